@@ -1,0 +1,78 @@
+"""The paper's adaptive law, split where its equations are.
+
+Law: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-order
+update explicit.
+
+Source: Eq. (9)-(13), (15) of the paper. Gains are diagonal and stand as vectors.
+"""
+
+from .arm import Array
+from .jit import leaf
+
+
+@leaf
+def errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array, e: Array, ed: Array, r: Array) -> None:
+    """Writes e, its derivative and r: Eq. (9), (18), (10).
+
+    Args:
+        q: joint angles, shape (n,), rad.
+        qd: joint velocities, shape (n,), rad/s.
+        q_des: reference q_id of Eq. (6), shape (n,), rad.
+        qd_des: its derivative, shape (n,), rad/s.
+        Lambda: shape (n,), 1/s.
+        e: position error, shape (n,), rad; written.
+        ed: its derivative, shape (n,), rad/s; written.
+        r: qd + Lambda e, shape (n,), rad/s; written.
+    """
+    for i in range(q.shape[0]):
+        e[i] = q[i] - q_des[i]
+        ed[i] = qd[i] - qd_des[i]
+        r[i] = qd[i] + Lambda[i] * e[i]
+
+
+@leaf
+def regressor_transpose_times(Y: Array, r: Array, Yr: Array) -> None:
+    """Writes Y' r, shape (p,), what drives the estimate in Eq. (15), for Y of shape (n, p)."""
+    for p in range(Y.shape[1]):
+        total = 0.0
+        for i in range(Y.shape[0]):
+            total += Y[i, p] * r[i]
+        Yr[p] = total
+
+
+@leaf
+def estimate(theta_hat: Array, gain_s: float, Gamma: Array, Yr: Array) -> None:
+    """Advances theta_hat by -gain Gamma Y' r, Eq. (15) over a time `gain_s`.
+
+    Args:
+        theta_hat: estimate, shape (p,), units of theta; changed in place.
+        gain_s: the time over which this value of Y' r counts, s.
+        Gamma: adaptation gain of each parameter, shape (p,).
+        Yr: Y' r, shape (p,).
+    """
+    for p in range(theta_hat.shape[0]):
+        theta_hat[p] -= gain_s * Gamma[p] * Yr[p]
+
+
+@leaf
+def torque(
+    Y: Array, theta_hat: Array, Kp: Array, Kd: Array, r: Array, ed: Array, limit: float, tau: Array
+) -> None:
+    """Writes tau = Y theta_hat - Kp r - Kd ed, Eq. (13), held within +-limit.
+
+    Args:
+        Y: regressor Y(q, qd, -Lambda e, -Lambda ed), shape (n, p).
+        theta_hat: estimate, shape (p,).
+        Kp: shape (n,), N m s/rad.
+        Kd: shape (n,), N m s/rad.
+        r: shape (n,), rad/s.
+        ed: shape (n,), rad/s.
+        limit: largest torque of a joint, N m.
+        tau: control torque, shape (n,), N m; written.
+    """
+    for i in range(tau.shape[0]):
+        total = 0.0
+        for p in range(theta_hat.shape[0]):
+            total += Y[i, p] * theta_hat[p]
+        total -= Kp[i] * r[i] + Kd[i] * ed[i]
+        tau[i] = min(max(total, -limit), limit)

@@ -1,0 +1,61 @@
+"""The one typed wrapper around Numba.
+
+Law: a leaf is compiled for float64 without reordering (no fastmath), so that compiled and plain Python
+runs of it give the same bits. Machine code is cached in the user's cache directory, in a folder named
+after the text of the whole core: Numba alone notices a change of the file that holds a leaf, but not of
+the leaves that it calls.
+"""
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar, cast
+
+import numba
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _cache_root() -> Path:
+    """The user's cache directory, by the custom of each platform."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+
+
+def _core_digest() -> str:
+    """Names the compiled code: a hash of every source file of the core and of Numba's version."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _writable_cache() -> Path | None:
+    """The directory for compiled leaves, or None where nothing can be written (then: memory only)."""
+    try:
+        directory = _cache_root() / "trilat-net" / _core_digest()
+        directory.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: no home directory
+        return None
+    return directory if os.access(directory, os.W_OK) else None
+
+
+_CACHE = None if numba.config.DISABLE_JIT else _writable_cache()
+
+
+def leaf(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
+    if _CACHE is None:
+        return cast(Callable[P, R], numba.njit(function))
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_CACHE)
+    try:
+        return cast(Callable[P, R], numba.njit(cache=True)(function))
+    finally:
+        numba.config.CACHE_DIR = before

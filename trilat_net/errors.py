@@ -1,0 +1,63 @@
+"""Errors that show whose fault it is.
+
+Law: an error carries its facts and a sentence that says what is wrong, where, and what would be right.
+The command line prints that sentence and nothing else.
+"""
+
+
+class TrilatError(Exception):
+    """Base of all errors that a person can act on; `exit_code` is what a command ends with."""
+
+    exit_code = 1
+
+
+class ScenarioError(TrilatError):
+    """The author's: a scenario, an override or an argument that cannot be right.
+
+    Args:
+        problem: what is wrong and what would be right.
+        path: the key, dotted, or "".
+        source: the file or the name of the scenario, or "".
+    """
+
+    exit_code = 2
+
+    def __init__(self, problem: str, *, path: str = "", source: str = "") -> None:
+        super().__init__(": ".join(part for part in (source, path, problem) if part))
+        self.problem = problem
+        self.path = path
+        self.source = source
+
+
+class UsageError(TrilatError):
+    """The caller's: arguments that contradict each other or the machine (a busy port, an existing file)."""
+
+    exit_code = 2
+
+
+class WireError(TrilatError):
+    """A peer's: a payload that is no message of ours. `reason` is the word it is counted under."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{reason}: {detail}")
+        self.reason = reason
+
+
+class SessionError(TrilatError):
+    """A session that cannot begin: a peer that never came, another scenario, a session that is running."""
+
+    exit_code = 2
+
+
+class LogError(TrilatError):
+    """The file's: a log that is missing, torn, or not one of ours."""
+
+    exit_code = 2
+
+
+class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
+    """A run or a comparison that ended badly: diverged, a site died, records that differ."""
+
+
+class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
+    """Ours: a state that the program itself must never reach."""

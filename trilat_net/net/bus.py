@@ -1,0 +1,213 @@
+"""The bus: what a member needs of a network, behind a small Protocol, and a fake that keeps it.
+
+Law: nothing that arrives runs code in a site. Messages wait in bounded rings until the loop asks; what
+overflows is lost oldest first, and the receiver sees it by the ticks. Only the recorder takes callbacks.
+
+`zenoh_bus` is the real one; `LocalBus` joins members of one process. Both pass the same contract tests.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+RING = 16_384
+"""Messages that a ring holds: sixteen seconds of one peer at 1 kHz."""
+
+
+class Inbox(Protocol):
+    """A bounded ring of messages."""
+
+    def poll(self) -> tuple[str, bytes] | None:
+        """Returns the oldest message (key, payload), or None; never waits."""
+
+
+class Presence(Protocol):
+    """A bounded ring of liveliness changes."""
+
+    def poll(self) -> tuple[str, bool] | None:
+        """Returns the oldest change (key, whether it is alive now), or None; never waits."""
+
+
+class Question(Protocol):
+    """A question that waits for an answer."""
+
+    def answer(self, payload: bytes) -> None:
+        """Answers it."""
+
+
+class Questions(Protocol):
+    """A bounded ring of questions."""
+
+    def poll(self) -> Question | None:
+        """Returns the oldest question, or None; never waits."""
+
+
+class Bus(Protocol):
+    """One member's connection."""
+
+    def publisher(self, key: str) -> Callable[[bytes], None]:
+        """Returns what publishes a payload under a key; it drops rather than waits."""
+
+    def inbox(self, key: str, capacity: int = RING) -> Inbox:
+        """Returns a ring that fills with what others publish under a key expression."""
+
+    def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Calls back with (key, payload) as messages come, in a thread of the bus."""
+
+    def questions(self, key: str) -> Questions:
+        """Returns a ring of the questions that others ask under a key."""
+
+    def ask(self, key: str) -> Inbox:
+        """Asks everyone who answers under a key expression; answers come into the ring as they come."""
+
+    def announce(self, key: str) -> None:
+        """Declares a liveliness token, which disappears with the member."""
+
+    def presence(self, key: str) -> Presence:
+        """Returns a ring of the tokens that appear and disappear, those that stand already first."""
+
+    def close(self) -> None:
+        """Leaves; safe to call again."""
+
+
+def matches(expression: str, key: str) -> bool:
+    """True where a key expression (`*` for one chunk, `**` for any number) includes a key."""
+    return _match(expression.split("/"), key.split("/"))
+
+
+def _match(pattern: list[str], chunks: list[str]) -> bool:
+    if not pattern:
+        return not chunks
+    if pattern[0] == "**":
+        return any(_match(pattern[1:], chunks[n:]) for n in range(len(chunks) + 1))
+    return bool(chunks) and pattern[0] in ("*", chunks[0]) and _match(pattern[1:], chunks[1:])
+
+
+class _Ring:
+    def __init__(self, capacity: int) -> None:
+        self._entries: deque[tuple[str, bytes]] = deque(maxlen=capacity)
+
+    def put(self, key: str, payload: bytes) -> None:
+        self._entries.append((key, payload))
+
+    def poll(self) -> tuple[str, bytes] | None:
+        return self._entries.popleft() if self._entries else None
+
+
+class _PresenceRing:
+    def __init__(self, capacity: int) -> None:
+        self._entries: deque[tuple[str, bool]] = deque(maxlen=capacity)
+
+    def put(self, key: str, alive: bool) -> None:
+        self._entries.append((key, alive))
+
+    def poll(self) -> tuple[str, bool] | None:
+        return self._entries.popleft() if self._entries else None
+
+
+class _LocalQuestion:
+    def __init__(self, key: str, replies: _Ring) -> None:
+        self._key = key
+        self._replies = replies
+
+    def answer(self, payload: bytes) -> None:
+        self._replies.put(self._key, payload)
+
+
+class _QuestionRing:
+    def __init__(self) -> None:
+        self._entries: deque[Question] = deque(maxlen=RING)
+
+    def put(self, question: Question) -> None:
+        self._entries.append(question)
+
+    def poll(self) -> Question | None:
+        return self._entries.popleft() if self._entries else None
+
+
+class LocalNetwork:
+    """What the `LocalBus`es of one process have in common."""
+
+    def __init__(self) -> None:
+        self.members: list[LocalBus] = []
+
+    def join(self) -> "LocalBus":
+        """Returns the connection of a new member."""
+        member = LocalBus(self)
+        self.members.append(member)
+        return member
+
+
+class LocalBus:
+    """A `Bus` inside one process, without delay and without loss; made by `LocalNetwork.join`."""
+
+    def __init__(self, network: LocalNetwork) -> None:
+        self._network = network
+        self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
+        self._answering: list[tuple[str, _QuestionRing]] = []
+        self._watching: list[tuple[str, _PresenceRing]] = []
+        self._tokens: list[str] = []
+
+    def publisher(self, key: str) -> Callable[[bytes], None]:
+        """See `Bus`."""
+
+        def publish(payload: bytes) -> None:
+            for member in self._network.members:
+                for expression, sink in member._sinks:
+                    if member is not self and matches(expression, key):
+                        sink(key, payload)
+
+        return publish
+
+    def inbox(self, key: str, capacity: int = RING) -> Inbox:
+        """See `Bus`."""
+        ring = _Ring(capacity)
+        self._sinks.append((key, ring.put))
+        return ring
+
+    def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """See `Bus`."""
+        self._sinks.append((key, callback))
+
+    def questions(self, key: str) -> Questions:
+        """See `Bus`."""
+        ring = _QuestionRing()
+        self._answering.append((key, ring))
+        return ring
+
+    def ask(self, key: str) -> Inbox:
+        """See `Bus`."""
+        replies = _Ring(RING)
+        for member in self._network.members:
+            for answered, ring in member._answering:
+                if member is not self and matches(key, answered):
+                    ring.put(_LocalQuestion(answered, replies))
+        return replies
+
+    def announce(self, key: str) -> None:
+        """See `Bus`."""
+        self._tokens.append(key)
+        self._tell(key, True)
+
+    def presence(self, key: str) -> Presence:
+        """See `Bus`."""
+        ring = _PresenceRing(RING)
+        for member in self._network.members:
+            for token in member._tokens:
+                if member is not self and matches(key, token):
+                    ring.put(token, True)
+        self._watching.append((key, ring))
+        return ring
+
+    def close(self) -> None:
+        """See `Bus`."""
+        if self in self._network.members:
+            self._network.members.remove(self)
+            for token in self._tokens:
+                self._tell(token, False)
+
+    def _tell(self, token: str, alive: bool) -> None:
+        for member in self._network.members:
+            for expression, ring in member._watching:
+                if member is not self and matches(expression, token):
+                    ring.put(token, alive)

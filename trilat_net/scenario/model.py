@@ -1,0 +1,259 @@
+"""The types of a scenario, complete and frozen, and what the core is built from.
+
+Law: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it loads to the same
+scenario, and its SHA-256 names the experiment.
+"""
+
+import hashlib
+import re
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import tomli_w
+from msgspec import Meta
+
+from ..core import dominance
+from ..core.arm import Array, Links, parameters
+from ..core.site import LinkSetup, Scheme, SiteSetup
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Joints = Annotated[tuple[float, ...], Meta(min_length=2, max_length=2)]
+PositiveJoints = Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)]
+NotNegativeJoints = Annotated[tuple[NotNegative, ...], Meta(min_length=2, max_length=2)]
+Parameters = Annotated[tuple[float, ...], Meta(min_length=5, max_length=5)]
+NotNegativeParameters = Annotated[tuple[NotNegative, ...], Meta(min_length=5, max_length=5)]
+Rate = Annotated[int, Meta(ge=1, le=20_000)]
+
+
+_NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
+
+
+def _one_line(numbers: re.Match[str]) -> str:
+    """Puts a list of numbers on one line."""
+    return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
+
+
+class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of the scenario's types: immutable, unknown keys refused."""
+
+
+class Arm(Frozen, frozen=True):
+    """The two links of a planar arm; defaults are the paper's, as point masses at the link ends.
+
+    Attributes:
+        l1_m: length of link 1, m.
+        m1_kg: mass of link 1, kg.
+        lc1_m: distance of its centre of mass from joint 1, m.
+        I1_kg_m2: inertia about its centre of mass, kg m^2.
+        l2_m: length of link 2, m.
+        m2_kg: mass of link 2, kg.
+        lc2_m: distance of its centre of mass from joint 2, m.
+        I2_kg_m2: inertia about its centre of mass, kg m^2.
+        g_m_s2: gravitational acceleration, m/s^2.
+    """
+
+    l1_m: Positive = 1.0
+    m1_kg: Positive = 1.0
+    lc1_m: NotNegative = 1.0
+    I1_kg_m2: NotNegative = 0.0
+    l2_m: Positive = 1.0
+    m2_kg: Positive = 1.0
+    lc2_m: Positive = 1.0
+    I2_kg_m2: NotNegative = 0.0
+    g_m_s2: NotNegative = 9.81
+
+    @property
+    def theta(self) -> Array:
+        """True parameters of Eq. (24), shape (5,)."""
+        return parameters(Links(**{name: getattr(self, name) for name in Links._fields}))
+
+
+class Control(Frozen, frozen=True):
+    """The law of a site and its gains, all diagonal.
+
+    Attributes:
+        law: "adaptive", Eq. (13) and (15).
+        Lambda: per joint, 1/s.
+        Kp: per joint, N m s/rad.
+        Kd: per joint, N m s/rad.
+        Gamma: adaptation gain per parameter.
+        theta_hat0: first estimate of theta, Eq. (24).
+    """
+
+    law: Literal["adaptive"] = "adaptive"
+    Lambda: PositiveJoints = (1.0, 1.0)
+    Kp: PositiveJoints = (1.0, 1.0)
+    Kd: NotNegativeJoints = (3.0, 3.0)
+    Gamma: NotNegativeParameters = (1.0,) * 5
+    theta_hat0: Parameters = (0.0,) * 5
+
+
+class Limits(Frozen, frozen=True):
+    """Where a run stops being physics.
+
+    Attributes:
+        tau_limit_nm: largest control torque of a joint, N m; more is cut off.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s.
+    """
+
+    tau_limit_nm: Positive = 200.0
+    qd_limit_rad_s: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 100.0
+
+
+class Pulse(Frozen, frozen=True):
+    """A smooth push of an operator: peak * sin^2(pi (t - start) / (end - start)), ON the arm.
+
+    Attributes:
+        kind: "pulse".
+        start_s: when it begins, s after the epoch.
+        end_s: when it ends, s after the epoch.
+        peak_nm: its peak on each joint, N m.
+    """
+
+    kind: Literal["pulse"]
+    start_s: NotNegative
+    end_s: Positive
+    peak_nm: Joints
+
+
+class SiteSpec(Frozen, frozen=True):
+    """One manipulator.
+
+    Attributes:
+        role: what it is to a reader of figures; enters no formula.
+        rate_hz: tick rate of its loop, Hz.
+        q0_rad: start pose, rad.
+        qd0_rad_s: start velocity, rad/s.
+        arm: its links.
+        control: its law and gains.
+        limits: where it stops.
+        hands: what its operator does.
+    """
+
+    role: Literal["master", "slave"]
+    rate_hz: Rate
+    q0_rad: Joints
+    qd0_rad_s: Joints
+    arm: Arm
+    control: Control
+    limits: Limits
+    hands: tuple[Pulse, ...] = ()
+
+
+class Link(Frozen, frozen=True):
+    """One directed link.
+
+    Attributes:
+        delay_ms: constant delay on nominal stamps, ms; 0 means one period.
+    """
+
+    delay_ms: Annotated[float, Meta(ge=0.0, le=10_000.0)]
+
+    @property
+    def delay_ns(self) -> int:
+        """The delay in integer nanoseconds, rounded to whole microseconds (L4)."""
+        return round(self.delay_ms * 1_000) * 1_000
+
+
+class Scenario(Frozen, frozen=True, dict=True):
+    """An experiment, resolved: every value of every site and link is explicit.
+
+    Attributes:
+        name: what the session and the log are called.
+        title: one line for people.
+        about: a paragraph for people.
+        assumed: what the source of the experiment does not say, and is assumed here.
+        duration_s: how long it runs, s.
+        seed: what every random draw is a function of.
+        scheme: "second_order" or "digital", see `core.site.Scheme`.
+        sites: the manipulators, in order; the first leads a live session.
+        dominance: row i, column j: share of site j in the reference of site i, Eq. (6).
+        links: "j->i" for every pair of sites.
+    """
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
+    duration_s: Annotated[float, Meta(gt=0.0, le=86_400.0)]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
+    scheme: Literal["second_order", "digital"]
+    sites: dict[str, SiteSpec]
+    dominance: dict[str, dict[str, float]]
+    links: dict[str, Link]
+    title: str = ""
+    about: str = ""
+    assumed: tuple[str, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites, in order."""
+        return tuple(self.sites)
+
+    @cached_property
+    def alpha(self) -> Array:
+        """The dominance matrix, shape (N, N), Eq. (6)."""
+        return np.array([[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names])
+
+    @property
+    def beta(self) -> Array | None:
+        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None where alpha is reducible."""
+        return dominance.perron(self.alpha) if dominance.irreducible(self.alpha) else None
+
+    @cached_property
+    def text(self) -> str:
+        """The canonical TOML text."""
+        tables: dict[str, Any] = msgspec.to_builtins(self)
+        first = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
+        tables = {key: value for key, value in first.items() if value} | tables
+        return _NUMBERS.sub(_one_line, tomli_w.dumps(tables, multiline_strings=True))
+
+    @cached_property
+    def sha256(self) -> str:
+        """Names the experiment: hash of the canonical text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def ticks(self, site: str) -> int:
+        """Returns how many ticks a site makes."""
+        return max(1, round(self.duration_s * self.sites[site].rate_hz))
+
+    def peers(self, site: str) -> tuple[str, ...]:
+        """Returns the peers of a site, in scenario order."""
+        return tuple(name for name in self.names if name != site)
+
+    def setup(self, site: str) -> SiteSetup:
+        """Returns all that the core needs to build a site."""
+        spec = self.sites[site]
+        c = spec.control
+        return SiteSetup(
+            name=site,
+            rate_hz=spec.rate_hz,
+            scheme=Scheme[self.scheme.upper()],
+            theta=spec.arm.theta,
+            g_m_s2=spec.arm.g_m_s2,
+            Lambda=np.array(c.Lambda),
+            Kp=np.array(c.Kp),
+            Kd=np.array(c.Kd),
+            Gamma=np.array(c.Gamma),
+            theta_hat0=np.array(c.theta_hat0),
+            tau_limit_nm=spec.limits.tau_limit_nm,
+            qd_limit_rad_s=spec.limits.qd_limit_rad_s,
+            q0=spec.q0_rad,
+            qd0=spec.qd0_rad_s,
+            pulses=np.array([[p.start_s, p.end_s, *p.peak_nm] for p in spec.hands]).reshape(-1, 4),
+            links=tuple(
+                LinkSetup(
+                    peer=peer,
+                    alpha=self.dominance[site].get(peer, 0.0),
+                    delay_ns=self.links[f"{peer}->{site}"].delay_ns,
+                    rate_hz=self.sites[peer].rate_hz,
+                    q0=self.sites[peer].q0_rad,
+                )
+                for peer in self.peers(site)
+            ),
+        )
+
+    def without_hands(self) -> "Scenario":
+        """Returns the same experiment with nobody at the arms: the twin that hands are measured against."""
+        sites = {name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()}
+        return msgspec.structs.replace(self, sites=sites)
