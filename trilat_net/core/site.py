@@ -308,6 +308,18 @@ def _advance(k: int, site: Row, pulses: Array) -> None:
 
 
 @leaf
+def site_accept(
+    k: int, count: int, site: Rows, links: Rows, samples: Rows, calendars: Ticks, arrivals: Rows
+) -> None:
+    """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
+    rate_hz = site[0].rate_hz
+    for n in range(count):
+        arrival: Row = arrivals[n]
+        j = arrival.peer
+        accept(k, rate_hz, arrival.tick, arrival.q, arrival.qd, links[j], samples[j], calendars[j])
+
+
+@leaf
 def site_tick(
     k: int,
     count: int,
@@ -333,10 +345,7 @@ def site_tick(
         row: the record's floats in the order of _EMITTED, shape (ROW_FLOATS,); written.
     """
     s: Row = site[0]
-    for n in range(count):  # 1 accept
-        arrival: Row = arrivals[n]
-        j = arrival.peer
-        accept(k, s.rate_hz, arrival.tick, arrival.q, arrival.qd, links[j], samples[j], calendars[j])
+    site_accept(k, count, site, links, samples, calendars, arrivals)  # 1 accept
     for j in range(links.shape[0]):  # 2 recall
         recall(k, links[j], samples[j], calendars[j])
     _reference(links, s.q_des, s.qd_des)  # 3 reference
@@ -417,18 +426,10 @@ class Site:
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals.
         """
-        count = len(tick.arrivals)
-        if count > MAX_ARRIVALS:
-            raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {count}")
-        offset = 0
-        for arrival in tick.arrivals:
-            _PACK_ARRIVAL(
-                self._arrival_bytes, offset, arrival.peer, arrival.tick, *arrival.q, *arrival.qd
-            )
-            offset += _PACK_ARRIVAL_SIZE
+        taken = self._pack(tick.arrivals)
         site_tick(
             tick.k,
-            count,
+            len(tick.arrivals),
             self._site,
             self._links,
             self._samples,
@@ -451,7 +452,7 @@ class Site:
             row[5 * n : 6 * n],
             row[6 * n :],
             self._links["used"].tolist(),
-            zlib.crc32(self._arrival_bytes[:offset]),
+            zlib.crc32(self._arrival_bytes[:taken]),
         )
 
     def counts(self) -> tuple[LinkCounts, ...]:
@@ -464,21 +465,48 @@ class Site:
         """Returns the tick of this site at which a peer's sample comes into use if it is there by then."""
         return int(release_tick(tick, self._links[peer], self.rate_hz))
 
-    def resume(self, before: Output, last: Output, in_use: Sequence[Arrival | None]) -> None:
-        """Puts the site where `step(last.tick)` left it, from two records in a row (L3: a key-frame).
+    def resume(self, before: Output, last: Output) -> None:
+        """Puts the arm and its controller where `step(last.tick)` left them, from two records in a row.
 
-        What had arrived and was not yet in use is not in a record: feed it as arrivals of later ticks.
+        The links are left alone; see `prime`.
 
         Args:
-            before: the record of the tick before the last one.
+            before: the record of the tick before the last one; any, where the last one is tick 0.
             last: the record of the last tick.
-            in_use: per peer the sample that `last.used` names, or None while none was.
         """
         s: Row = self._site[0]
         s.mode = int(last.mode)
         s.q, s.qd, s.theta_hat = last.q, last.qd, last.theta_hat
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
+        site_resume(last.tick, self._site, self._pulses)
+
+    def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
+        """Puts the links where they were before tick k: what is in use, and what waits to be.
+
+        Args:
+            k: the tick that will be stepped next.
+            in_use: per peer the sample in use, or None before the first.
+            waiting: arrivals that had not come into use.
+
+        Raises:
+            ValueError: more than MAX_ARRIVALS of them wait.
+        """
+        self._samples["tick"] = -1
+        self._calendars[:] = -1
         for link, sample in zip(self._links, in_use, strict=True):
             if sample is not None:
                 link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
-        site_resume(last.tick, self._site, self._pulses)
+        self._pack(waiting)
+        site_accept(
+            k, len(waiting), self._site, self._links, self._samples, self._calendars, self._arrivals
+        )
+
+    def _pack(self, arrivals: Sequence[Arrival]) -> int:
+        """Writes arrivals into their table; returns the bytes that they take."""
+        if len(arrivals) > MAX_ARRIVALS:
+            raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
+        offset = 0
+        for peer, tick, q, qd, _ in arrivals:
+            _PACK_ARRIVAL(self._arrival_bytes, offset, peer, tick, *q, *qd)
+            offset += _PACK_ARRIVAL_SIZE
+        return offset

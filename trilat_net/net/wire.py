@@ -236,7 +236,9 @@ def encode_state(
         WireError: a number is not finite.
     """
     (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc) = output
-    if not all(map(_isfinite, [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat])):
+    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat]
+    # a sum is finite only if its terms are; the second look is for terms whose sum overflows
+    if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
     packed: bytes = _pack(
         {

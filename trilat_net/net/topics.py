@@ -1,0 +1,28 @@
+"""Keys: where a session's messages are."""
+
+from typing import NamedTuple
+
+ROOT = "trilat"
+RECORDER = "recorder"
+STATE, LINK, EVENT, INFO, ALIVE = "state", "link", "event", "info", "alive"
+
+
+class Address(NamedTuple):
+    """What a key says: `trilat/<session>/<member>/<channel>`, and a boot behind `alive`."""
+
+    session: str
+    member: str
+    channel: str
+    boot: str = ""
+
+
+def key(session: str, member: str, channel: str) -> str:
+    """Returns the key of a member's channel; `*` stands for every member."""
+    return f"{ROOT}/{session}/{member}/{channel}"
+
+
+def address(key: str) -> Address | None:
+    """Returns what a key says, or None where it is none of ours."""
+    root, _, rest = key.partition("/")
+    parts = rest.split("/")
+    return Address(*parts) if root == ROOT and len(parts) in (3, 4) else None

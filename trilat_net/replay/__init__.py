@@ -1,0 +1,1 @@
+"""Execution from a log: the records of a session fed back into `Site.step`, and what came of it."""

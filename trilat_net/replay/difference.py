@@ -1,0 +1,84 @@
+"""Where two executions differ: site, tick, field, both values."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ..core.site import Output
+from ..net.wire import State
+
+VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+TOLERANCE = 1e-9
+"""Where platforms differ, values a and b count as equal when |a - b| <= TOLERANCE (1 + |a|)."""
+
+Same = Callable[[float, float], bool]
+
+
+class Difference(NamedTuple):
+    """One field of one record that is not as it should be.
+
+    Attributes:
+        site: whose record.
+        tick: which record.
+        field: which field, with the index of the number in it.
+        logged: what the log says.
+        computed: what the execution gave.
+    """
+
+    site: str
+    tick: int
+    field: str
+    logged: Any
+    computed: Any
+
+    def __str__(self) -> str:
+        return (
+            f"{self.site}, tick {self.tick}, {self.field}: "
+            f"logged {_shown(self.logged)}, computed {_shown(self.computed)}"
+        )
+
+
+def _shown(value: Any) -> str:
+    return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
+
+
+def same_bits(a: float, b: float) -> bool:
+    """True where two numbers have the same bits (-0.0 is not 0.0)."""
+    return a.hex() == b.hex()
+
+
+def close(a: float, b: float) -> bool:
+    """True where two numbers agree as well as two platforms can be expected to."""
+    return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
+
+
+def first_difference(logged: State, computed: Output, peers: tuple[str, ...], same: Same) -> Difference | None:
+    """Returns the first field in which a record differs from an execution, or None.
+
+    Args:
+        logged: the record.
+        computed: what `Site.step` returned.
+        peers: the site's peers in scenario order.
+        same: when two numbers are the same.
+    """
+
+    def differs(field: str, a: Any, b: Any) -> Difference:
+        return Difference(logged.site, logged.tick, field, a, b)
+
+    plain = (("tick", computed.tick), ("t_ns", computed.t_ns), ("mode", computed.mode.name.lower()))
+    for field, value in plain:
+        if getattr(logged, field) != value:
+            return differs(field, getattr(logged, field), value)
+    for field in VECTORS:
+        for n, (a, b) in enumerate(zip(getattr(logged, field), getattr(computed, field), strict=True)):
+            if not same(float(a), b):
+                return differs(f"{field}[{n}]", float(a), b)
+    used = dict(zip(peers, computed.used, strict=True))
+    for peer in sorted({*logged.used, *used}):
+        if logged.used.get(peer) != used.get(peer):
+            return differs(f"used[{peer}]", logged.used.get(peer), used.get(peer))
+    if logged.rx_crc != computed.rx_crc:
+        return differs("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
+    for field in ("cmd", "mem"):
+        if getattr(logged, field):
+            return differs(field, getattr(logged, field), [])
+    return None

@@ -1,0 +1,232 @@
+"""Executes every site again from its log and compares every computed field of every record.
+
+Law (L3, L5): the log alone feeds `Site.step`. On the platform that made it (by fingerprint) a whole run is
+executed and bit equality demanded; elsewhere each tick is recomputed from the two records before it, to
+1e-9 (1 + |a|). A gap is reported; execution resumes behind it from two records in a row, and what could
+not be judged is counted.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ..core.fingerprint import fingerprint
+from ..core.site import MAX_ARRIVALS, Arrival, Mode, Output, Site, Tick
+from ..errors import WireError
+from ..log.reader import Log, SiteLog
+from ..net.wire import State, encode_state
+from ..scenario import Scenario
+from .difference import Difference, close, first_difference, same_bits
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What an execution from a log showed.
+
+    Attributes:
+        whole_run: True where runs were executed whole and bits compared; False where tick by tick, to 1e-9.
+        records: records in the log.
+        identical: records of which every computed field agreed.
+        unjudged: records that nothing could be said of, behind gaps.
+        differing: records that differ.
+        first: the first difference, by tick and then by site.
+        gaps: missing ticks: (site, first, last).
+    """
+
+    whole_run: bool
+    records: int = 0
+    identical: int = 0
+    unjudged: int = 0
+    differing: int = 0
+    first: Difference | None = None
+    gaps: list[tuple[str, int, int]] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        """True where no record differs."""
+        return self.first is None
+
+    def differ(self, difference: Difference) -> None:
+        """Books a record that differs."""
+        self.differing += 1
+        if self.first is None or difference.tick < self.first.tick:
+            self.first = difference
+
+
+def verify(log: Log) -> Verdict:
+    """Executes every site of a log again.
+
+    Args:
+        log: the log.
+
+    Raises:
+        LogError: a record cannot be read.
+    """
+    verdict = Verdict(whole_run=log.session.get("fingerprint") == fingerprint())
+    by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+    for name in log.sites:
+        _Execution(log.scenario, log[name], by_tick, verdict).run()
+    return verdict
+
+
+def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
+    """Returns a record as `Site.step` returned it."""
+    mode = Mode.RUN if state.mode == "run" else Mode.DIVERGED
+    used = [state.used.get(peer, -1) for peer in peers]
+    return Output(
+        state.tick,
+        state.t_ns,
+        mode,
+        state.q,
+        state.qd,
+        state.q_des,
+        state.qd_des,
+        state.tau,
+        state.tau_x,
+        state.theta_hat,
+        used,
+        state.rx_crc,
+    )
+
+
+class _Execution:
+    """One site, executed from its records.
+
+    While it is `assured`, the site's state follows from the records before. It is lost at a gap, and when a
+    sample comes into use that the log lacks; two records in a row bring it back. What arrived inside a gap
+    is not known: samples between the one in use and the next one listed are taken to have come
+    (`assumed`), and as long as one of them is in use a difference counts as unjudged.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        site_log: SiteLog,
+        by_tick: Mapping[str, Mapping[int, State]],
+        verdict: Verdict,
+    ) -> None:
+        self._site = Site(scenario.setup(site_log.name))
+        self._log = site_log
+        self._peers = site_log.peers
+        self._by_tick = [by_tick[peer] for peer in site_log.peers]
+        self._ends = [scenario.ticks(peer) for peer in site_log.peers]
+        self._verdict = verdict
+        self._same = same_bits if verdict.whole_run else close
+        self._assured = True
+        self._assumed_until = [-1] * len(self._peers)
+
+    def run(self) -> None:
+        """Executes every record."""
+        verdict, states = self._verdict, self._log.states
+        expected = 0
+        for n, state in enumerate(states):
+            verdict.records += 1
+            if state.tick == expected - 1:
+                verdict.differ(Difference(state.site, state.tick, "tick", state.tick, expected))
+                continue
+            if state.tick != expected:
+                verdict.gaps.append((self._log.name, expected, state.tick - 1))
+                self._assured = False
+            expected = state.tick + 1
+            if not self._assured and not self._resume(n):
+                verdict.unjudged += 1
+                continue
+            self._judge(n, state)
+
+    def _judge(self, n: int, state: State) -> None:
+        """Steps one tick and compares."""
+        verdict = self._verdict
+        states = self._log.states
+        if not verdict.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
+            before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
+            self._site.resume(before, last)
+        arrivals, missing = self._arrivals(state)
+        if missing is not None and missing.field != "":
+            verdict.differ(missing)
+            self._site.step(Tick(state.tick, arrivals))
+            return
+        output = self._site.step(Tick(state.tick, arrivals))
+        if missing is not None:  # the log lacks a sample that came in: its CRC cannot be checked
+            output = output._replace(rx_crc=state.rx_crc)
+        if state.boot != states[0].boot:
+            verdict.differ(Difference(state.site, state.tick, "boot", state.boot, states[0].boot))
+        elif self._payload_agrees(n, state, output, arrivals):
+            verdict.identical += 1
+        elif difference := first_difference(state, output, self._peers, self._same):
+            self._book(state, difference)
+        else:
+            verdict.identical += 1
+
+    def _payload_agrees(self, n: int, state: State, output: Output, arrivals: list[Arrival]) -> bool:
+        """True where the record, encoded again, is the payload byte for byte: the common, fast case."""
+        try:
+            payload = encode_state(
+                self._log.name, state.boot, self._peers, output, arrivals, state.late_us, state.busy_us
+            )
+        except WireError:
+            return False
+        return payload == self._log.payloads[n]
+
+    def _book(self, state: State, difference: Difference) -> None:
+        in_doubt = any(
+            state.used.get(peer, -1) >= 0
+            and (state.used[peer] <= self._assumed_until[j] or state.used[peer] not in self._by_tick[j])
+            for j, peer in enumerate(self._peers)
+        )
+        if in_doubt:
+            self._verdict.unjudged += 1
+            self._assured = False
+        else:
+            self._verdict.differ(difference)
+
+    def _arrivals(self, state: State) -> tuple[list[Arrival], Difference | None]:
+        """Returns what a record says came in, with the samples of its peers' records.
+
+        A sample that no record of the log can be is a difference; one whose record is merely missing is
+        told by a difference without a field.
+        """
+        arrivals: list[Arrival] = []
+        lacking = None
+        for peer, tick, latency_us in state.rx:
+            if not 0 <= peer < len(self._peers):
+                return arrivals, Difference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
+            sample = self._by_tick[peer].get(tick)
+            if sample is not None:
+                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
+            elif 0 <= tick < self._ends[peer]:
+                lacking = Difference(state.site, state.tick, "", tick, None)
+            else:
+                last = self._ends[peer] - 1
+                return arrivals, Difference(
+                    state.site, state.tick, f"rx[{self._peers[peer]}]", tick, f"a tick from 0 to {last}"
+                )
+        return arrivals[:MAX_ARRIVALS], lacking
+
+    def _resume(self, n: int) -> bool:
+        """Brings the site to where record n finds it, if the two records before it stand in a row."""
+        states = self._log.states
+        if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
+            return False
+        before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
+        in_use: list[Arrival | None] = []
+        waiting: list[Arrival] = []
+        for j, used in enumerate(last.used):
+            sample = self._by_tick[j].get(used)
+            if used >= 0 and sample is None:
+                return False
+            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
+            listed = self._next_listed(j, n)
+            self._assumed_until[j] = listed - 1
+            found = (self._by_tick[j].get(tick) for tick in range(used + 1, listed))
+            waiting += [Arrival(j, s.tick, s.q, s.qd) for s in found if s is not None]
+        self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
+        self._site.resume(before, last)
+        self._assured = True
+        return True
+
+    def _next_listed(self, peer: int, n: int) -> int:
+        """Returns the tick of the first sample of a peer that record n or a later one lists."""
+        for state in self._log.states[n:]:
+            for j, tick, _ in state.rx:
+                if j == peer:
+                    return tick
+        return self._ends[peer]
