@@ -11,7 +11,9 @@ from .jit import leaf
 
 
 @leaf
-def errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array, e: Array, ed: Array, r: Array) -> None:
+def errors(
+    q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array, e: Array, ed: Array, r: Array
+) -> None:
     """Writes e, its derivative and r: Eq. (9), (18), (10).
 
     Args:

@@ -69,4 +69,5 @@ def perron(alpha: Array) -> Array:
     beta[0] = 1.0
     for site in range(1, size):
         beta[site] = beta[:site] @ a[:site, site]
-    return beta / beta.sum()
+    normalised: Array = beta / beta.sum()
+    return normalised

@@ -12,7 +12,9 @@ import numpy as np
 
 from .arm import Array, Links, parameters
 from .jit import leaf
-from .site import Arrival, LinkSetup, Scheme, Site, SiteSetup, Tick
+from .setup import LinkSetup, Scheme, SiteSetup
+from .site import Site
+from .tick import Arrival, Tick
 
 _TICKS = 200
 

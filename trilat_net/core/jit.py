@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 
@@ -46,16 +46,17 @@ def _writable_cache() -> Path | None:
     return directory if os.access(directory, os.W_OK) else None
 
 
-_CACHE = None if numba.config.DISABLE_JIT else _writable_cache()
+_config: Any = numba.config  # made at import from the environment; its stubs name no options
+_CACHE = None if _config.DISABLE_JIT else _writable_cache()
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
     if _CACHE is None:
         return cast(Callable[P, R], numba.njit(function))
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_CACHE)
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = str(_CACHE)
     try:
         return cast(Callable[P, R], numba.njit(cache=True)(function))
     finally:
-        numba.config.CACHE_DIR = before
+        _config.CACHE_DIR = before

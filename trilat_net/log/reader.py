@@ -10,11 +10,12 @@ whole, and says so (`complete`).
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import collector
 from ..core.arm import Array
 from ..core.grid import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
@@ -25,6 +26,7 @@ from .chunks import Walk
 from .writer import ACCOUNTS, SCENARIO, SESSION
 
 Ints = NDArray[np.int64]
+M = TypeVar("M", Event, LinkStats)
 
 
 class SiteLog:
@@ -52,7 +54,8 @@ class SiteLog:
         self.peers = peers
         self.rate_hz = rate_hz
         try:
-            pairs = [(decode(payload, State), payload) for payload in payloads]
+            with collector.paused():
+                pairs = [(decode(payload, State), payload) for payload in payloads]
         except WireError as error:
             raise LogError(f"{source}: a record of {name} cannot be read: {error}") from None
         pairs.sort(key=lambda pair: pair[0].tick)
@@ -63,7 +66,8 @@ class SiteLog:
         return len(self.states)
 
     def _vectors(self, field: str) -> Array:
-        return np.array([getattr(state, field) for state in self.states])
+        vectors: Array = np.array([getattr(state, field) for state in self.states], dtype=np.float64)
+        return vectors
 
     def _numbers(self, field: str) -> Ints:
         return np.array([getattr(state, field) for state in self.states], dtype=np.int64)
@@ -132,8 +136,7 @@ class SiteLog:
     def used(self) -> dict[str, Ints]:
         """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
         return {
-            peer: np.array([state.used[peer] for state in self.states], dtype=np.int64)
-            for peer in self.peers
+            peer: np.array([state.used[peer] for state in self.states], dtype=np.int64) for peer in self.peers
         }
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
@@ -145,7 +148,8 @@ class SiteLog:
         """
         used = self.used[peer]
         age = self._numbers("t_ns") - used * NS_PER_S // rate_hz
-        return np.where(used >= 0, age * 1e-9, np.nan)
+        seconds: Array = np.where(used >= 0, age * 1e-9, np.nan)
+        return seconds
 
 
 class Log:
@@ -186,7 +190,7 @@ class Log:
     def _topic(self, member: str, channel: str) -> str:
         return "/" + topics.key(self.session["session"], member, channel)
 
-    def _decoded(self, topic: str, kind: type[Event] | type[LinkStats]) -> Iterator[Event | LinkStats]:
+    def _decoded(self, topic: str, kind: type[M]) -> Iterator[M]:
         try:
             for payload in self._payloads.get(topic, []):
                 yield decode(payload, kind)
@@ -218,7 +222,7 @@ class Log:
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published, in order."""
-        return [m for m in self._decoded(self._topic(site, topics.LINK), LinkStats) if isinstance(m, LinkStats)]
+        return list(self._decoded(self._topic(site, topics.LINK), LinkStats))
 
 
 def open_log(source: str | Path | BinaryIO) -> Log:

@@ -6,8 +6,9 @@ first message, payloads are byte for byte what was published, and the accounts s
 
 import json
 from collections.abc import Mapping
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import msgspec
 from mcap.writer import CompressionType, Writer
 
 from ..errors import LogError
@@ -18,7 +19,7 @@ from .accounting import Account
 from .provenance import provenance
 
 SESSION, ACCOUNTS, SCENARIO = "trilat.session", "trilat.accounts", "scenario.toml"
-SCHEMAS = {topics.STATE: State, topics.LINK: LinkStats, topics.EVENT: Event}
+SCHEMAS: dict[str, type[msgspec.Struct]] = {topics.STATE: State, topics.LINK: LinkStats, topics.EVENT: Event}
 
 _CHUNK_BYTES = 1 << 20
 
@@ -50,7 +51,7 @@ class LogWriter:
         self.accounts = {site: Account() for site in scenario.names}
         self._epoch_unix_ns = epoch_unix_ns
         self._stream = stream
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer: Any = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"trilat-net {provenance()['version_trilat-net']}")
         self._writer.add_metadata(
             SESSION,

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from ..core.arm import JOINTS, PARAMETERS
-from ..core.site import Arrival, Output
+from ..core.tick import Arrival, Output
 from ..errors import WireError
 
 VERSION = 1
@@ -36,7 +36,7 @@ Torques = Annotated[list[float], _unit("N m", "joint torques")]
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The complete record of one tick of one site; what each vector means stands at `core.site.Output`.
+    """The complete record of one tick of one site; what each vector means stands at `core.tick.Output`.
 
     Attributes:
         v: version of this schema.
@@ -197,7 +197,9 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 _pack = msgpack.Packer().pack
-_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in (State, Sample, LinkStats, Event, Info)}
+_DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
+    kind: msgspec.msgpack.Decoder(kind) for kind in (State, Sample, LinkStats, Event, Info)
+}
 _isfinite = math.isfinite
 
 SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}
@@ -312,6 +314,6 @@ def _check_numbers(message: Sample | State) -> None:
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
     """Returns the JSON Schema of a message type, root object, as viewers want it."""
-    (_, ), components = msgspec.json.schema_components([kind])
+    (_,), components = msgspec.json.schema_components([kind])
     schema: dict[str, Any] = components[kind.__name__]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

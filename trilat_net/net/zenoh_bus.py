@@ -30,9 +30,8 @@ ASK_TIMEOUT_S = 1.0
 def configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
     """Returns the Zenoh configuration of a member of a session."""
     queue = {
-        "size": {
-            name: 16
-            for name in (
+        "size": dict.fromkeys(
+            (
                 "control",
                 "real_time",
                 "interactive_high",
@@ -41,8 +40,9 @@ def configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, An
                 "data",
                 "data_low",
                 "background",
-            )
-        },
+            ),
+            16,
+        ),
         "congestion_control": {"drop": {"wait_before_drop": 0}},
         "batching": {"enabled": True},
     }
@@ -131,7 +131,7 @@ class ZenohBus:
     def __init__(self, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> None:
         try:
             config = zenoh.Config.from_json5(json.dumps(configuration(listen, connect)))
-            self._session = zenoh.open(config)
+            self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
             raise UsageError(_open_problem(str(error), listen, connect)) from None
         self._kept: list[Any] = []
@@ -171,7 +171,8 @@ class ZenohBus:
     def questions(self, key: str) -> Questions:
         """See `Bus`."""
         return _QuestionRing(
-            self._session.declare_queryable(key, handlers.RingChannel(64), allowed_origin=Locality.REMOTE), key
+            self._session.declare_queryable(key, handlers.RingChannel(64), allowed_origin=Locality.REMOTE),
+            key,
         )
 
     def ask(self, key: str) -> Inbox:

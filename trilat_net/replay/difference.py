@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from ..core.site import Output
+from ..core.tick import Output
 from ..net.wire import State
 
 VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
@@ -51,7 +51,9 @@ def close(a: float, b: float) -> bool:
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
-def first_difference(logged: State, computed: Output, peers: tuple[str, ...], same: Same) -> Difference | None:
+def first_difference(
+    logged: State, computed: Output, peers: tuple[str, ...], same: Same
+) -> Difference | None:
     """Returns the first field in which a record differs from an execution, or None.
 
     Args:

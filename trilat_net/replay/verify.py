@@ -9,8 +9,10 @@ not be judged is counted.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from .. import collector
 from ..core.fingerprint import fingerprint
-from ..core.site import MAX_ARRIVALS, Arrival, Mode, Output, Site, Tick
+from ..core.site import Site
+from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
 from ..errors import WireError
 from ..log.reader import Log, SiteLog
 from ..net.wire import State, encode_state
@@ -62,9 +64,10 @@ def verify(log: Log) -> Verdict:
         LogError: a record cannot be read.
     """
     verdict = Verdict(whole_run=log.session.get("fingerprint") == fingerprint())
-    by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
-    for name in log.sites:
-        _Execution(log.scenario, log[name], by_tick, verdict).run()
+    with collector.paused():
+        by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+        for name in log.sites:
+            _Execution(log.scenario, log[name], by_tick, verdict).run()
     return verdict
 
 

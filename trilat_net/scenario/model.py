@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from ..core import dominance
 from ..core.arm import Array, Links, parameters
-from ..core.site import LinkSetup, Scheme, SiteSetup
+from ..core.setup import LinkSetup, Scheme, SiteSetup
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]

@@ -233,7 +233,9 @@ def _resolve_sites(tables: Table) -> Table:
         hands = site.get("hands", [])
         if not isinstance(hands, list):
             raise ScenarioError(f"must be a list of tables [[{path}.hands]]", path=f"{path}.hands")
-        site["hands"] = [_vectors(_known(h, _fields(Pulse), f"{path}.hands[{n}]")) for n, h in enumerate(hands)]
+        site["hands"] = [
+            _vectors(_known(h, _fields(Pulse), f"{path}.hands[{n}]")) for n, h in enumerate(hands)
+        ]
         sites[name] = {key: site[key] for key in _fields(SiteSpec)}
     if len(sites) < 2:
         raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from ..core.grid import NS_PER_S
-from ..core.site import Arrival, Output
+from ..core.tick import Arrival, Output
 
 
 class Network(Protocol):

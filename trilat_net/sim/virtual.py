@@ -9,8 +9,10 @@ import heapq
 from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
+from .. import collector
 from ..core.grid import NS_PER_S
-from ..core.site import Arrival, Mode, Output, Site, Tick
+from ..core.site import Site
+from ..core.tick import Arrival, Mode, Output, Tick, diverged_text
 from ..log.writer import LogWriter
 from ..net import topics
 from ..net.stats import LoopStats
@@ -94,12 +96,6 @@ class _Member:
         self._writer.add(self._keys[topics.EVENT], encode(event), t_ns, t_ns, self.ticks - 1)
 
 
-def diverged_text(site: str, output: Output) -> str:
-    """Says that a site has left the physics, where and how fast."""
-    speed = max(abs(v) for v in output.qd)
-    return f"{site} diverged at t = {output.t_ns * 1e-9:.3f} s: a joint moves at {speed:.4g} rad/s"
-
-
 def record(scenario: Scenario, stream: BinaryIO, network: Network | None = None) -> bool:
     """Runs a scenario in virtual time and writes its log.
 
@@ -118,12 +114,13 @@ def record(scenario: Scenario, stream: BinaryIO, network: Network | None = None)
     members: dict[str, _Member] = {}
     within = True
     t_ns = 0
-    for site, arrivals, output in run(scenario, network):
-        if site.name not in members:
-            members[site.name] = _Member(scenario, site, writer)
-        members[site.name].write(arrivals, output)
-        within &= output.mode is Mode.RUN
-        t_ns = output.t_ns
+    with collector.paused():
+        for site, arrivals, output in run(scenario, network):
+            if site.name not in members:
+                members[site.name] = _Member(scenario, site, writer)
+            members[site.name].write(arrivals, output)
+            within &= output.mode is Mode.RUN
+            t_ns = output.t_ns
     for name, member in members.items():
         member.say("end", f"{name} made {member.ticks} ticks", t_ns)
     writer.finish({name: member.ticks for name, member in members.items()})

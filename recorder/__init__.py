@@ -1,0 +1,1 @@
+"""The recording process: every channel of a session into one MCAP file."""

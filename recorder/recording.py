@@ -1,0 +1,154 @@
+"""What the recorder writes, and what it knows is missing.
+
+Law: a message is written byte for byte as it came, if it is a message of this session; whatever is not is
+counted by reason. The recorder says `stored` to a site when it has every record that the site made.
+"""
+
+from collections import Counter
+from typing import BinaryIO
+
+from trilat_net.errors import WireError
+from trilat_net.log.writer import LogWriter
+from trilat_net.net import topics
+from trilat_net.net.session import Epoch, Voice
+from trilat_net.net.wire import Event, LinkStats, State, decode, encode
+from trilat_net.scenario import Scenario
+
+from .tap import Arrived, Tap
+
+SETTLE_NS = 1_000_000_000
+"""How long to wait for what may still be under way once every site has ended or is gone."""
+
+
+class Recording:
+    """One file and its accounts.
+
+    Args:
+        stream: the file, opened for writing.
+        scenario: the scenario of the session.
+        session: the session's name.
+        epoch: its tick 0, and who its members are.
+        voice: the recorder's own events.
+    """
+
+    def __init__(
+        self, stream: BinaryIO, scenario: Scenario, session: str, epoch: Epoch, voice: Voice
+    ) -> None:
+        self._writer = LogWriter(stream, scenario, session, "live", epoch.unix_ns)
+        self._scenario, self._session, self._epoch, self._voice = scenario, session, epoch, voice
+        self._ends: dict[str, int] = {}
+        self._stored: set[str] = set()
+        self._gone: set[str] = set()
+        self._over_since_ns: int | None = None
+        self._overflowed = 0
+        self.dropped: Counter[str] = Counter()
+
+    def write(self, tap: Tap, now_ns: int) -> None:
+        """Writes what has come in, and answers sites whose records are complete."""
+        for arrived in tap.drain():
+            try:
+                self._take(arrived)
+            except WireError as error:
+                self.dropped[error.reason] += 1
+        for site, ticks in self._ends.items():
+            if site not in self._stored and self._writer.accounts[site].received >= ticks:
+                self._stored.add(site)
+                self._say("stored", f"every record of {site} is stored", now_ns, about=site, ticks=ticks)
+
+    def _take(self, arrived: Arrived) -> None:
+        where = topics.address(arrived.key)
+        if where is None or where.member not in self._scenario.sites:
+            raise WireError("stranger", arrived.key)
+        boot = self._epoch.boots.get(where.member)
+        log_time_ns = self._epoch.unix_ns + arrived.mono_ns - self._epoch.mono_ns
+        if where.channel == topics.STATE:
+            state = decode(arrived.payload, State)
+            _belongs(state.site == where.member and state.boot == boot, arrived.key)
+            fresh = self._writer.add_state(
+                where.member, arrived.key, arrived.payload, state.t_ns, log_time_ns, state.tick
+            )
+            self.dropped["duplicate"] += not fresh
+        elif where.channel == topics.LINK:
+            stats = decode(arrived.payload, LinkStats)
+            _belongs(stats.site == where.member and stats.boot == boot, arrived.key)
+            self._writer.add(arrived.key, arrived.payload, stats.t_ns, log_time_ns, stats.tick)
+        else:
+            event = decode(arrived.payload, Event)
+            _belongs(event.member == where.member and event.boot == boot, arrived.key)
+            t_ns = event.t_ns if event.t_ns >= 0 else log_time_ns - self._epoch.unix_ns
+            self._writer.add(arrived.key, arrived.payload, t_ns, log_time_ns, event.ticks)
+            if event.kind == "end":
+                self._ends[where.member] = event.ticks
+
+    def _say(self, kind: str, text: str, now_ns: int, **facts: object) -> None:
+        """Publishes an event of the recorder's own, and writes it."""
+        t_ns = now_ns - self._epoch.mono_ns
+        event = self._voice.say(kind, text, t_ns=t_ns, **facts)
+        key = topics.key(self._session, topics.RECORDER, topics.EVENT)
+        self._writer.add(key, encode(event), t_ns, self._epoch.unix_ns + t_ns, event.ticks)
+
+    def presence(self, key: str, alive: bool) -> None:
+        """Takes note of a member's token that appeared or disappeared."""
+        where = topics.address(key)
+        if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
+            return
+        (self._gone.discard if alive else self._gone.add)(where.member)
+
+    def over(self, now_ns: int) -> bool:
+        """True once every site has ended with all its records here, or is gone, and nothing more comes."""
+        sites = set(self._scenario.names)
+        if sites <= self._stored:
+            return True
+        if not sites <= self._gone | self._stored:
+            self._over_since_ns = None
+            return False
+        if self._over_since_ns is None:
+            self._over_since_ns = now_ns
+        return now_ns - self._over_since_ns > SETTLE_NS
+
+    def flush(self) -> None:
+        """Hands everything so far to the operating system."""
+        self._writer.flush()
+
+    def finish(self, tap: Tap) -> None:
+        """Writes the rest, the accounts and the end mark."""
+        for arrived in tap.drain():
+            try:
+                self._take(arrived)
+            except WireError as error:
+                self.dropped[error.reason] += 1
+        self._overflowed = tap.overflowed
+        counts = {f"dropped: {reason}": str(count) for reason, count in self.dropped.items() if count}
+        self._writer.finish(self._ends, {**counts, "overflowed": str(tap.overflowed)})
+
+    def summary(self) -> list[str]:
+        """Returns what was recorded, a line per site, for people."""
+        lines = []
+        for site, account in self._writer.accounts.items():
+            made = self._ends.get(site)
+            of = f" of {made}" if made is not None else ", it never said how many it made"
+            lines.append(
+                f"recorder: {site}: {account.received}{of} records, {account.missing} missing, "
+                f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
+            )
+        if self._overflowed:
+            lines.append(f"recorder: {self._overflowed} messages lost because the queue was full")
+        for reason, count in self.dropped.items():
+            if count:
+                lines.append(f"recorder: {count} messages dropped: {reason}")
+        return lines
+
+    def problem(self) -> str | None:
+        """Says what is missing, or None where everything is there."""
+        for site, account in self._writer.accounts.items():
+            if site not in self._ends:
+                return f"{site} disappeared after {account.received} records"
+            if account.missing:
+                return f"{account.missing} of {self._ends[site]} records of {site} are missing"
+        return None
+
+
+def _belongs(right: bool, key: str) -> None:
+    """Refuses a message whose sender is not the member that its key names."""
+    if not right:
+        raise WireError("stranger", key)

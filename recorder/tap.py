@@ -1,0 +1,49 @@
+"""Where messages come in: stamped at once, then queued for the one thread that writes.
+
+Law (L6): the queue is bounded; what overflows is counted, and shown.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from trilat_net.net.clock import Clock
+
+CAPACITY = 200_000
+"""Messages that wait at most: a minute of three sites at 1 kHz."""
+
+
+class Arrived(NamedTuple):
+    """One message as it came in: its key, its bytes, and when, on the monotonic clock."""
+
+    key: str
+    payload: bytes
+    mono_ns: int
+
+
+class Tap:
+    """A queue between the bus's thread, which takes, and the writer's, which drains.
+
+    Args:
+        clock: what stamps.
+
+    Attributes:
+        overflowed: messages lost because the queue was full.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._queue: deque[Arrived] = deque()
+        self.overflowed = 0
+
+    def take(self, key: str, payload: bytes) -> None:
+        """Takes one message; called by the bus."""
+        if len(self._queue) >= CAPACITY:
+            self.overflowed += 1
+            return
+        self._queue.append(Arrived(key, payload, self._clock.monotonic_ns()))
+
+    def drain(self) -> Iterator[Arrived]:
+        """Yields what waits, oldest first."""
+        while self._queue:
+            yield self._queue.popleft()

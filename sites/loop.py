@@ -1,0 +1,79 @@
+"""The live driver: a fixed-rate loop on an absolute grid.
+
+Law (L1): tick k lies at epoch + k periods. Lateness is telemetry and enters no formula; a late loop runs
+its missed ticks back to back and counts them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from trilat_net.core.grid import NS_PER_S
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Mode, Output, Tick
+from trilat_net.net.clock import Clock
+from trilat_net.net.session import Epoch
+from trilat_net.net.stats import LoopStats
+from trilat_net.net.wire import encode, encode_state
+
+from .intake import Intake
+
+
+@dataclass(slots=True)
+class Ports:
+    """What the loop touches besides its site.
+
+    Attributes:
+        clock: the time.
+        intake: the peers' samples.
+        publish_state: publishes a record.
+        publish_link: publishes statistics.
+        slack: called ten times a second, after the tick's work is done, with the tick and its nominal time.
+        stopped: True once the loop was asked to end.
+    """
+
+    clock: Clock
+    intake: Intake
+    publish_state: Callable[[bytes], None]
+    publish_link: Callable[[bytes], None]
+    slack: Callable[[int, int], None]
+    stopped: Callable[[], bool]
+
+
+def run_loop(
+    site: Site, boot: int, ticks: int, epoch: Epoch, stats: LoopStats, ports: Ports
+) -> Output | None:
+    """Runs a site in real time, from tick 0, and returns its last record.
+
+    Args:
+        site: the site, at its start.
+        boot: this process's boot.
+        ticks: how many ticks to make.
+        epoch: when tick 0 is.
+        stats: where the loop is accounted for.
+        ports: what the loop touches.
+
+    Returns:
+        The last record: its mode says whether the run stayed within its limits. None if it made no tick.
+    """
+    clock, intake = ports.clock, ports.intake
+    busy_us = 0
+    output = None
+    for k in range(ticks):
+        since_epoch_ns = k * NS_PER_S // site.rate_hz
+        deadline_ns = epoch.mono_ns + since_epoch_ns
+        clock.sleep_until(deadline_ns)
+        if ports.stopped():
+            break
+        woke_ns = clock.monotonic_ns()
+        late_us = max(0, (woke_ns - deadline_ns) // 1000)
+        arrivals = intake.drain(woke_ns - epoch.mono_ns)
+        output = site.step(Tick(k, arrivals))
+        ports.publish_state(encode_state(site.name, boot, site.peers, output, arrivals, late_us, busy_us))
+        stats.tick(late_us, busy_us)
+        if stats.due(k):
+            ports.publish_link(encode(stats.take(output)))
+            ports.slack(k, output.t_ns)
+        if output.mode is not Mode.RUN:
+            break
+        busy_us = (clock.monotonic_ns() - woke_ns) // 1000
+    return output

@@ -1,0 +1,262 @@
+"""One site as one process: from its scenario to its exit code.
+
+Law: a site declares itself alive only when its subscriptions stand and its step is compiled. Until the
+epoch its arm is braked; at the end it stays until the recorder has every record, or `LINGER_S`.
+"""
+
+import platform
+import signal
+import types
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from trilat_net.core.fingerprint import fingerprint
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Arrival, Mode, Output, Tick, diverged_text
+from trilat_net.errors import RunFailed, SessionError, WireError
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, Inbox
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.session import Epoch, Joining, Voice, new_boot
+from trilat_net.net.stats import LoopStats
+from trilat_net.net.wire import Event, Info, decode, encode_state
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.scenario import Scenario
+
+from . import realtime
+from .intake import Intake
+from .loop import Ports, run_loop
+
+LINGER_S = 5
+POLL_NS = 5_000_000
+_WARM_TICKS = 200
+
+
+class Interrupt:
+    """Remembers the first signal that asks the process to end.
+
+    Attributes:
+        number: that signal, or 0.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def install(self) -> None:
+        """Takes SIGINT and SIGTERM; a second one of them acts as it did before."""
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, self._take)
+
+    def _take(self, number: int, _frame: types.FrameType | None) -> None:
+        self.number = number
+        signal.signal(number, signal.default_int_handler)
+
+    def requested(self) -> bool:
+        """True once a signal has come."""
+        return self.number != 0
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a site takes part.
+
+    Attributes:
+        session: the session's name.
+        listen: endpoints to listen at.
+        connect: endpoints to connect to.
+        join_timeout_s: how long to wait for the others, s.
+        needs_recorder: whether a recorder must be there.
+        cpu: the processor to stay on, or None.
+    """
+
+    session: str
+    listen: Sequence[str]
+    connect: Sequence[str]
+    join_timeout_s: float = 60.0
+    needs_recorder: bool = False
+    cpu: int | None = None
+
+
+def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str], None]) -> int:
+    """Runs one site from its start to its end.
+
+    Args:
+        scenario: the experiment.
+        name: which of its sites this is.
+        options: how it takes part.
+        say: tells a person what happens.
+
+    Returns:
+        The exit code: 0, or 128 and the number of the signal that ended it.
+
+    Raises:
+        SessionError: the session could not begin.
+        UsageError: an endpoint cannot be used.
+        RunFailed: the run diverged.
+    """
+    interrupt = Interrupt()
+    interrupt.install()
+    bus = ZenohBus(options.listen, options.connect)
+    try:
+        return _Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
+    finally:
+        bus.close()
+
+
+def warm_up(scenario: Scenario, name: str) -> None:
+    """Steps a throw-away site, so that everything that a tick runs through is compiled and in memory."""
+    site = Site(scenario.setup(name))
+    for k in range(_WARM_TICKS):
+        arrivals = [
+            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0))
+            for j, link in enumerate(scenario.setup(name).links)
+            if k > 0
+        ]
+        output = site.step(Tick(k, arrivals))
+        encode_state(name, 0, site.peers, output, arrivals, 0, 0)
+
+
+class _Member:
+    """A site's life in a session."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        options: Options,
+        bus: Bus,
+        clock: Clock,
+        interrupt: Interrupt,
+        say: Callable[[str], None],
+    ) -> None:
+        self._scenario, self._name, self._options = scenario, name, options
+        self._bus, self._clock, self._interrupt, self._say = bus, clock, interrupt, say
+        self._site = Site(scenario.setup(name))
+        self._boot = new_boot()
+        rates = [scenario.sites[peer].rate_hz for peer in self._site.peers]
+        self._stats = LoopStats(self._site, self._boot, rates)
+        session = options.session
+        rings = [bus.inbox(topics.key(session, peer, topics.STATE)) for peer in self._site.peers]
+        self._intake = Intake(self._site.peers, rings, rates, self._stats.dropped)
+        self._publish_state = bus.publisher(topics.key(session, name, topics.STATE))
+        self._publish_link = bus.publisher(topics.key(session, name, topics.LINK))
+        self._peer_events = [bus.inbox(topics.key(session, p, topics.EVENT), 256) for p in self._site.peers]
+        self._ended_by = ""
+        self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
+        warm_up(scenario, name)
+        self._voice = Voice(
+            bus,
+            session,
+            Info(
+                member=name,
+                boot=self._boot,
+                scenario_sha256=scenario.sha256,
+                scenario=scenario.text,
+                host=platform.node(),
+                clock=clock.identity(),
+                fingerprint=fingerprint(),
+                needs_recorder=options.needs_recorder,
+            ),
+        )
+        self._joining = Joining(bus, clock, session, self._voice, scenario.names)
+        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+
+    def live(self) -> int:
+        """Joins, runs, leaves."""
+        epoch = self._join()
+        if epoch is None:
+            return 128 + self._interrupt.number
+        self._epoch = epoch
+        self._intake.admit([epoch.boots[peer] for peer in self._site.peers])
+        self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
+        obtained = realtime.prepare(self._options.cpu)
+        self._voice.say("setup", ", ".join(f"{key}: {value}" for key, value in obtained.items()))
+        self._say(f"{self._name}: the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
+        ports = Ports(
+            self._clock,
+            self._intake,
+            self._publish_state,
+            self._publish_link,
+            self._slack,
+            lambda: self._interrupt.requested() or bool(self._ended_by),
+        )
+        ticks = self._scenario.ticks(self._name)
+        output = run_loop(self._site, self._boot, ticks, epoch, self._stats, ports)
+        return self._leave(output)
+
+    def _join(self) -> Epoch | None:
+        """Waits for the others; None where a signal came first."""
+        clock = self._clock
+        give_up_ns = clock.monotonic_ns() + int(self._options.join_timeout_s * 1e9)
+        self._say(f"{self._name}: waiting for {', '.join(self._joining.missing()) or 'the epoch'}")
+        while not self._interrupt.requested():
+            epoch = self._joining.poll()
+            if epoch is not None:
+                return epoch
+            now_ns = clock.monotonic_ns()
+            if now_ns > give_up_ns:
+                missing = self._joining.missing()
+                who = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+                raise SessionError(
+                    f"{self._name} waited {self._options.join_timeout_s:g} s in session "
+                    f"{self._options.session!r}: {who}"
+                )
+            clock.sleep_until(now_ns + POLL_NS)
+        return None
+
+    def _slack(self, _k: int, t_ns: int) -> None:
+        """Ten times a second: answers questions, and says who is gone or back."""
+        self._voice.answer()
+        while (change := self._presence.poll()) is not None:
+            where = topics.address(change[0])
+            if where is None or self._epoch.boots.get(where.member) != int(where.boot):
+                continue
+            if not change[1]:
+                self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
+        for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):
+            for event in _events(inbox):
+                if event.kind == "diverged" and event.boot == self._epoch.boots[peer]:
+                    self._ended_by = event.text
+
+    def _leave(self, output: Output | None) -> int:
+        """Says how the run ended, and stays until the recorder has all of it."""
+        ticks = 0 if output is None else output.tick + 1
+        t_ns = -1 if output is None else output.t_ns
+        diverged = output is not None and output.mode is Mode.DIVERGED
+        if output is not None and diverged:
+            self._voice.say("diverged", diverged_text(self._name, output), t_ns=t_ns, ticks=ticks)
+        self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
+        if topics.RECORDER in self._epoch.boots:
+            self._await_recorder(ticks)
+        dropped = ", ".join(f"{count} {reason}" for reason, count in self._stats.dropped.items())
+        self._say(
+            f"{self._name}: {ticks} ticks, {self._stats.overruns} of them late by a period or more"
+            + (f"; dropped: {dropped}" if dropped else "")
+        )
+        if output is not None and diverged:
+            raise RunFailed(diverged_text(self._name, output))
+        if self._ended_by:
+            raise RunFailed(f"{self._name} ended because {self._ended_by}")
+        return 128 + self._interrupt.number if self._interrupt.requested() else 0
+
+    def _await_recorder(self, ticks: int) -> None:
+        """Waits for the recorder's word that it has every record, at most `LINGER_S`."""
+        clock = self._clock
+        give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
+        while clock.monotonic_ns() < give_up_ns:
+            self._voice.answer()
+            for event in _events(self._recorder_events):
+                if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
+                    return
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+
+
+def _events(inbox: Inbox) -> Iterator[Event]:
+    """Yields the events that wait; what is none of ours is passed over."""
+    while (message := inbox.poll()) is not None:
+        try:
+            yield decode(message[1], Event)
+        except WireError:
+            continue

@@ -1,0 +1,89 @@
+"""What a process can do to be woken in time, and what it obtained.
+
+Law: every step warns and goes on. A loop without privileges runs as well as it can, and its log says how
+that was.
+"""
+
+import ctypes
+import os
+import sys
+from collections.abc import Callable
+
+from trilat_net import collector
+
+FIFO_PRIORITY = 50
+NICE = -10
+
+_PR_SET_TIMERSLACK = 29
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+
+
+def prepare(cpu: int | None) -> dict[str, str]:
+    """Asks for all that helps a loop, and returns what was obtained, by name.
+
+    Args:
+        cpu: the processor to stay on, or None for any.
+    """
+    steps: dict[str, Callable[[], str]] = {
+        "affinity": lambda: _affinity(cpu),
+        "timer_slack": _timer_slack,
+        "memory": _lock_memory,
+        "scheduling": _schedule,
+        "collector": _stop_collector,
+    }
+    return {name: _attempt(step) for name, step in steps.items()}
+
+
+def _attempt(step: Callable[[], str]) -> str:
+    try:
+        return step()
+    except (OSError, AttributeError) as error:
+        return f"not obtained ({getattr(error, 'strerror', None) or 'not on this platform'})"
+
+
+def _affinity(cpu: int | None) -> str:
+    if cpu is not None:
+        os.sched_setaffinity(0, {cpu})
+    return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
+
+
+def _libc_call(function: str, *arguments: int) -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if getattr(libc, function)(*arguments) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def _linux_only() -> None:
+    if not sys.platform.startswith("linux"):
+        raise AttributeError
+
+
+def _timer_slack() -> str:
+    _linux_only()
+    _libc_call("prctl", _PR_SET_TIMERSLACK, 1)
+    return "1 ns"
+
+
+def _lock_memory() -> str:
+    _linux_only()
+    _libc_call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    return "locked"
+
+
+def _schedule() -> str:
+    """SCHED_FIFO for this thread, else a better nice value, else as it is."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except (OSError, AttributeError):
+        try:
+            os.setpriority(os.PRIO_PROCESS, 0, NICE)
+        except (OSError, AttributeError):
+            return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
+        return f"nice {NICE} (SCHED_FIFO was not permitted)"
+    return f"SCHED_FIFO {FIFO_PRIORITY}"
+
+
+def _stop_collector() -> str:
+    collector.off_for_good()
+    return "frozen and off"

@@ -1,0 +1,215 @@
+"""One tick of one site, compiled: the state's layout, and the eight stages in order.
+
+Law: one call computes a whole tick, and every stage is a leaf that other drivers of the same numbers (the
+fused virtual-time kernel) call as well. A site's state is one row of a structured array: one argument
+that costs a quarter of a microsecond to pass, and fields with the paper's names.
+"""
+
+import math
+
+import numpy as np
+
+from . import control
+from .arm import JOINTS, PARAMETERS, Array, regressor
+from .exogenous import torque_on_arm
+from .grid import tick_ns
+from .integrator import STAGE_ROWS, advance
+from .jit import leaf
+from .link import Row, Rows, Ticks, accept, recall
+from .setup import Scheme
+from .tick import Mode
+
+_VECTOR = (JOINTS,)
+SITE = np.dtype(
+    (
+        np.record,
+        [
+            ("rate_hz", "i8"),
+            ("scheme", "i8"),
+            ("mode", "i8"),
+            ("g", "f8"),
+            ("tau_limit", "f8"),
+            ("qd_limit", "f8"),
+            ("theta", "f8", (PARAMETERS,)),
+            ("Lambda", "f8", _VECTOR),
+            ("Kp", "f8", _VECTOR),
+            ("Kd", "f8", _VECTOR),
+            ("Gamma", "f8", (PARAMETERS,)),
+            # the state
+            ("q", "f8", _VECTOR),
+            ("qd", "f8", _VECTOR),
+            ("theta_hat", "f8", (PARAMETERS,)),
+            ("tau", "f8", _VECTOR),
+            ("tau_before", "f8", _VECTOR),
+            ("Yr", "f8", (PARAMETERS,)),
+            ("Yr_before", "f8", (PARAMETERS,)),
+            # what a tick computes on its way
+            ("q_des", "f8", _VECTOR),
+            ("qd_des", "f8", _VECTOR),
+            ("on_arm", "f8", _VECTOR),
+            ("e", "f8", _VECTOR),
+            ("ed", "f8", _VECTOR),
+            ("r", "f8", _VECTOR),
+            ("v", "f8", _VECTOR),
+            ("a", "f8", _VECTOR),
+            ("u", "f8", _VECTOR),
+            ("q_kept", "f8", _VECTOR),
+            ("qd_kept", "f8", _VECTOR),
+            ("Y", "f8", (JOINTS, PARAMETERS)),
+            ("work", "f8", (STAGE_ROWS, JOINTS)),
+        ],
+    )
+)
+ARRIVAL = np.dtype((np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", _VECTOR), ("qd", "f8", _VECTOR)]))
+
+# Where each vector of a record lies in the row of floats that a tick emits.
+EMITTED = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+ROW_FLOATS = 6 * JOINTS + PARAMETERS
+
+_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_DIGITAL = int(Scheme.DIGITAL)
+
+
+@leaf
+def _reference(links: Rows, q_des: Array, qd_des: Array) -> None:
+    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order."""
+    q_des[:] = 0.0
+    qd_des[:] = 0.0
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        for i in range(q_des.shape[0]):
+            q_des[i] += link.alpha * link.q[i]
+            qd_des[i] += link.alpha * link.qd[i]
+
+
+@leaf
+def _errors_and_regressor(site: Row) -> None:
+    """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
+    control.errors(site.q, site.qd, site.q_des, site.qd_des, site.Lambda, site.e, site.ed, site.r)
+    for i in range(site.q.shape[0]):
+        site.v[i] = -site.Lambda[i] * site.e[i]
+        site.a[i] = -site.Lambda[i] * site.ed[i]
+    regressor(site.g, site.q, site.qd, site.v, site.a, site.Y)
+    control.regressor_transpose_times(site.Y, site.r, site.Yr)
+
+
+@leaf
+def _finite(site: Row) -> bool:
+    """True while the arm's state is made of numbers that a record can hold."""
+    for i in range(site.q.shape[0]):
+        if not (math.isfinite(site.q[i]) and math.isfinite(site.qd[i])):
+            return False
+    return True
+
+
+@leaf
+def _within_limits(site: Row) -> bool:
+    """True while every joint speed is within the divergence stop."""
+    for i in range(site.qd.shape[0]):
+        if not abs(site.qd[i]) <= site.qd_limit:
+            return False
+    return True
+
+
+@leaf
+def _emit(site: Row, row: Array) -> None:
+    """Writes the record's floats in the order of EMITTED."""
+    n = site.q.shape[0]
+    for i in range(n):
+        row[i] = site.q[i]
+        row[n + i] = site.qd[i]
+        row[2 * n + i] = site.q_des[i]
+        row[3 * n + i] = site.qd_des[i]
+        row[4 * n + i] = site.tau[i]
+        row[5 * n + i] = 0.0 - site.on_arm[i]  # 0.0, never -0.0, where nothing acts
+    for p in range(site.theta_hat.shape[0]):
+        row[6 * n + p] = site.theta_hat[p]
+
+
+@leaf
+def _advance(k: int, site: Row, pulses: Array) -> None:
+    """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
+    h_s = 1.0 / site.rate_hz
+    for i in range(site.u.shape[0]):
+        if site.scheme == _DIGITAL or k == 0:
+            site.u[i] = site.tau[i]
+        else:
+            ahead = 1.5 * site.tau[i] - 0.5 * site.tau_before[i]
+            site.u[i] = min(max(ahead, -site.tau_limit), site.tau_limit)
+    site.q_kept[:] = site.q
+    site.qd_kept[:] = site.qd
+    t_s = tick_ns(k, site.rate_hz) * 1e-9
+    advance(t_s, h_s, site.q, site.qd, site.u, site.theta, site.g, pulses, site.work)
+    if not _finite(site):
+        site.q[:] = site.q_kept
+        site.qd[:] = site.qd_kept
+        site.mode = _DIVERGED
+    if site.scheme == _DIGITAL:
+        control.estimate(site.theta_hat, h_s, site.Gamma, site.Yr)
+    site.tau_before[:] = site.tau
+    site.Yr_before[:] = site.Yr
+
+
+@leaf
+def site_accept(
+    k: int, count: int, site: Rows, links: Rows, samples: Rows, calendars: Ticks, arrivals: Rows
+) -> None:
+    """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
+    rate_hz = site[0].rate_hz
+    for n in range(count):
+        arrival: Row = arrivals[n]
+        j = arrival.peer
+        accept(k, rate_hz, arrival.tick, arrival.q, arrival.qd, links[j], samples[j], calendars[j])
+
+
+@leaf
+def site_tick(
+    k: int,
+    count: int,
+    site: Row,
+    links: Rows,
+    samples: Rows,
+    calendars: Ticks,
+    arrivals: Rows,
+    pulses: Array,
+    row: Array,
+) -> None:
+    """Computes one tick of one site; what `Site.step` and the virtual-time kernel both call.
+
+    Args:
+        k: the tick.
+        count: how many rows of `arrivals` are filled.
+        site: the site's state and constants, one row of dtype SITE, shape (1,).
+        links: one row per peer, shape (P,), dtype LINK.
+        samples: where samples wait, shape (P, pages), dtype SAMPLE.
+        calendars: the links' calendars, shape (P, pages).
+        arrivals: what came in, shape (MAX_ARRIVALS,), dtype ARRIVAL.
+        pulses: the operator's torque, see `exogenous`.
+        row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
+    """
+    s: Row = site[0]
+    site_accept(k, count, site, links, samples, calendars, arrivals)  # 1 accept
+    for j in range(links.shape[0]):  # 2 recall
+        recall(k, links[j], samples[j], calendars[j])
+    _reference(links, s.q_des, s.qd_des)  # 3 reference
+    _errors_and_regressor(s)  # 4 errors
+    if s.scheme != _DIGITAL and k > 0 and s.mode == _RUN:  # 5 estimate: the trapezoid rule, explicit
+        half_s = 0.5 / s.rate_hz
+        for p in range(s.Yr.shape[0]):
+            s.theta_hat[p] -= half_s * s.Gamma[p] * (s.Yr_before[p] + s.Yr[p])
+    control.torque(s.Y, s.theta_hat, s.Kp, s.Kd, s.r, s.ed, s.tau_limit, s.tau)  # 6 torque
+    torque_on_arm(tick_ns(k, s.rate_hz) * 1e-9, pulses, s.on_arm)
+    if not _within_limits(s):
+        s.mode = _DIVERGED
+    _emit(s, row)  # 7 emit
+    if s.mode == _RUN:  # 8 advance
+        _advance(k, s, pulses)
+
+
+@leaf
+def site_resume(k: int, site: Rows, pulses: Array) -> None:
+    """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
+    s: Row = site[0]
+    _errors_and_regressor(s)
+    if s.mode == _RUN:
+        _advance(k, s, pulses)

@@ -1,0 +1,109 @@
+"""What a person does with a scenario or a log, in Python; every command of `trilat` is one of these.
+
+Law: no logic that is not the joining of parts: scenario, virtual time, log, execution, analysis.
+"""
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+from .core.tick import Output
+from .errors import UsageError
+from .log.reader import Log, open_log
+from .replay.comparison import Comparison, LateSample, compare, late_samples, schedule
+from .replay.verify import Verdict, verify
+from .scenario import Scenario, load
+from .sim import virtual
+from .sim.network import Network, RecordedNetwork
+
+__all__ = [
+    "Twins",
+    "Verdict",
+    "compare_with_virtual",
+    "new_file",
+    "open_log",
+    "record_virtual",
+    "simulate",
+    "twin_without_hands",
+    "verify",
+]
+
+
+def simulate(
+    scenario: str | Path | Scenario,
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+) -> Log:
+    """Runs a scenario in virtual time and returns its log.
+
+    Args:
+        scenario: the name of a shipped scenario, a path, or a scenario.
+        set: overrides, as in `{"control.Kd": 5}`.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid.
+    """
+    stream = io.BytesIO()
+    virtual.record(load(scenario, set), stream)
+    stream.seek(0)
+    return open_log(stream)
+
+
+def new_file(path: Path, force: bool) -> BinaryIO:
+    """Opens a file for writing that must not exist yet, unless it may be replaced.
+
+    Raises:
+        UsageError: it exists, or cannot be made.
+    """
+    try:
+        return path.open("wb" if force else "xb")
+    except FileExistsError:
+        raise UsageError(f"{path}: exists; choose another name, or replace it with --force") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def record_virtual(scenario: Scenario, path: Path, *, force: bool = False) -> bool:
+    """Runs a scenario in virtual time into a file; False where the run diverged.
+
+    Raises:
+        UsageError: the file exists, or cannot be made.
+        LogError: the disk refused.
+    """
+    with new_file(path, force) as stream:
+        return virtual.record(scenario, stream)
+
+
+class Twins(NamedTuple):
+    """A log against virtual time.
+
+    Attributes:
+        fed: against virtual time fed with the log's arrivals; equal always.
+        plain: against plain virtual time; equal until the first late sample.
+        late: the samples that came after they were due.
+    """
+
+    fed: Comparison
+    plain: Comparison
+    late: list[LateSample]
+
+
+def compare_with_virtual(log: Log) -> Twins:
+    """Runs a log's scenario again in virtual time, with its arrivals and without, and compares."""
+    scenario = log.scenario
+    peers = {name: scenario.peers(name) for name in scenario.names}
+    recorded = RecordedNetwork(schedule(log), peers)
+    return Twins(
+        compare(log, _outputs(scenario, recorded), arrivals=True),
+        compare(log, _outputs(scenario, None), arrivals=False),
+        late_samples(log),
+    )
+
+
+def _outputs(scenario: Scenario, network: Network | None) -> Iterator[tuple[str, Output]]:
+    return ((site.name, output) for site, _, output in virtual.run(scenario, network))
+
+
+def twin_without_hands(log: Log) -> Log:
+    """Returns the log's experiment in virtual time with nobody at the arms."""
+    return simulate(log.scenario.without_hands())

@@ -1,0 +1,247 @@
+"""How the members of a session find together and agree on one epoch.
+
+Law: one epoch whatever the start order. The first site of the scenario leads: with every member's answer
+in and equal where it must be, it announces an epoch and the boots that it is for; when all have answered
+`ready` in time it says `start`, and otherwise announces another one. Nobody starts without `start`.
+
+Everything here is polled, on a `Bus` and a `Clock` that it is given; nothing waits.
+"""
+
+import secrets
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from ..errors import SessionError, WireError
+from . import topics
+from .bus import Bus
+from .clock import Clock
+from .wire import Event, Info, decode, encode
+
+AHEAD_NS = 700_000_000
+"""How far ahead an epoch is announced."""
+DECIDE_NS = 150_000_000
+"""How long before the epoch every answer must be in."""
+ASK_EVERY_NS = 200_000_000
+
+
+class Epoch(NamedTuple):
+    """Tick 0 of a session.
+
+    Attributes:
+        mono_ns: on this process's monotonic clock.
+        unix_ns: in Unix time, as the leader read it.
+        boots: the members and their boots.
+    """
+
+    mono_ns: int
+    unix_ns: int
+    boots: dict[str, int]
+
+
+def new_boot() -> int:
+    """Returns a random number that names one start of one process."""
+    return secrets.randbits(64)
+
+
+class Voice:
+    """A member's own events and answers.
+
+    Args:
+        bus: its connection.
+        session: the session's name.
+        info: what it answers when asked who it is.
+
+    Attributes:
+        info: what it answers when asked who it is.
+    """
+
+    def __init__(self, bus: Bus, session: str, info: Info) -> None:
+        self.info = info
+        self._publish = bus.publisher(topics.key(session, info.member, topics.EVENT))
+        self._questions = bus.questions(topics.key(session, info.member, topics.INFO))
+
+    def say(self, kind: str, text: str, **facts: object) -> Event:
+        """Publishes an event and returns it."""
+        event = msgspec.convert(
+            {"member": self.info.member, "boot": self.info.boot, "kind": kind, "text": text, **facts}, Event
+        )
+        self._publish(encode(event))
+        return event
+
+    def answer(self) -> None:
+        """Answers who asks who this is."""
+        while (question := self._questions.poll()) is not None:
+            question.answer(encode(self.info))
+
+
+class Joining:
+    """One member's way into a session; call `poll` until it returns the epoch.
+
+    Args:
+        bus: its connection, on which its subscriptions stand already.
+        clock: the time.
+        session: the session's name.
+        voice: its own events and answers.
+        sites: the sites of the scenario, in order; empty for a member that learns them (the recorder).
+
+    Attributes:
+        met: what the other members said of themselves, by name.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, voice: Voice, sites: Sequence[str]) -> None:
+        self.met: dict[str, Info] = {}
+        self._bus, self._clock, self._session, self._voice = bus, clock, session, voice
+        self._sites = tuple(sites)
+        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
+        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._asked_ns = -ASK_EVERY_NS
+        self._replies = bus.ask(topics.key(session, "*", topics.INFO))
+        self._announced: Event | None = None
+        self._attempt = 0
+        self._ready: set[str] = set()
+        self._refused: set[int] = set()
+        bus.announce(topics.key(session, voice.info.member, topics.ALIVE) + f"/{voice.info.boot}")
+
+    @property
+    def _own(self) -> Info:
+        return self._voice.info
+
+    @property
+    def _leads(self) -> bool:
+        return bool(self._sites) and self._sites[0] == self._own.member
+
+    def missing(self) -> list[str]:
+        """Returns the members that have not been met."""
+        wanted = [*self._sites, *([topics.RECORDER] if self._own.needs_recorder else [])]
+        return [name for name in wanted if name != self._own.member and name not in self.met]
+
+    def poll(self) -> Epoch | None:
+        """Does what is to be done now; returns the epoch once it is fixed.
+
+        Raises:
+            SessionError: this member cannot be part of the session, and why.
+        """
+        self._voice.answer()
+        self._meet()
+        self._watch()
+        started = self._listen()
+        if started is None and self._leads:
+            started = self._lead()
+        return None if started is None else self._epoch(started)
+
+    def _meet(self) -> None:
+        """Asks again and again who is there, and takes the answers."""
+        now_ns = self._clock.monotonic_ns()
+        while (reply := self._replies.poll()) is not None:
+            try:
+                self._take(decode(reply[1], Info))
+            except WireError as error:
+                raise SessionError(f"a member of {self._session!r} cannot be understood: {error}") from None
+        if now_ns - self._asked_ns >= ASK_EVERY_NS:
+            self._asked_ns = now_ns
+            self._replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
+
+    def _take(self, info: Info) -> None:
+        own = self._own
+        if info.boot == own.boot:
+            return
+        invited = self._announced is not None and own.boot in self._announced.boots.values()
+        if info.running and not invited:
+            raise SessionError(f"session {self._session!r} is running; {info.member} is at tick {info.ticks}")
+        if info.member == own.member:
+            if info.boot < own.boot:
+                raise SessionError(f"there is a {own.member} in session {self._session!r} already")
+            return
+        if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
+            self._refuse(info)
+            return
+        if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
+            self.met[info.member] = info
+
+    def _refuse(self, info: Info) -> None:
+        """The leader's scenario is the session's: others leave, and the leader says why."""
+        own = self._own
+        text = (
+            f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
+            f"{own.member} has {own.scenario_sha256[:16]}"
+        )
+        if not self._leads and info.member == self._sites[0]:
+            raise SessionError(f"{text}; the one of {info.member}, who leads, counts")
+        if self._leads and info.boot not in self._refused:
+            self._refused.add(info.boot)
+            self._voice.say("refused", text, about=info.member)
+
+    def _watch(self) -> None:
+        """Forgets members that are gone."""
+        while (change := self._presence.poll()) is not None:
+            key, alive = change
+            where = topics.address(key)
+            if where is None or alive:
+                continue
+            met = self.met.get(where.member)
+            if met is not None and str(met.boot) == where.boot:
+                del self.met[where.member]
+
+    def _listen(self) -> Event | None:
+        """Takes events; returns the announcement that has been started."""
+        while (message := self._events.poll()) is not None:
+            try:
+                event = decode(message[1], Event)
+            except WireError:
+                continue  # a stranger's; the loop counts those, joining has no use for them
+            if event.kind == "epoch":
+                self._consider(event)
+            elif event.kind == "ready" and self._announced and event.attempt == self._announced.attempt:
+                self._ready.add(event.member)
+            elif event.kind == "start" and self._announced and event.attempt == self._announced.attempt:
+                return self._announced
+        return None
+
+    def _consider(self, event: Event) -> None:
+        """Answers an announced epoch, if it is for this boot."""
+        if not self._sites and not any(info.scenario for info in self.met.values()):
+            return  # a recorder that has not learnt the scenario yet is not ready
+        if event.boots.get(self._own.member) == self._own.boot:
+            self._announced = event
+            self._voice.say("ready", f"{self._own.member} is ready", attempt=event.attempt)
+        elif self._own.member in event.boots:
+            raise SessionError(f"session {self._session!r} goes on with another {self._own.member}")
+
+    def _lead(self) -> Event | None:
+        """Announces an epoch when all are there; returns it when all are ready in time."""
+        now_ns = self._clock.monotonic_ns()
+        announced = self._announced
+        if announced is not None:
+            others = set(announced.boots) - {self._own.member}
+            if now_ns >= announced.epoch_mono_ns - DECIDE_NS or not others <= set(self.met):
+                self._announced = None  # somebody was too late, or is gone: another attempt
+            elif self._ready >= others:
+                self._voice.say("start", "all are ready", attempt=announced.attempt)
+                return announced
+            return None
+        if not self.missing():
+            self._announce(now_ns)
+        return None
+
+    def _announce(self, now_ns: int) -> None:
+        boots = {name: info.boot for name, info in self.met.items()} | {self._own.member: self._own.boot}
+        self._ready = set()
+        self._attempt += 1
+        self._announced = self._voice.say(
+            "epoch",
+            f"{', '.join(sorted(boots))}: tick 0 is {AHEAD_NS // 1_000_000} ms from now",
+            attempt=self._attempt,
+            epoch_mono_ns=now_ns + AHEAD_NS,
+            epoch_unix_ns=self._clock.unix_ns() + AHEAD_NS,
+            clock=self._clock.identity(),
+            boots=boots,
+        )
+
+    def _epoch(self, event: Event) -> Epoch:
+        """Puts an announced epoch onto this process's monotonic clock."""
+        mono_ns = event.epoch_mono_ns
+        if event.clock != self._clock.identity():  # another machine: by the wall clocks of both
+            mono_ns = event.epoch_unix_ns - self._clock.unix_ns() + self._clock.monotonic_ns()
+        return Epoch(mono_ns, event.epoch_unix_ns, dict(event.boots))

@@ -1,0 +1,94 @@
+"""Compares a log with another execution of the same experiment, and names the first late sample.
+
+Law (L2): virtual time fed with a log's arrivals equals that log on every tick, always; plain virtual time
+equals it as long as no sample came after it was due.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from ..core.site import Site
+from ..core.tick import Output
+from ..log.reader import Log
+from .difference import Difference, first_difference, same_bits
+
+
+class Comparison(NamedTuple):
+    """How far two executions agree.
+
+    Attributes:
+        records: records compared.
+        identical: those of which every computed field has the same bits.
+        first: the first difference, by tick and then by site, or None.
+    """
+
+    records: int
+    identical: int
+    first: Difference | None
+
+
+class LateSample(NamedTuple):
+    """A sample that came after it was due.
+
+    Attributes:
+        site: who received it.
+        peer: who sent it.
+        tick: the sample's own tick.
+        due_tick: the receiver's tick at which it was due.
+        arrived_tick: the receiver's tick at which it was taken in.
+    """
+
+    site: str
+    peer: str
+    tick: int
+    due_tick: int
+    arrived_tick: int
+
+    def __str__(self) -> str:
+        return (
+            f"sample {self.tick} of {self.peer} was due at tick {self.due_tick} of {self.site} "
+            f"and came at tick {self.arrived_tick}"
+        )
+
+
+def compare(log: Log, executed: Iterable[tuple[str, Output]], *, arrivals: bool) -> Comparison:
+    """Compares every record of a log with another execution, bit for bit.
+
+    Args:
+        log: the log.
+        executed: the other execution: (site, record), in any order.
+        arrivals: whether arrivals must be the same too, or only what was computed from them.
+    """
+    by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+    records = identical = 0
+    first: Difference | None = None
+    for site, output in executed:
+        state = by_tick[site].get(output.tick)
+        if state is None:
+            continue
+        records += 1
+        computed = output if arrivals else output._replace(rx_crc=state.rx_crc)
+        difference = first_difference(state, computed, log[site].peers, same_bits)
+        if difference is None:
+            identical += 1
+        elif first is None or difference.tick < first.tick:
+            first = difference
+    return Comparison(records, identical, first)
+
+
+def late_samples(log: Log) -> list[LateSample]:
+    """Returns every sample that came after it was due, by the tick at which it was due."""
+    late = []
+    for name in log.sites:
+        site = Site(log.scenario.setup(name))
+        for state in log[name].states:
+            for peer, tick, _ in state.rx:
+                due = site.release_tick(peer, tick)
+                if due < state.tick:
+                    late.append(LateSample(name, site.peers[peer], tick, due, state.tick))
+    return sorted(late, key=lambda sample: sample.due_tick)
+
+
+def schedule(log: Log) -> dict[str, dict[int, list[list[int]]]]:
+    """Returns what arrived when: per site and tick the arrivals, as a `RecordedNetwork` wants them."""
+    return {name: {state.tick: state.rx for state in log[name].states} for name in log.sites}
