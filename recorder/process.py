@@ -92,7 +92,8 @@ class Recorder:
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
                 met = ", ".join(self._joining.met) or "nobody"
                 raise SessionError(
-                    f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; it met {met}"
+                    f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
+                    f"it met {met}"
                 )
             self._clock.sleep_until(now_ns + POLL_NS)
         return None

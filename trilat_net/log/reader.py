@@ -80,7 +80,7 @@ class SiteLog:
     @cached_property
     def t_s(self) -> Array:
         """Nominal time since the epoch, shape (K,), s."""
-        return self._numbers("t_ns") * 1e-9
+        return self._numbers("t_ns").astype(np.float64) * 1e-9
 
     @cached_property
     def q(self) -> Array:
