@@ -17,8 +17,9 @@ from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.session import Epoch, Joining, Voice, new_boot
-from trilat_net.net.wire import Info
+from trilat_net.net.endpoints import default_endpoint, default_endpoints
+from trilat_net.net.session import ASK_EVERY_NS, Epoch, Joining, Voice, new_boot, token
+from trilat_net.net.wire import Info, decode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import parse
 
@@ -36,6 +37,7 @@ class Recorder:
         bus: the connection.
         clock: the time.
         session: the session's name.
+        boot: this process's boot.
         path: where the log goes; must not exist.
         stopped: True once the recorder was asked to end.
         say: tells a person what happens.
@@ -46,6 +48,7 @@ class Recorder:
         bus: Bus,
         clock: Clock,
         session: str,
+        boot: int,
         path: Path,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
@@ -61,7 +64,7 @@ class Recorder:
             session,
             Info(
                 member=topics.RECORDER,
-                boot=new_boot(),
+                boot=boot,
                 scenario_sha256="",
                 scenario="",
                 host=platform.node(),
@@ -137,11 +140,54 @@ class Recorder:
             self._clock.sleep_until(now_ns + POLL_NS)
 
 
+class Discovery:
+    """Asks the first site of a session, on this machine, where the others are.
+
+    It announces the recorder meanwhile, so that the session does not begin without it.
+
+    Args:
+        session: the session's name.
+        boot: the recorder's boot.
+    """
+
+    def __init__(self, session: str, boot: int) -> None:
+        self._session = session
+        self._first = default_endpoint(session, 0)
+        self._bus = ZenohBus([], [self._first])
+        self._bus.announce(token(session, topics.RECORDER, boot))
+
+    def endpoints(self, clock: Clock, stopped: Callable[[], bool], timeout_s: float | None) -> list[str]:
+        """Returns the default endpoints of the session's sites, once the first has said who they are.
+
+        Raises:
+            SessionError: it did not answer in time.
+        """
+        begun_ns = clock.monotonic_ns()
+        while not stopped():
+            replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
+            clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
+            while (reply := replies.poll()) is not None:
+                info = decode(reply[1], Info)
+                if info.scenario:
+                    names = parse(info.scenario, info.member).names
+                    return list(default_endpoints(self._session, names).values())
+            if timeout_s is not None and clock.monotonic_ns() - begun_ns > timeout_s * 1e9:
+                raise SessionError(
+                    f"the recorder waited {timeout_s:g} s for the first site of session {self._session!r} "
+                    f"at {self._first}; name other endpoints with --connect"
+                )
+        return [self._first]
+
+    def close(self) -> None:
+        """Leaves; by then the recorder has announced itself to all sites."""
+        self._bus.close()
+
+
 def record_session(
     session: str,
     path: Path,
     listen: Sequence[str],
-    connect: Sequence[str],
+    connect: Sequence[str] | None,
     join_timeout_s: float | None,
     say: Callable[[str], None],
 ) -> int:
@@ -151,7 +197,7 @@ def record_session(
         session: the session's name.
         path: where the log goes; must not exist.
         listen: endpoints to listen at.
-        connect: endpoints to connect to.
+        connect: endpoints to connect to; None to ask the session's first site, on this machine.
         join_timeout_s: how long to wait for the session to begin, s, or None.
         say: tells a person what happens.
 
@@ -168,11 +214,23 @@ def record_session(
 
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, take)
-    bus = ZenohBus(listen, connect)
+    clock = SystemClock()
+    say(f"recorder: waiting for session {session!r} to begin")
+    boot = new_boot()
+    discovery = Discovery(session, boot) if connect is None else None
     try:
-        recorder = Recorder(bus, SystemClock(), session, path, lambda: bool(signals), say)
-        say(f"recorder: waiting for session {session!r} to begin")
+        if discovery is not None:
+            connect = discovery.endpoints(clock, lambda: bool(signals), join_timeout_s)
+        bus = ZenohBus(listen, connect or [])
+    except BaseException:
+        if discovery is not None:
+            discovery.close()
+        raise
+    try:
+        recorder = Recorder(bus, clock, session, boot, path, lambda: bool(signals), say)
         epoch = recorder.join(join_timeout_s)
+        if discovery is not None:
+            discovery.close()
         if epoch is None:
             say("recorder: ended before the session began; nothing was written")
             return 128 + signals[0]

@@ -10,6 +10,18 @@ One `Site.step`, three drivers: live over a network, in virtual time, and again 
 gives the same numbers bit for bit.
 """
 
-from .experiment import open_log, simulate, verify
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .experiment import open_log, simulate, verify
 
 __all__ = ["open_log", "simulate", "verify"]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
+    if name in __all__:
+        from . import experiment
+
+        return getattr(experiment, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -45,6 +45,11 @@ def new_boot() -> int:
     return secrets.randbits(64)
 
 
+def token(session: str, member: str, boot: int) -> str:
+    """Returns the liveliness token of one start of a member."""
+    return topics.key(session, member, topics.ALIVE) + f"/{boot}"
+
+
 class Voice:
     """A member's own events and answers.
 
@@ -102,7 +107,8 @@ class Joining:
         self._attempt = 0
         self._ready: set[str] = set()
         self._refused: set[int] = set()
-        bus.announce(topics.key(session, voice.info.member, topics.ALIVE) + f"/{voice.info.boot}")
+        self._recorders: set[str] = set()
+        bus.announce(token(session, voice.info.member, voice.info.boot))
 
     @property
     def _own(self) -> Info:
@@ -114,7 +120,8 @@ class Joining:
 
     def missing(self) -> list[str]:
         """Returns the members that have not been met."""
-        wanted = [*self._sites, *([topics.RECORDER] if self._own.needs_recorder else [])]
+        recorder = self._own.needs_recorder or bool(self._recorders)
+        wanted = [*self._sites, *([topics.RECORDER] if recorder else [])]
         return [name for name in wanted if name != self._own.member and name not in self.met]
 
     def poll(self) -> Epoch | None:
@@ -174,11 +181,15 @@ class Joining:
             self._voice.say("refused", text, about=info.member)
 
     def _watch(self) -> None:
-        """Forgets members that are gone."""
+        """Notes recorders that announce themselves, and forgets members that are gone."""
         while (change := self._presence.poll()) is not None:
             key, alive = change
             where = topics.address(key)
-            if where is None or alive:
+            if where is None:
+                continue
+            if where.member == topics.RECORDER:
+                (self._recorders.add if alive else self._recorders.discard)(where.boot)
+            if alive:
                 continue
             met = self.met.get(where.member)
             if met is not None and str(met.boot) == where.boot:

@@ -51,7 +51,7 @@ def configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, An
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
         "connect": {
             "endpoints": list(connect),
-            "timeout_ms": 0,
+            "timeout_ms": -1,
             "exit_on_failure": False,
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         },

@@ -5,7 +5,7 @@ the path of the key and the nearest valid name.
 """
 
 from .model import Arm, Control, Limits, Link, Pulse, Scenario, SiteSpec
-from .reader import load, override, parse, shipped, shipped_text, template_text
+from .reader import load, override, parse, shipped, shipped_text, site_named, template_text
 
 __all__ = [
     "Arm",
@@ -20,5 +20,6 @@ __all__ = [
     "parse",
     "shipped",
     "shipped_text",
+    "site_named",
     "template_text",
 ]

@@ -90,6 +90,20 @@ def load(source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[
     return parse(shipped_text(name), name, overrides)
 
 
+def site_named(scenario: Scenario, name: str) -> SiteSpec:
+    """Returns a site of a scenario.
+
+    Raises:
+        ScenarioError: it has none of that name.
+    """
+    if name not in scenario.sites:
+        hint = _nearest(name, scenario.names)
+        raise ScenarioError(
+            f"no site {name!r}{hint}; its sites are {', '.join(scenario.names)}", source=scenario.name
+        )
+    return scenario.sites[name]
+
+
 def parse(text: str, source: str = "", overrides: Mapping[str, Any] | Sequence[str] = ()) -> Scenario:
     """Returns the scenario that a TOML text describes.
 

@@ -1,0 +1,191 @@
+"""A whole session on one machine: every site and the recorder as processes, started, watched, ended.
+
+Law: whatever happens, the recorder is ended last and the children are all gone when this returns. The
+children stand in sessions of their own, so that Ctrl-C reaches them through here, in that order.
+"""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+from trilat_net.net import topics
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.scenario import Scenario
+
+from .display import Display
+from .process import warm_up
+from .watch import Watch
+
+POLL_NS = 100_000_000
+END_S = 15
+"""How long a child may take to end once it was asked to; then it is killed."""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """How a session ended.
+
+    Attributes:
+        log: its log.
+        problems: what went wrong, in order; empty where nothing did.
+        interrupted: number of the signal that ended it, or 0.
+    """
+
+    log: Path
+    problems: list[str] = field(default_factory=list)
+    interrupted: int = 0
+
+
+class _Signals:
+    """Turns SIGINT and SIGTERM into a number that the loop looks at."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def install(self) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, self._take)
+
+    def _take(self, number: int, _frame: FrameType | None) -> None:
+        self.number = number
+
+
+class _Child:
+    """One process of the session, with what it prints in a file."""
+
+    def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
+        self.name = name
+        self.printed = folder / f"{name}.txt"
+        with self.printed.open("wb") as sink:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "trilat_net", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def code(self) -> int | None:
+        """Returns the exit code, negative for a signal, or None while it runs."""
+        return self._process.poll()
+
+    def end(self, number: int) -> None:
+        """Asks the process to end, or kills it."""
+        if self.code() is None:
+            self._process.send_signal(number)
+
+    def problem(self) -> str | None:
+        """Says how the process failed, or None where it did not."""
+        code = self.code()
+        if code in (0, None):
+            return None
+        if code is not None and code < 0:
+            return f"{self.name} was killed by {signal.Signals(-code).name}"
+        lines = self.printed.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return f"{self.name} ended with code {code}: {lines[-1] if lines else 'it said nothing'}"
+
+
+def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
+    """Runs a session of all sites and a recorder, from start to end.
+
+    Args:
+        scenario: the experiment.
+        folder: where the log and what the processes print go; exists.
+        display: where progress is shown.
+
+    Returns:
+        How it ended. The log is valid in every case in which a session began.
+    """
+    signals = _Signals()
+    signals.install()
+    warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once, not in every child
+    session = f"{scenario.name}-demo"
+    endpoints = free_endpoints(len(scenario.names))
+    text = folder / "scenario.toml"
+    text.write_text(scenario.text, encoding="utf-8")
+    outcome = Outcome(folder / "run.mcap")
+    printed = folder / "processes"
+    printed.mkdir(exist_ok=True)
+    children = [
+        _Child(name, _site_arguments(name, text, session, endpoints, n), printed)
+        for n, name in enumerate(scenario.names)
+    ]
+    connect = [word for endpoint in endpoints for word in ("--connect", endpoint)]
+    recorder = _Child(
+        topics.RECORDER,
+        ["record", "--session", session, *connect, "-o", str(outcome.log), "--join-timeout", "60"],
+        printed,
+    )
+    clock = SystemClock()
+    bus = ZenohBus([], endpoints)
+    try:
+        _attend(Watch(bus, session), display, children, recorder, signals, outcome, clock)
+    finally:
+        bus.close()
+        _end_all(children, recorder, clock)
+    outcome.interrupted = signals.number
+    for child in [*children, recorder]:
+        problem = child.problem()
+        if problem and not outcome.interrupted and problem not in outcome.problems:
+            outcome.problems.append(problem)
+    return outcome
+
+
+def _site_arguments(name: str, scenario: Path, session: str, endpoints: list[str], n: int) -> list[str]:
+    connect = [word for endpoint in endpoints[:n] for word in ("--connect", endpoint)]
+    return [
+        "site",
+        name,
+        "--scenario",
+        str(scenario),
+        "--session",
+        session,
+        "--listen",
+        endpoints[n],
+        *connect,
+        "--needs-recorder",
+    ]
+
+
+def _attend(
+    watch: Watch,
+    display: Display,
+    children: list[_Child],
+    recorder: _Child,
+    signals: _Signals,
+    outcome: Outcome,
+    clock: Clock,
+) -> None:
+    """Shows progress until every process has ended, one has failed, or a signal has come."""
+    while not signals.number:
+        watch.poll()
+        display.update(watch.latest)
+        for sentence in watch.take_news():
+            display.say(sentence)
+        everyone = [*children, recorder]
+        failed = [problem for child in everyone if (problem := child.problem())]
+        if failed:
+            outcome.problems += failed
+            return
+        if all(child.code() == 0 for child in everyone):
+            return
+        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+
+
+def _end_all(children: list[_Child], recorder: _Child, clock: Clock) -> None:
+    """Ends the sites, then the recorder, which by then has what they had to say."""
+    for group in (children, [recorder]):
+        for child in group:
+            child.end(signal.SIGINT)
+        give_up_ns = clock.monotonic_ns() + END_S * 1_000_000_000
+        while any(child.code() is None for child in group):
+            if clock.monotonic_ns() > give_up_ns:
+                for child in group:
+                    child.end(signal.SIGKILL)
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)

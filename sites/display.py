@@ -1,0 +1,83 @@
+"""What a person sees while a session runs: a table on a terminal, a line every two seconds elsewhere."""
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from trilat_net.core.grid import NS_PER_S
+from trilat_net.net.wire import LinkStats
+from trilat_net.scenario import Scenario
+
+LINE_EVERY = 20
+"""Without a terminal, every so many updates a line is printed."""
+
+
+class Display:
+    """Shows progress; a context, so that the terminal is left as it was.
+
+    Args:
+        scenario: the experiment.
+        console: where to show it.
+    """
+
+    def __init__(self, scenario: Scenario, console: Console) -> None:
+        self._scenario, self._console = scenario, console
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._updates = 0
+
+    def __enter__(self) -> "Display":
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live:
+            self._live.stop()
+
+    def update(self, latest: dict[str, LinkStats]) -> None:
+        """Shows the latest statistics of every site."""
+        self._updates += 1
+        if self._live:
+            self._live.update(self._table(latest), refresh=True)
+        elif latest and self._updates % LINE_EVERY == 0:
+            self._console.print(self._line(latest), highlight=False)
+
+    def say(self, text: str) -> None:
+        """Prints a sentence above the table."""
+        self._console.print(text, highlight=False)
+
+    def _table(self, latest: dict[str, LinkStats]) -> Table:
+        table = Table(title=f"{self._scenario.name}, {self._scenario.duration_s:g} s", title_justify="left")
+        for column in ("site", "mode", "time", "tick", "late now", "overruns", "age of each peer's sample"):
+            table.add_column(column, justify="left" if column[:3] in ("sit", "mod", "age") else "right")
+        for name in self._scenario.names:
+            stats = latest.get(name)
+            if stats is None:
+                table.add_row(name, "braked", "", "", "", "", "")
+                continue
+            ages = "  ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
+            table.add_row(
+                name,
+                stats.mode,
+                f"{stats.t_ns / NS_PER_S:.1f} s",
+                f"{stats.tick}",
+                f"{stats.late_max_us} us",
+                f"{stats.overruns}",
+                ages,
+            )
+        return table
+
+    def _line(self, latest: dict[str, LinkStats]) -> str:
+        parts = []
+        for name, stats in sorted(latest.items(), key=lambda item: self._scenario.names.index(item[0])):
+            ages = ", ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
+            parts.append(f"{name} {stats.mode} tick {stats.tick} late {stats.late_max_us} us (age {ages})")
+        return "; ".join(parts)
+
+
+def _milliseconds(age_us: int) -> str:
+    return "none yet" if age_us < 0 else f"{age_us / 1000:.0f} ms"

@@ -1,0 +1,183 @@
+"""What there is to say of a log at the end: checked, drawn, in a few lines and a table.
+
+Law: nothing is claimed that was not executed again just now.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .analysis.report import VerdictLine, write_report
+from .errors import UsageError
+from .experiment import compare_with_virtual, twin_without_hands
+from .log.reader import Log, open_log
+from .replay.comparison import Comparison
+from .replay.verify import Verdict, verify
+from .scenario import Scenario
+
+
+class Conclusion(NamedTuple):
+    """A log, judged.
+
+    Attributes:
+        columns: heads of the table.
+        rows: a row per site.
+        lines: what was checked and how it came out.
+        paths: the files that were made.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    lines: list[VerdictLine]
+    paths: list[Path]
+
+    @property
+    def passed(self) -> bool:
+        """True where every check passed."""
+        return all(line.passed for line in self.lines)
+
+
+def conclude(file: Path, folder: Path) -> Conclusion:
+    """Verifies a log, compares it with virtual time, and writes figures, page and summary.
+
+    Args:
+        file: the log.
+        folder: where the results go; exists.
+
+    Raises:
+        LogError: the log cannot be read.
+    """
+    log = open_log(file)
+    lines = list(_checks(log, virtual=True))
+    twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
+    made = write_report(log, folder, twin=twin, verdicts=lines)
+    paths = [*([] if file in made else [file]), *made]
+    return Conclusion(_COLUMNS, [_row(log, site) for site in log.sites], lines, paths)
+
+
+def check_lines(file: Path, *, virtual: bool) -> list[VerdictLine]:
+    """Returns what executing a log again showed.
+
+    Args:
+        file: the log.
+        virtual: whether to compare it with virtual time as well.
+
+    Raises:
+        LogError: the log cannot be read.
+    """
+    return list(_checks(open_log(file), virtual=virtual))
+
+
+def results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
+    """Makes a folder for results.
+
+    Args:
+        folder: which one, or None for the next free `runs/NAME-N`.
+        name: what the run is called.
+        force: whether a folder that holds something may be used.
+
+    Raises:
+        UsageError: it holds something, or cannot be made.
+    """
+    if folder is None:
+        number = 1
+        while (folder := Path("runs") / f"{name}-{number:03d}").exists():
+            number += 1
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            if not force:
+                raise UsageError(f"{folder}: holds something; choose another folder, or use --force")
+            (folder / "run.mcap").unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
+    return folder
+
+
+def scenario_facts(scenario: Scenario) -> list[str]:
+    """Returns what a valid scenario says, and what follows from it."""
+    beta = scenario.beta
+    weights = (
+        "none: alpha is reducible, some site's weight is zero"
+        if beta is None
+        else ", ".join(f"{name} {weight:.4g}" for name, weight in zip(scenario.names, beta, strict=True))
+    )
+    delays = ", ".join(f"{name} {link.delay_ms:g} ms" for name, link in scenario.links.items())
+    return [
+        f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
+        f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
+        + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
+        f"delays: {delays}",
+        f"beta, the left null vector of Upsilon: {weights}",
+        *(f"assumed: {text}" for text in scenario.assumed),
+    ]
+
+
+def _checks(log: Log, *, virtual: bool) -> Iterator[VerdictLine]:
+    yield _records_line(log)
+    yield _verify_line(verify(log))
+    if log.session.get("scenario_sha256") != log.scenario.sha256:
+        yield VerdictLine("scenario", "is not the one whose hash the log names: it was changed", False)
+    if virtual:
+        twins = compare_with_virtual(log)
+        yield _twin_line("virtual time fed with the log's arrivals", twins.fed, None)
+        late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
+        yield _twin_line(
+            f"plain virtual time ({late})", twins.plain, twins.late[0].due_tick if twins.late else None
+        )
+
+
+def _records_line(log: Log) -> VerdictLine:
+    """Says how many records there are of how many."""
+    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
+    have = sum(len(log[name]) for name in log.sites)
+    want = sum(made.get(name, 0) for name in log.sites)
+    silent = [name for name in log.sites if name not in made]
+    text = f"{have}/{want} in the file" if not silent else f"{have} in the file"
+    if silent:
+        text += f"; {', '.join(silent)} never said how many ticks were made"
+    if not log.complete:
+        text += "; the file was not finished"
+    return VerdictLine("records", text, not silent and have == want and log.complete)
+
+
+def _verify_line(verdict: Verdict) -> VerdictLine:
+    how = "whole runs, bit for bit" if verdict.whole_run else "tick by tick to 1e-9: another platform made it"
+    text = f"{verdict.identical}/{verdict.records} records identical ({how})"
+    for site, first, last in verdict.gaps[:5]:
+        text += f"; gap: {site} has no records of ticks {first} to {last}"
+    if len(verdict.gaps) > 5:
+        text += f"; and {len(verdict.gaps) - 5} more gaps"
+    if verdict.unjudged:
+        text += f"; {verdict.unjudged} behind gaps could not be judged"
+    if verdict.first:
+        text += f"; {verdict.differing} differ, the first: {verdict.first}"
+    if not verdict.records:
+        return VerdictLine("executed again", "no records to execute", False)
+    return VerdictLine("executed again", text, verdict.passed)
+
+
+def _twin_line(label: str, comparison: Comparison, late_from: int | None) -> VerdictLine:
+    """A difference is excused only from the tick at which the first late sample was due."""
+    first = comparison.first
+    text = f"{comparison.identical}/{comparison.records} records identical"
+    if first is None:
+        return VerdictLine(label, text, True)
+    excused = late_from is not None and first.tick >= late_from
+    return VerdictLine(label, f"{text}; the first that differs: {first}", excused)
+
+
+_COLUMNS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
+
+
+def _row(log: Log, site: str) -> tuple[str, ...]:
+    part = log[site]
+    if not len(part):
+        return (site, "0", *("",) * (len(_COLUMNS) - 2))
+    missing = int(part.tick[-1]) + 1 - len(part)
+    late = np.percentile(part.late_us, (50, 99, 100))
+    busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
+    numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")
+    return (site, str(len(part)), str(missing), *numbers)
