@@ -18,6 +18,9 @@ class Network(Protocol):
     def send(self, sender: str, output: Output) -> None:
         """Takes the record of one tick from its sender."""
 
+    def ready(self, receiver: str, k: int) -> bool:
+        """True where everything that arrives for tick k of a receiver has been sent."""
+
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """Returns what arrives for tick k of a receiver, in order."""
 
@@ -43,6 +46,10 @@ class PromptNetwork:
         """See `Network`."""
         for queue in self._outgoing[sender]:
             queue.append(output)
+
+    def ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
+        """See `Network`. In order of time, always."""
+        return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """See `Network`."""
@@ -77,10 +84,18 @@ class RecordedNetwork:
         """See `Network`."""
         self._sent[sender, output.tick] = output
 
+    def ready(self, receiver: str, k: int) -> bool:
+        """See `Network`. A loop that was late took in samples of ticks that lie ahead of its own."""
+        peers = self._peers[receiver]
+        return all((peers[index], tick) in self._sent for index, tick, _ in self._listed(receiver, k))
+
+    def _listed(self, receiver: str, k: int) -> Sequence[Sequence[int]]:
+        return self._schedule[receiver].get(k, ())
+
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """See `Network`. A sample that its peer has not sent (yet) in virtual time stays away."""
+        """See `Network`. A sample that was never sent (the log names none of its sender's) stays away."""
         arrivals = []
-        for index, tick, latency_us in self._schedule[receiver].get(k, ()):
+        for index, tick, latency_us in self._listed(receiver, k):
             sample = self._sent.get((self._peers[receiver][index], tick))
             if sample is not None:
                 arrivals.append(Arrival(index, tick, sample.q, sample.qd, latency_us))

@@ -4,8 +4,8 @@ Law: sites advance by `Site.step` alone, in order of nominal time and then of th
 runs of one scenario and seed are the same file, SHA-256 and all.
 """
 
+import bisect
 import hashlib
-import heapq
 from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
@@ -30,21 +30,23 @@ class Stepped(NamedTuple):
 
 
 def run(scenario: Scenario, network: Network | None = None) -> Iterator[Stepped]:
-    """Yields every tick of every site, in order of time.
+    """Yields every tick of every site: in order of nominal time, then of the scenario.
 
-    A run that diverges ends with the ticks of that instant.
+    A site whose network is not ready lets the others go first. A run that diverges ends with the ticks of
+    that instant.
 
     Args:
         scenario: the experiment.
         network: what joins the sites; by default every sample arrives at the next tick.
     """
-    rates = {name: spec.rate_hz for name, spec in scenario.sites.items()}
-    joined = network or PromptNetwork(rates)
+    joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     sites = [Site(scenario.setup(name)) for name in scenario.names]
-    queue = [(0, index, 0) for index in range(len(sites))]  # (t_ns, order, k): sorted, hence a heap
-    last_ns = max(scenario.ticks(name) for name in rates) * NS_PER_S
-    while queue and queue[0][0] <= last_ns:
-        t_ns, index, k = queue[0]
+    ticks = [scenario.ticks(name) for name in scenario.names]
+    pending = [(0, index, 0) for index in range(len(sites))]  # (t_ns, order, k) of each site's next tick
+    last_ns = round(scenario.duration_s * NS_PER_S)
+    while pending and pending[0][0] <= last_ns:
+        place = next((n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0)
+        t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = joined.deliver(site.name, k)
         output = site.step(Tick(k, arrivals))
@@ -52,10 +54,8 @@ def run(scenario: Scenario, network: Network | None = None) -> Iterator[Stepped]
         yield Stepped(site, arrivals, output)
         if output.mode is not Mode.RUN:
             last_ns = t_ns
-        if k + 1 < scenario.ticks(site.name):
-            heapq.heapreplace(queue, ((k + 1) * NS_PER_S // site.rate_hz, index, k + 1))
-        else:
-            heapq.heappop(queue)
+        if k + 1 < ticks[index]:
+            bisect.insort(pending, ((k + 1) * NS_PER_S // site.rate_hz, index, k + 1))
 
 
 def virtual_boot(scenario: Scenario, site: str) -> int:

@@ -1,0 +1,136 @@
+"""The delay-differential equations of the paper, written from the paper and solved by another method.
+
+Nothing of `trilat_net.core` is in here: SciPy's DOP853 with dense output, by the method of steps.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+Array = NDArray[np.float64]
+STATE = 9  # q (2), qd (2), theta_hat (5)
+
+
+def theta_of(arm) -> Array:
+    """Eq. (24), with m2 lc2 for theta_5."""
+    m1, m2, l1, lc1, lc2 = arm.m1_kg, arm.m2_kg, arm.l1_m, arm.lc1_m, arm.lc2_m
+    outer = m2 * lc2**2 + arm.I2_kg_m2
+    return np.array(
+        [m1 * lc1**2 + m2 * l1**2 + arm.I1_kg_m2 + outer, m2 * l1 * lc2, outer, m1 * lc1 + m2 * l1, m2 * lc2]
+    )
+
+
+def inertia(theta: Array, q: Array) -> Array:
+    """M(q) for q of shape (..., 2), as Section IV prints it."""
+    c2 = np.cos(q[..., 1])
+    m12 = theta[2] + theta[1] * c2
+    rows = [theta[0] + 2 * theta[1] * c2, m12, m12, theta[2] + 0 * c2]
+    return np.stack(rows, axis=-1).reshape(*q.shape[:-1], 2, 2)
+
+
+def regressor(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
+    """Y(q, qd, v, a) of Eq. (12), shape (..., 2, 5): what C multiplies is v."""
+    c2, s2 = np.cos(q[..., 1]), np.sin(q[..., 1])
+    g1, g12 = g * np.cos(q[..., 0]), g * np.cos(q[..., 0] + q[..., 1])
+    v1, v2, a1, a2 = v[..., 0], v[..., 1], a[..., 0], a[..., 1]
+    d1, d2 = qd[..., 0], qd[..., 1]
+    zero = np.zeros_like(c2)
+    y12 = c2 * (2 * a1 + a2) - s2 * (d2 * v1 + (d1 + d2) * v2)
+    y22 = c2 * a1 + s2 * d1 * v1
+    entries = [a1, y12, a2, g1, g12, zero, y22, a1 + a2, zero, g12]
+    return np.stack(entries, axis=-1).reshape(*q.shape[:-1], 2, 5)
+
+
+@dataclass
+class DelayEquations:
+    """Eq. (6), (8)-(10), (13), (15) for identical arms and gains, and one delay on every link."""
+
+    theta: Array
+    g: float
+    alpha: Array
+    delay_s: float
+    Lambda: Array
+    Kp: Array
+    Kd: Array
+    Gamma: Array
+    q0: Array
+    hands: Callable[[float], Array]
+    edges_s: list[float] = field(default_factory=list)
+    starts: list[float] = field(default_factory=list)
+    pieces: list[Callable[[float], Array]] = field(default_factory=list)
+
+    def past(self, t: float) -> Array:
+        """The state at t, shape (N, 9); before the start the start pose, at rest."""
+        if t < 0:
+            return np.hstack([self.q0, np.zeros((len(self.q0), STATE - 2))])
+        return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, STATE)
+
+    def rate(self, t: float, flat: Array) -> Array:
+        x = flat.reshape(-1, STATE)
+        q, qd, estimate = x[:, :2], x[:, 2:4], x[:, 4:]
+        before = x if self.delay_s == 0 else self.past(t - self.delay_s)
+        e = q - self.alpha @ before[:, :2]
+        ed = qd - self.alpha @ before[:, 2:4]
+        r = qd + self.Lambda * e
+        Y = regressor(self.g, q, qd, -self.Lambda * e, -self.Lambda * ed)
+        tau = (Y @ estimate[..., None])[..., 0] - self.Kp * r - self.Kd * ed
+        forces = regressor(self.g, q, qd, qd, np.zeros_like(qd)) @ self.theta  # C qd + G, Eq. (5)
+        pushed = tau + self.hands(t) - forces
+        qdd = np.linalg.solve(inertia(self.theta, q), pushed[..., None])[..., 0]
+        update = -self.Gamma * (Y.swapaxes(1, 2) @ r[..., None])[..., 0]
+        return np.hstack([qd, qdd, update]).ravel()
+
+    def solve(self, end_s: float) -> "DelayEquations":
+        """Method of steps: one piece per delay, and no piece across an edge of a pulse."""
+        step = self.delay_s or 0.2
+        steps = np.arange(1, round(end_s / step) + 1) * step
+        cuts = sorted({round(float(t), 9) for t in [*steps, *self.edges_s, end_s] if 0 < t <= end_s})
+        x, t = self.past(-1.0).ravel(), 0.0
+        for cut in cuts:
+            done = solve_ivp(self.rate, (t, cut), x, "DOP853", rtol=1e-11, atol=1e-12, dense_output=True)
+            assert done.success
+            self.starts.append(t)
+            self.pieces.append(done.sol)
+            x, t = done.y[:, -1], cut
+        return self
+
+    def at(self, times: Array) -> Array:
+        """States at sorted times, shape (N, K, 9)."""
+        piece = np.searchsorted(self.starts, times, side="right") - 1
+        parts = [self.pieces[p](times[piece == p]) for p in np.unique(piece)]
+        return np.hstack(parts).reshape(len(self.q0), STATE, -1).swapaxes(1, 2)
+
+
+def equations(scenario) -> DelayEquations:
+    """The equations of a scenario whose arms, gains and delays are all alike."""
+    specs = list(scenario.sites.values())
+    (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
+    assert len({(s.arm, s.control) for s in specs}) == 1
+    arm, control = specs[0].arm, specs[0].control
+
+    def hands(t: float) -> Array:
+        total = np.zeros((len(specs), 2))
+        for i, spec in enumerate(specs):
+            for p in spec.hands:
+                if p.start_s < t < p.end_s:
+                    height = np.sin(np.pi * (t - p.start_s) / (p.end_s - p.start_s)) ** 2
+                    total[i] += np.array(p.peak_nm) * height
+        return total
+
+    return DelayEquations(
+        theta=theta_of(arm),
+        g=arm.g_m_s2,
+        alpha=np.array([[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites]),
+        delay_s=delay_ms * 1e-3,
+        Lambda=np.array(control.Lambda),
+        Kp=np.array(control.Kp),
+        Kd=np.array(control.Kd),
+        Gamma=np.array(control.Gamma),
+        q0=np.array([s.q0_rad for s in specs]),
+        hands=hands,
+        edges_s=[edge for s in specs for p in s.hands for edge in (p.start_s, p.end_s)],
+    )

@@ -1,0 +1,62 @@
+"""Virtual runs against the delay-differential equations, solved by another method.
+
+Eq. (6), (8)-(10), (13), (15) in continuous time; what is sampled must converge to them.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.theory.delay_equations import DelayEquations, equations
+from tests.virtual_runs import run
+from trilat_net.scenario import load
+
+DURATION_S = 20.0
+
+
+@cache
+def exact(name: str) -> DelayEquations:
+    return equations(load(name)).solve(DURATION_S)
+
+
+@cache
+def distance(name: str, scheme: str, rate_hz: int) -> float:
+    """max abs(dq) over 20 s, every site, joint and tick."""
+    made = run(name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S})
+    (times,) = np.unique(made.stack("t_s"), axis=0)
+    return float(np.abs(made.stack("q") - exact(name).at(times)[..., :2]).max())
+
+
+def order(name: str, scheme: str) -> list[float]:
+    errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
+    return [float(np.log2(coarse / fine)) for coarse, fine in zip(errors, errors[1:], strict=False)]
+
+
+def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
+    """The hands-free start of Section IV: with theta_hat(0) = 0 both joints fall with (-g, +g)."""
+    paper = exact("paper")
+    first = paper.rate(0.0, paper.past(-1.0).ravel()).reshape(3, 9)
+    assert np.allclose(first[:, 2:4], [-9.81, 9.81], atol=1e-12)
+    halves = equations(load("paper"))
+    halves.edges_s += [float(t) for t in np.arange(0.1, 5.0, 0.2)]  # other pieces, other steps
+    times = np.linspace(0.0, 5.0, 501)
+    assert np.abs(halves.solve(5.0).at(times) - paper.at(times)).max() < 1e-8
+
+
+@pytest.mark.parametrize("name", ["paper", "paper_rods", "free"])
+def test_second_order_is_within_1e_5_rad_of_the_exact_solution(name: str) -> None:
+    assert distance(name, "second_order", 1000) <= 1e-5
+
+
+@pytest.mark.parametrize("name", ["paper", "free"])
+def test_second_order_converges_with_order_two(name: str) -> None:
+    assert order(name, "second_order") == pytest.approx([2.0, 2.0], abs=0.1)
+
+
+def test_digital_is_some_milliradians_off() -> None:
+    assert distance("paper", "digital", 1000) == pytest.approx(3.0e-3, rel=0.1)
+
+
+def test_digital_converges_with_order_one() -> None:
+    assert order("paper", "digital") == pytest.approx([1.0, 1.0], abs=0.1)

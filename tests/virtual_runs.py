@@ -1,0 +1,68 @@
+"""Virtual runs as arrays, each made once per test session."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.scenario import Scenario, load
+from trilat_net.sim import virtual
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One site's records, rows are ticks."""
+
+    t_s: Array
+    q: Array
+    qd: Array
+    q_des: Array
+    qd_des: Array
+    tau: Array
+    tau_x: Array
+    theta_hat: Array
+    used: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Run:
+    scenario: Scenario
+    sites: dict[str, Trajectory]
+
+    def stack(self, field: str) -> Array:
+        """The field of every site, shape (N, K, ...)."""
+        return np.array([getattr(site, field) for site in self.sites.values()])
+
+
+def trajectories(scenario: Scenario) -> Run:
+    records: dict[str, list[Any]] = {name: [] for name in scenario.names}
+    for site, _, output in virtual.run(scenario):
+        records[site.name].append(output)
+    return Run(
+        scenario,
+        {
+            name: Trajectory(
+                t_s=np.array([o.tick for o in outputs]) / scenario.sites[name].rate_hz,
+                **{
+                    field: np.array([getattr(o, field) for o in outputs])
+                    for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat", "used")
+                },
+            )
+            for name, outputs in records.items()
+        },
+    )
+
+
+@cache
+def _run(name: str, overrides: tuple[tuple[str, Any], ...]) -> Run:
+    return trajectories(load(name, dict(overrides)))
+
+
+def run(name: str, overrides: Mapping[str, Any] | None = None) -> Run:
+    """A shipped scenario in virtual time; the same call returns the same run."""
+    return _run(name, tuple(sorted((overrides or {}).items())))
