@@ -44,7 +44,7 @@ class Display:
         if self._live:
             self._live.update(self._table(latest), refresh=True)
         elif latest and self._updates % LINE_EVERY == 0:
-            self._console.print(self._line(latest), highlight=False)
+            self._console.print(self._line(latest), highlight=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Prints a sentence above the table."""

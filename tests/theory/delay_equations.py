@@ -65,7 +65,7 @@ class DelayEquations:
 
     def past(self, t: float) -> Array:
         """The state at t, shape (N, 9); before the start the start pose, at rest."""
-        if t < 0:
+        if t <= 0 or not self.pieces:
             return np.hstack([self.q0, np.zeros((len(self.q0), STATE - 2))])
         return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, STATE)
 

@@ -1,0 +1,64 @@
+# Everything a person needs: `make demo`, `make test`. Everything else is for those who change the program.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
+
+.PHONY: help demo setup test pytest live lint bench lock clean
+
+help:
+	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
+	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
+	@echo "make test    everything that CI checks"
+	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
+
+demo: setup
+	@$(BIN)/trilat demo paper
+
+setup: $(VENV)/runtime.stamp
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "trilat-net needs Python 3.11 or newer; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo "Python's venv module is missing; on Debian and Ubuntu: apt install python3-venv"; exit 2; }
+	@$(PYTHON) -m venv $(VENV)
+
+$(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/bin/python
+	@echo "installing locked dependencies into $(VENV)"
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/runtime.lock
+	@$(PIP) --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+$(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/dev.lock
+	@touch $@
+
+test: pytest live lint
+
+pytest: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -q
+
+live: setup
+	rm -rf runs/check
+	$(BIN)/trilat demo paper --duration 10 --out runs/check
+	$(BIN)/trilat verify --virtual runs/check/run.mcap
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/dev.stamp
+	$(BIN)/python -m benchmarks
+
+lock:
+	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		pyproject.toml --group build -o requirements/runtime.lock
+	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		pyproject.toml --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,82 @@
+"""The corrected Lyapunov functional along a virtual run, and the power that must balance it.
+
+The paper's Eq. (17) is wrong in a sign and a factor; corrected, with Kd common to all sites,
+
+    V_i' = -r'Kp r - 1/2 sum_j a_ij |qd_i - qd_j(t - T_ij)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j a_ij |qd_j|^2 + r'tau_h
+
+with |x|^2 = x'Kd x. Weighted with the left null vector of Upsilon, Eq. (20), the last two norms cancel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.theory.delay_equations import inertia, theta_of
+from tests.virtual_runs import Run
+
+Array = NDArray[np.float64]
+
+
+def cumulative(values: Array, h: float) -> Array:
+    """Integral from the first tick on, by the trapezoid rule on the ticks."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * h * (values[1:] + values[:-1]))])
+
+
+def delayed(values: Array, ticks: int, before: float = 0.0) -> Array:
+    """The values `ticks` ago; before the start, what the history holds."""
+    past = np.full_like(values, before)
+    past[ticks:] = values[: len(values) - ticks] if ticks else values
+    return past
+
+
+@dataclass(frozen=True)
+class Balance:
+    """V, what the dissipation took and what the hands gave, each over the ticks and weighted by beta."""
+
+    V: Array
+    taken: Array
+    given: Array
+
+    @property
+    def residual(self) -> float:
+        """Largest error of the balance, as a share of the largest V."""
+        return float(np.abs(self.V - self.V[0] + self.taken - self.given).max() / self.V.max())
+
+
+def left_null_vector(scenario) -> Array:
+    """beta of Eq. (20) from NumPy's singular vectors, sum 1."""
+    names = list(scenario.sites)
+    alpha = np.array([[scenario.dominance[i].get(j, 0.0) for j in names] for i in names])
+    beta = np.linalg.svd((alpha - np.eye(len(names))).T)[2][-1]
+    return beta / beta.sum()
+
+
+def balance(run: Run, beta: Array) -> Balance:
+    """Books a run whose sites share one rate."""
+    scenario = run.scenario
+    names = list(scenario.sites)
+    rate_hz = scenario.sites[names[0]].rate_hz
+    h = 1.0 / rate_hz
+    V, taken, given = 0.0, 0.0, 0.0
+    for weight, name in zip(beta, names, strict=True):
+        site, spec = run.sites[name], scenario.sites[name]
+        theta, control = theta_of(spec.arm), spec.control
+        Lambda, Kp, Kd = (np.array(getattr(control, gain)) for gain in ("Lambda", "Kp", "Kd"))
+        e = site.q - site.q_des
+        r = site.qd + Lambda * e
+        off = site.theta_hat - theta
+        v = np.einsum("ki,kij,kj->k", r, inertia(theta, site.q), r)
+        v += (off**2 / np.array(control.Gamma)).sum(1) + (Lambda * Kd * e**2).sum(1)
+        loss = (Kp * r**2).sum(1)
+        for peer, share in scenario.dominance[name].items():
+            qd = run.sites[peer].qd
+            ticks = round(scenario.links[f"{peer}->{name}"].delay_ms * 1e-3 * rate_hz)
+            norm = cumulative((Kd * qd**2).sum(1), h)
+            v += share * (norm - delayed(norm, ticks))
+            came = np.stack([delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1)
+            loss += 0.5 * share * (Kd * (site.qd - came) ** 2).sum(1)
+        V = V + weight * 0.5 * v
+        taken = taken + weight * cumulative(loss, h)
+        given = given + weight * cumulative((r * -site.tau_x).sum(1), h)
+    return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
