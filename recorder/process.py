@@ -1,186 +1,17 @@
-"""The recorder as a process: joins a session, writes what comes, ends with it.
+"""The recorder as one process: from its arguments to its exit code."""
 
-Law: nothing is lost that arrived. Messages are stamped where they come in and wait in one bounded queue;
-one thread writes. The file is flushed every 100 ms and finished whatever ends the process in order.
-"""
-
-import platform
-import signal
-import types
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
-
-from trilat_net.core.fingerprint import fingerprint
-from trilat_net.errors import RunFailed, SessionError, UsageError
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.endpoints import default_endpoint, default_endpoints
-from trilat_net.net.session import ASK_EVERY_NS, Epoch, Joining, Voice, new_boot, token
-from trilat_net.net.wire import Info, decode
+from trilat_net.errors import RunFailed
+from trilat_net.interrupt import Interrupt
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.session import new_boot
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import parse
 
-from .recording import Recording
-from .tap import Tap
-
-POLL_NS = 10_000_000
-FLUSH_NS = 100_000_000
-
-
-class Recorder:
-    """One recording, from the first poll to the end mark of the file.
-
-    Args:
-        bus: the connection.
-        clock: the time.
-        session: the session's name.
-        boot: this process's boot.
-        path: where the log goes; must not exist.
-        stopped: True once the recorder was asked to end.
-        say: tells a person what happens.
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        session: str,
-        boot: int,
-        path: Path,
-        stopped: Callable[[], bool],
-        say: Callable[[str], None],
-    ) -> None:
-        self._clock, self._session, self._path = clock, session, path
-        self._stopped, self._say = stopped, say
-        self._tap = Tap(clock)
-        for channel in (topics.STATE, topics.LINK, topics.EVENT):
-            bus.tap(topics.key(session, "*", channel), self._tap.take)
-        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
-        self._voice = Voice(
-            bus,
-            session,
-            Info(
-                member=topics.RECORDER,
-                boot=boot,
-                scenario_sha256="",
-                scenario="",
-                host=platform.node(),
-                clock=clock.identity(),
-                fingerprint=fingerprint(),
-            ),
-        )
-        self._joining = Joining(bus, clock, session, self._voice, ())
-
-    def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for a session to begin.
-
-        Args:
-            timeout_s: how long, s; None for as long as it takes.
-
-        Returns:
-            The epoch, or None where the recorder was asked to end before.
-
-        Raises:
-            SessionError: none began in time.
-        """
-        begun_ns = self._clock.monotonic_ns()
-        while not self._stopped():
-            epoch = self._joining.poll()
-            if epoch is not None:
-                return epoch
-            now_ns = self._clock.monotonic_ns()
-            if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                met = ", ".join(self._joining.met) or "nobody"
-                raise SessionError(
-                    f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
-                    f"it met {met}"
-                )
-            self._clock.sleep_until(now_ns + POLL_NS)
-        return None
-
-    def record(self, epoch: Epoch) -> Recording:
-        """Writes the session from its epoch to its end, and returns the finished recording.
-
-        Raises:
-            UsageError: the file cannot be made.
-            LogError: the disk refused.
-        """
-        self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
-        scenario = next(
-            parse(info.scenario, info.member) for info in self._joining.met.values() if info.scenario
-        )
-        try:
-            stream = self._path.open("xb")
-        except OSError as error:
-            raise UsageError(f"{self._path}: cannot be written: {error.strerror}") from None
-        with stream:
-            recording = Recording(stream, scenario, self._session, epoch, self._voice)
-            self._say(f"recorder: the session begins, writing {self._path}")
-            try:
-                self._run(recording)
-            finally:
-                recording.finish(self._tap)
-        return recording
-
-    def _run(self, recording: Recording) -> None:
-        """Takes and writes until the session is over."""
-        flushed_ns = self._clock.monotonic_ns()
-        while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
-            self._voice.answer()
-            recording.write(self._tap, self._clock.monotonic_ns())
-            while (change := self._presence.poll()) is not None:
-                recording.presence(*change)
-            now_ns = self._clock.monotonic_ns()
-            if now_ns - flushed_ns >= FLUSH_NS:
-                recording.flush()
-                flushed_ns = now_ns
-            self._clock.sleep_until(now_ns + POLL_NS)
-
-
-class Discovery:
-    """Asks the first site of a session, on this machine, where the others are.
-
-    It announces the recorder meanwhile, so that the session does not begin without it.
-
-    Args:
-        session: the session's name.
-        boot: the recorder's boot.
-    """
-
-    def __init__(self, session: str, boot: int) -> None:
-        self._session = session
-        self._first = default_endpoint(session, 0)
-        self._bus = ZenohBus([], [self._first])
-        self._bus.announce(token(session, topics.RECORDER, boot))
-
-    def endpoints(self, clock: Clock, stopped: Callable[[], bool], timeout_s: float | None) -> list[str]:
-        """Returns the default endpoints of the session's sites, once the first has said who they are.
-
-        Raises:
-            SessionError: it did not answer in time.
-        """
-        begun_ns = clock.monotonic_ns()
-        while not stopped():
-            replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
-            clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
-            while (reply := replies.poll()) is not None:
-                info = decode(reply[1], Info)
-                if info.scenario:
-                    names = parse(info.scenario, info.member).names
-                    return list(default_endpoints(self._session, names).values())
-            if timeout_s is not None and clock.monotonic_ns() - begun_ns > timeout_s * 1e9:
-                raise SessionError(
-                    f"the recorder waited {timeout_s:g} s for the first site of session {self._session!r} "
-                    f"at {self._first}; name other endpoints with --connect"
-                )
-        return [self._first]
-
-    def close(self) -> None:
-        """Leaves; by then the recorder has announced itself to all sites."""
-        self._bus.close()
+from .discovery import Discovery
+from .recorder import Recorder
 
 
 def record_session(
@@ -207,39 +38,26 @@ def record_session(
     Raises:
         TrilatError: the session did not begin, the file cannot be written, or records are missing.
     """
-    signals: list[int] = []
-
-    def take(number: int, _frame: types.FrameType | None) -> None:
-        signals.append(number)
-
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, take)
+    interrupt = Interrupt().install()
     clock = SystemClock()
-    say(f"recorder: waiting for session {session!r} to begin")
     boot = new_boot()
-    discovery = Discovery(session, boot) if connect is None else None
-    try:
-        if discovery is not None:
-            connect = discovery.endpoints(clock, lambda: bool(signals), join_timeout_s)
-        bus = ZenohBus(listen, connect or [])
-    except BaseException:
-        if discovery is not None:
-            discovery.close()
-        raise
-    try:
-        recorder = Recorder(bus, clock, session, boot, path, lambda: bool(signals), say)
+    say(f"recorder: waiting for session {session!r} to begin")
+    with ExitStack() as stack:
+        if connect is None:
+            discovery = Discovery(session, boot)
+            stack.callback(discovery.close)
+            connect = discovery.endpoints(clock, interrupt.requested, join_timeout_s)
+        bus = ZenohBus(listen, connect)
+        stack.callback(bus.close)
+        recorder = Recorder(bus, clock, session, boot, path, interrupt.requested, say)
         epoch = recorder.join(join_timeout_s)
-        if discovery is not None:
-            discovery.close()
         if epoch is None:
             say("recorder: ended before the session began; nothing was written")
-            return 128 + signals[0]
+            return interrupt.exit_code
         recording = recorder.record(epoch)
-    finally:
-        bus.close()
     say("\n".join(recording.summary()))
-    if signals:
-        return 128 + signals[0]
+    if interrupt.requested():
+        return interrupt.exit_code
     if problem := recording.problem():
         raise RunFailed(problem)
     return 0

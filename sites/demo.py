@@ -10,8 +10,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 
+from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.endpoints import free_endpoints
@@ -40,20 +40,6 @@ class Outcome:
     log: Path
     problems: list[str] = field(default_factory=list)
     interrupted: int = 0
-
-
-class _Signals:
-    """Turns SIGINT and SIGTERM into a number that the loop looks at."""
-
-    def __init__(self) -> None:
-        self.number = 0
-
-    def install(self) -> None:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._take)
-
-    def _take(self, number: int, _frame: FrameType | None) -> None:
-        self.number = number
 
 
 class _Child:
@@ -102,8 +88,7 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     Returns:
         How it ended. The log is valid in every case in which a session began.
     """
-    signals = _Signals()
-    signals.install()
+    interrupt = Interrupt().install()
     warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once, not in every child
     session = f"{scenario.name}-demo"
     endpoints = free_endpoints(len(scenario.names))
@@ -125,11 +110,11 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     clock = SystemClock()
     bus = ZenohBus([], endpoints)
     try:
-        _attend(Watch(bus, session), display, children, recorder, signals, outcome, clock)
+        _attend(Watch(bus, session), display, children, recorder, interrupt, outcome, clock)
     finally:
         bus.close()
         _end_all(children, recorder, clock)
-    outcome.interrupted = signals.number
+    outcome.interrupted = interrupt.number
     for child in [*children, recorder]:
         problem = child.problem()
         if problem and not outcome.interrupted and problem not in outcome.problems:
@@ -158,12 +143,12 @@ def _attend(
     display: Display,
     children: list[_Child],
     recorder: _Child,
-    signals: _Signals,
+    interrupt: Interrupt,
     outcome: Outcome,
     clock: Clock,
 ) -> None:
     """Shows progress until every process has ended, one has failed, or a signal has come."""
-    while not signals.number:
+    while not interrupt.requested():
         watch.poll()
         display.update(watch.latest)
         for sentence in watch.take_news():

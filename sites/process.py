@@ -5,8 +5,6 @@ epoch its arm is braked; at the end it stays until the recorder has every record
 """
 
 import platform
-import signal
-import types
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +14,7 @@ from trilat_net.core.fingerprint import fingerprint
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Arrival, Mode, Output, Tick, diverged_text
 from trilat_net.errors import RunFailed, SessionError, WireError
+from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock, SystemClock
@@ -32,30 +31,6 @@ from .loop import Ports, run_loop
 LINGER_S = 5
 POLL_NS = 5_000_000
 _WARM_TICKS = 200
-
-
-class Interrupt:
-    """Remembers the first signal that asks the process to end.
-
-    Attributes:
-        number: that signal, or 0.
-    """
-
-    def __init__(self) -> None:
-        self.number = 0
-
-    def install(self) -> None:
-        """Takes SIGINT and SIGTERM; a second one of them acts as it did before."""
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._take)
-
-    def _take(self, number: int, _frame: types.FrameType | None) -> None:
-        self.number = number
-        signal.signal(number, signal.default_int_handler)
-
-    def requested(self) -> bool:
-        """True once a signal has come."""
-        return self.number != 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +71,7 @@ def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str
         UsageError: an endpoint cannot be used.
         RunFailed: the run diverged.
     """
-    interrupt = Interrupt()
-    interrupt.install()
+    interrupt = Interrupt().install()
     bus = ZenohBus(options.listen, options.connect)
     try:
         return _Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
@@ -167,7 +141,7 @@ class _Member:
         """Joins, runs, leaves."""
         epoch = self._join()
         if epoch is None:
-            return 128 + self._interrupt.number
+            return self._interrupt.exit_code
         self._epoch = epoch
         self._intake.admit([epoch.boots[peer] for peer in self._site.peers])
         self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
@@ -239,7 +213,7 @@ class _Member:
             raise RunFailed(diverged_text(self._name, output))
         if self._ended_by:
             raise RunFailed(f"{self._name} ended because {self._ended_by}")
-        return 128 + self._interrupt.number if self._interrupt.requested() else 0
+        return self._interrupt.exit_code if self._interrupt.requested() else 0
 
     def _await_recorder(self, ticks: int) -> None:
         """Waits for the recorder's word that it has every record, at most `LINGER_S`."""
