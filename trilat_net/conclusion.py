@@ -3,6 +3,7 @@
 Law: nothing is claimed that was not executed again just now.
 """
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -81,19 +82,20 @@ def results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
     Raises:
         UsageError: it holds something, or cannot be made.
     """
-    if folder is None:
-        number = 1
-        while (folder := Path("runs") / f"{name}-{number:03d}").exists():
-            number += 1
+    chosen = folder if folder is not None else _next_free(Path("runs"), name)
     try:
-        if folder.exists() and any(folder.iterdir()):
+        if chosen.exists() and any(chosen.iterdir()):
             if not force:
-                raise UsageError(f"{folder}: holds something; choose another folder, or use --force")
-            (folder / "run.mcap").unlink(missing_ok=True)
-        folder.mkdir(parents=True, exist_ok=True)
+                raise UsageError(f"{chosen}: holds something; choose another folder, or use --force")
+            (chosen / "run.mcap").unlink(missing_ok=True)
+        chosen.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
-    return folder
+        raise UsageError(f"{chosen}: cannot be made or read: {error.strerror}") from None
+    return chosen
+
+
+def _next_free(parent: Path, name: str) -> Path:
+    return next(path for n in itertools.count(1) if not (path := parent / f"{name}-{n:03d}").exists())
 
 
 def scenario_facts(scenario: Scenario) -> list[str]:

@@ -304,11 +304,16 @@ def decode(payload: bytes, kind: type[M]) -> M:
 def _check_numbers(message: Sample | State) -> None:
     """Refuses vectors of the wrong length and numbers that are not finite."""
     fields = STATE_VECTORS if isinstance(message, State) else SAMPLE_VECTORS
+    total = 0.0
     for name, length in fields.items():
         vector = getattr(message, name)
         if len(vector) != length:
             raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
-        if not all(map(_isfinite, vector)):
+        total += sum(vector)
+    if _isfinite(total):  # only if every term is; the second look is for terms whose sum overflows
+        return
+    for name in fields:
+        if not all(map(_isfinite, getattr(message, name))):
             raise WireError("not finite", f"{name} of {message.site} at tick {message.tick}")
 
 
