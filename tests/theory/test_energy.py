@@ -75,7 +75,7 @@ def test_sites_may_scale_kd_if_beta_is_divided_by_the_scale() -> None:
     )
     right = balance(made, left_null_vector(made.scenario) / list(scale.values()))
     assert np.diff(right.V).max() <= 5e-8 * right.V.max()
-    assert right.residual <= 2e-5
+    assert right.residual <= 5e-5
     ones = balance(made, np.ones(3)).V
     assert (ones - np.minimum.accumulate(ones)).max() == pytest.approx(12.3, abs=0.2)
     assert ones[0] == pytest.approx(32.8, abs=0.1)

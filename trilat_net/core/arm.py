@@ -59,6 +59,18 @@ def parameters(links: Links) -> Array:
     )
 
 
+def positive_definite(theta: Array) -> bool:
+    """True where M(q) is positive definite in every pose, with a margin (Property 1).
+
+    Its determinant, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is least for the stretched arm.
+
+    Args:
+        theta: parameters, shape (5,).
+    """
+    least = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
+    return bool(theta[2] > 0.0 and least > 1e-9 * theta[0] * theta[2])
+
+
 @leaf
 def inertia(theta: Array, q: Array, M: Array) -> None:
     """Writes M(q), shape (2, 2), kg m^2 (Section IV of the paper; Property 1).

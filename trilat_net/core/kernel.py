@@ -113,7 +113,10 @@ def _within_limits(site: Row) -> bool:
 
 @leaf
 def _emit(site: Row, row: Array) -> None:
-    """Writes the record's floats in the order of EMITTED."""
+    """Writes the record's floats in the order of EMITTED.
+
+    A record holds finite numbers: where the arithmetic has left them, the run has diverged, and 0 stands.
+    """
     n = site.q.shape[0]
     for i in range(n):
         row[i] = site.q[i]
@@ -124,6 +127,10 @@ def _emit(site: Row, row: Array) -> None:
         row[5 * n + i] = 0.0 - site.on_arm[i]  # 0.0, never -0.0, where nothing acts
     for p in range(site.theta_hat.shape[0]):
         row[6 * n + p] = site.theta_hat[p]
+    for i in range(row.shape[0]):
+        if not math.isfinite(row[i]):
+            row[i] = 0.0
+            site.mode = _DIVERGED
 
 
 @leaf

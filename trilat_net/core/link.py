@@ -40,7 +40,8 @@ LINK = np.dtype(
 # One row per sample that may wait: its tick (-1: empty) and the peer's joint state.
 SAMPLE = np.dtype((np.record, [("tick", "i8"), ("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,))]))
 
-AHEAD_LIMIT_NS = 10 * NS_PER_S
+AHEAD_LIMIT_S = 10
+AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
 """A stamp further ahead of the receiver than this is refused."""
 
 Row = Any
@@ -80,8 +81,9 @@ def accept(
         calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
     """
     link.accepted += 1
-    ahead_ns = tick_ns(tick, link.rate_hz) - tick_ns(k, rate_hz)
-    if tick < 0 or ahead_ns > AHEAD_LIMIT_NS:
+    # whole seconds first: a hostile tick must not overflow the arithmetic that comes after
+    far_ahead = tick // link.rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1
+    if tick < 0 or far_ahead or tick_ns(tick, link.rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS:
         link.refused += 1
         return
     slot: Row = samples[tick % samples.shape[0]]

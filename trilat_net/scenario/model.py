@@ -18,12 +18,16 @@ from ..core import dominance
 from ..core.arm import Array, Links, parameters
 from ..core.setup import LinkSetup, Scheme, SiteSetup
 
-Positive = Annotated[float, Meta(gt=0.0)]
-NotNegative = Annotated[float, Meta(ge=0.0)]
-Joints = Annotated[tuple[float, ...], Meta(min_length=2, max_length=2)]
+LARGEST = 1e9
+"""Beyond this no quantity of an arm, a gain or a torque is meant; arithmetic stays far from its limits."""
+
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Real = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Joints = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
 PositiveJoints = Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)]
 NotNegativeJoints = Annotated[tuple[NotNegative, ...], Meta(min_length=2, max_length=2)]
-Parameters = Annotated[tuple[float, ...], Meta(min_length=5, max_length=5)]
+Parameters = Annotated[tuple[Real, ...], Meta(min_length=5, max_length=5)]
 NotNegativeParameters = Annotated[tuple[NotNegative, ...], Meta(min_length=5, max_length=5)]
 Rate = Annotated[int, Meta(ge=1, le=20_000)]
 

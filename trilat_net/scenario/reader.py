@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from ..core import dominance
-from ..core.arm import JOINTS, PARAMETERS
+from ..core.arm import JOINTS, PARAMETERS, positive_definite
 from ..errors import ScenarioError
 from .model import Arm, Control, Limits, Link, Pulse, Scenario, SiteSpec
 
@@ -296,6 +296,11 @@ def _convert(resolved: Table) -> Scenario:
         dotted = _dotted(resolved, path.strip("`"))
         raise ScenarioError(_plain(problem, dotted), path=dotted) from None
     for name, site in scenario.sites.items():
+        if not positive_definite(site.arm.theta):
+            raise ScenarioError(
+                "its inertia matrix is singular in some pose: give the links mass away from their joints",
+                path=f"sites.{name}.arm",
+            )
         for n, pulse in enumerate(site.hands):
             if pulse.end_s <= pulse.start_s:
                 raise ScenarioError(
