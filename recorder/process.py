@@ -38,11 +38,11 @@ def record_session(
     Raises:
         TrilatError: the session did not begin, the file cannot be written, or records are missing.
     """
-    interrupt = Interrupt().install()
     clock = SystemClock()
     boot = new_boot()
     say(f"recorder: waiting for session {session!r} to begin")
     with ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt())
         if connect is None:
             discovery = Discovery(session, boot)
             stack.callback(discovery.close)

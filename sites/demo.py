@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -88,13 +89,32 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     Returns:
         How it ended. The log is valid in every case in which a session began.
     """
-    interrupt = Interrupt().install()
     warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once, not in every child
-    session = f"{scenario.name}-demo"
-    endpoints = free_endpoints(len(scenario.names))
+    outcome = Outcome(folder / "run.mcap")
+    with Interrupt() as interrupt:
+        endpoints = free_endpoints(len(scenario.names))
+        session = f"{scenario.name}-demo"
+        children, recorder = _start(scenario, folder, session, endpoints)
+        clock = SystemClock()
+        try:
+            with closing(ZenohBus([], endpoints)) as bus:
+                _attend(Watch(bus, session), display, children, recorder, interrupt, outcome, clock)
+        finally:
+            _end_all(children, recorder, clock)
+        outcome.interrupted = interrupt.number
+    for child in [*children, recorder]:
+        problem = child.problem()
+        if problem and not outcome.interrupted and problem not in outcome.problems:
+            outcome.problems.append(problem)
+    return outcome
+
+
+def _start(
+    scenario: Scenario, folder: Path, session: str, endpoints: list[str]
+) -> tuple[list[_Child], _Child]:
+    """Starts every site and the recorder; what they print goes into `processes/`."""
     text = folder / "scenario.toml"
     text.write_text(scenario.text, encoding="utf-8")
-    outcome = Outcome(folder / "run.mcap")
     printed = folder / "processes"
     printed.mkdir(exist_ok=True)
     children = [
@@ -102,24 +122,9 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
         for n, name in enumerate(scenario.names)
     ]
     connect = [word for endpoint in endpoints for word in ("--connect", endpoint)]
-    recorder = _Child(
-        topics.RECORDER,
-        ["record", "--session", session, *connect, "-o", str(outcome.log), "--join-timeout", "60"],
-        printed,
-    )
-    clock = SystemClock()
-    bus = ZenohBus([], endpoints)
-    try:
-        _attend(Watch(bus, session), display, children, recorder, interrupt, outcome, clock)
-    finally:
-        bus.close()
-        _end_all(children, recorder, clock)
-    outcome.interrupted = interrupt.number
-    for child in [*children, recorder]:
-        problem = child.problem()
-        if problem and not outcome.interrupted and problem not in outcome.problems:
-            outcome.problems.append(problem)
-    return outcome
+    log = str(folder / "run.mcap")
+    arguments = ["record", "--session", session, *connect, "-o", log, "--join-timeout", "60"]
+    return children, _Child(topics.RECORDER, arguments, printed)
 
 
 def _site_arguments(name: str, scenario: Path, session: str, endpoints: list[str], n: int) -> list[str]:

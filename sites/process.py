@@ -71,12 +71,12 @@ def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str
         UsageError: an endpoint cannot be used.
         RunFailed: the run diverged.
     """
-    interrupt = Interrupt().install()
-    bus = ZenohBus(options.listen, options.connect)
-    try:
-        return _Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
-    finally:
-        bus.close()
+    with Interrupt() as interrupt:
+        bus = ZenohBus(options.listen, options.connect)
+        try:
+            return _Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
+        finally:
+            bus.close()
 
 
 def warm_up(scenario: Scenario, name: str) -> None:

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from typer.core import TyperGroup
 
 from .errors import TrilatError, UsageError
 
@@ -20,7 +21,23 @@ if TYPE_CHECKING:
     from .conclusion import Conclusion
     from .scenario import Scenario
 
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+class _Commands(TyperGroup):
+    """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1."""
+
+    def invoke(self, ctx: typer.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            err.print("interrupted")
+            raise typer.Exit(130) from None
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -30,9 +47,6 @@ app = typer.Typer(
 )
 scenario_app = typer.Typer(no_args_is_help=True, help="The shipped scenarios and your own.")
 app.add_typer(scenario_app, name="scenario")
-
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
 
 ScenarioArgument = Annotated[str, typer.Argument(help="Name of a shipped scenario, or path of a TOML file.")]
 SetOption = Annotated[
@@ -318,7 +332,7 @@ def _print_conclusion(conclusion: "Conclusion") -> None:
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
     try:
-        app(standalone_mode=True)
+        app()
     except TrilatError as error:
         err.print(f"error: {escape(str(error))}", soft_wrap=True)
         sys.exit(error.exit_code)

@@ -4,11 +4,12 @@ Law: a signal ends nothing by itself; whoever loops looks, and ends in order.
 """
 
 import signal
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import Any
 
 
 class Interrupt:
-    """Remembers the first SIGINT or SIGTERM.
+    """Remembers the first SIGINT or SIGTERM; a context, which puts things back as they were.
 
     Attributes:
         number: that signal, or 0.
@@ -16,12 +17,18 @@ class Interrupt:
 
     def __init__(self) -> None:
         self.number = 0
+        self._before: dict[int, Any] = {}
 
-    def install(self) -> "Interrupt":
-        """Begins to take the signals of this process, and returns itself."""
+    def __enter__(self) -> "Interrupt":
         for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._take)
+            self._before[name] = signal.signal(name, self._take)
         return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for name, handler in self._before.items():
+            signal.signal(name, handler)
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number

@@ -114,14 +114,16 @@ def record(scenario: Scenario, stream: BinaryIO, network: Network | None = None)
     members: dict[str, _Member] = {}
     within = True
     t_ns = 0
-    with collector.paused():
-        for site, arrivals, output in run(scenario, network):
-            if site.name not in members:
-                members[site.name] = _Member(scenario, site, writer)
-            members[site.name].write(arrivals, output)
-            within &= output.mode is Mode.RUN
-            t_ns = output.t_ns
-    for name, member in members.items():
-        member.say("end", f"{name} made {member.ticks} ticks", t_ns)
-    writer.finish({name: member.ticks for name, member in members.items()})
+    try:
+        with collector.paused():
+            for site, arrivals, output in run(scenario, network):
+                if site.name not in members:
+                    members[site.name] = _Member(scenario, site, writer)
+                members[site.name].write(arrivals, output)
+                within &= output.mode is Mode.RUN
+                t_ns = output.t_ns
+    finally:  # Ctrl-C too leaves a file that is finished
+        for name, member in members.items():
+            member.say("end", f"{name} made {member.ticks} ticks", t_ns)
+        writer.finish({name: member.ticks for name, member in members.items()})
     return within

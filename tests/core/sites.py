@@ -1,0 +1,29 @@
+"""Sites of the shipped scenarios, stepped by hand."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from trilat_net.core.setup import LinkSetup, SiteSetup
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Arrival, Output, Tick
+from trilat_net.scenario import load
+
+
+def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSetup:
+    """The setup of a site; overrides with `__` for the dot."""
+    return load(scenario, {key.replace("__", "."): value for key, value in overrides.items()}).setup(site)
+
+
+def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int, start: Sequence[float] = (0.5, -0.25)) -> Site:
+    """A site with a single peer, whose reference therefore is the sample in use."""
+    link = LinkSetup("peer", 1.0, delay_ns, peer_rate_hz, tuple(start))
+    return Site(setup()._replace(rate_hz=rate_hz, links=(link,)))
+
+
+def sample(tick: int, peer: int = 0) -> Arrival:
+    """A sample that carries its own number."""
+    return Arrival(peer, tick, (1e-3 * (tick + 1), -1e-3 * (tick + 1)), (1e-4 * tick, 0.0))
+
+
+def stepped(site: Site, ticks: Iterable[Tick]) -> list[Output]:
+    return [site.step(tick) for tick in ticks]

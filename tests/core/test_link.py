@@ -1,0 +1,237 @@
+"""The receiving end of a link (L2, L7), against a list of samples and fractions of a second."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.core.sites import one_link, sample, setup, stepped
+from tests.virtual_runs import run
+from trilat_net.core.link import calendar_pages
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Arrival, Tick
+from trilat_net.scenario import load
+
+rates = st.sampled_from([1, 3, 50, 333, 700, 999, 1000, 1001, 4096, 20_000])
+S = 10**9
+
+
+def stamp_ns(tick: int, rate_hz: int) -> int:
+    return int(Fraction(tick, rate_hz) * S)
+
+
+class SampleList:
+    """What L2 says, by brute force: of all samples that are due, the newest that has come."""
+
+    def __init__(self, rate_hz: int, peer_rate_hz: int, delay_ns: int) -> None:
+        self.rate_hz, self.peer_rate_hz, self.delay_ns = rate_hz, peer_rate_hz, delay_ns
+        self.come: dict[int, int] = {}
+        self.late = self.duplicate = self.refused = 0
+
+    def due(self, tick: int, k: int) -> bool:
+        now, stamp = stamp_ns(k, self.rate_hz), stamp_ns(tick, self.peer_rate_hz)
+        return now >= stamp + self.delay_ns and now > stamp
+
+    def take(self, k: int, tick: int) -> None:
+        if tick < 0 or stamp_ns(tick, self.peer_rate_hz) - stamp_ns(k, self.rate_hz) > 10 * S:
+            self.refused += 1
+        elif tick in self.come:
+            self.duplicate += 1
+        else:
+            self.late += k > 0 and self.due(tick, k - 1)
+            self.come[tick] = k
+
+    def used(self, k: int) -> int:
+        return max((tick for tick in self.come if self.due(tick, k)), default=-1)
+
+
+@given(
+    rate_hz=rates,
+    peer_rate_hz=rates,
+    delay_us=st.one_of(st.just(0), st.integers(0, 50_000), st.integers(0, 10_000_000)),
+    tick=st.integers(0, 10_000),
+)
+def test_a_sample_is_released_by_the_first_tick_at_or_after_its_due_time_and_never_at_its_stamp(
+    rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
+) -> None:
+    released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
+    model = SampleList(rate_hz, peer_rate_hz, delay_us * 1000)
+    assert model.due(tick, released)
+    assert not model.due(tick, released - 1)
+
+
+def test_no_delay_means_one_period() -> None:
+    site = one_link(1000, 1000, 0)
+    outputs = stepped(site, [Tick(0), *(Tick(k, [sample(k - 1), sample(k)]) for k in range(1, 6))])
+    assert [o.used for o in outputs] == [[-1], [0], [1], [2], [3], [4]]
+
+
+@given(
+    rate_hz=st.sampled_from([100, 333, 1000, 1001]),
+    peer_rate_hz=st.sampled_from([100, 333, 1000, 1001]),
+    delay_us=st.integers(0, 20_000),
+    data=st.data(),
+)
+def test_what_is_in_use_is_the_newest_sample_that_is_due_and_has_come(
+    rate_hz: int, peer_rate_hz: int, delay_us: int, data: st.DataObject
+) -> None:
+    """Any order, late ones, duplicates, and stamps of the future: all against the list."""
+    site, model = one_link(rate_hz, peer_rate_hz, delay_us * 1000), SampleList(
+        rate_hz, peer_rate_hz, delay_us * 1000
+    )
+    arrivals = st.lists(st.integers(0, 40), max_size=6)
+    for k in range(25):
+        came = data.draw(arrivals)
+        for tick in came:
+            model.take(k, tick)
+        output = site.step(Tick(k, [sample(tick) for tick in came]))
+        used = model.used(k)
+        assert output.used == [used]
+        if used >= 0:
+            assert output.q_des == list(sample(used).q)
+            assert output.qd_des == list(sample(used).qd)
+    assert site.counts()[0].accepted >= len(model.come)
+
+
+@given(
+    order=st.permutations(range(30)),
+    arrive=st.lists(st.integers(0, 10), min_size=30, max_size=30),
+    twice=st.sets(st.integers(0, 29)),
+    peer_rate_hz=st.sampled_from([500, 1000, 1500]),
+)
+def test_when_and_in_what_order_samples_arrive_before_they_are_due_changes_no_bit(
+    order: list[int], arrive: list[int], twice: set[int], peer_rate_hz: int
+) -> None:
+    rate_hz, delay_ns = 1000, 60_000_000
+
+    def run_with(at: dict[int, list[int]]) -> list[object]:
+        site = one_link(rate_hz, peer_rate_hz, delay_ns)
+        ticks = [Tick(k, [sample(m) for m in at.get(k, [])]) for k in range(100)]
+        return [output._replace(rx_crc=0) for output in stepped(site, ticks)]
+
+    scattered: dict[int, list[int]] = {}
+    for tick in order:
+        scattered.setdefault(arrive[tick], []).extend([tick] * (1 + (tick in twice)))
+    assert run_with(scattered) == run_with({0: list(range(30))})
+
+
+def test_late_duplicate_and_refused_samples_are_counted() -> None:
+    site = one_link(1000, 1000, 5_000_000)
+    site.step(Tick(0, [sample(0), sample(0), sample(-1), sample(10_001)]))
+    counts = site.counts()[0]
+    assert (counts.accepted, counts.late, counts.duplicate, counts.refused) == (4, 0, 1, 2)
+    stepped(site, [Tick(k) for k in range(1, 10)])
+    output = site.step(Tick(10, [sample(3), sample(5), sample(4)]))  # due at ticks 8, 10, 9
+    assert output.used == [5]
+    assert site.counts()[0].late == 2
+
+
+def test_a_late_sample_comes_into_use_at_once_if_it_is_the_newest() -> None:
+    site = one_link(1000, 1000, 5_000_000)
+    stepped(site, [Tick(k) for k in range(30)])
+    assert site.step(Tick(30, [sample(12)])).used == [12]
+    assert site.step(Tick(31, [sample(11)])).used == [12]
+
+
+@pytest.mark.parametrize("peer_rate_hz", [1, 1000, 20_000])
+def test_a_stamp_more_than_ten_seconds_ahead_is_refused(peer_rate_hz: int) -> None:
+    site = one_link(1000, peer_rate_hz, 0)
+    limit = 10 * peer_rate_hz
+    site.step(Tick(0, [sample(limit), sample(limit + 1)]))
+    assert site.counts()[0].refused == 1
+
+
+@given(tick=st.one_of(st.integers(10_001, 2**40 - 1), st.just(18_446_744_074)))
+def test_a_stamp_ahead_by_whatever_the_wire_can_carry_is_refused(tick: int) -> None:
+    site = one_link(1000, 1000, 0)
+    site.step(Tick(0, [sample(tick)]))
+    assert site.counts()[0].refused == 1
+
+
+@given(delay_us=st.integers(0, 10_000_000), rate_hz=rates)
+def test_a_calendar_has_a_page_for_all_that_may_wait(delay_us: int, rate_hz: int) -> None:
+    pages = calendar_pages(delay_us * 1000, rate_hz)
+    assert pages & (pages - 1) == 0
+    assert pages > Fraction(delay_us * 1000 + 10 * S, S) * rate_hz + 1
+
+
+def test_samples_from_far_ahead_wait_without_touching_nearer_ones() -> None:
+    site = one_link(1000, 1000, 10_000_000_000)
+    first = [sample(m) for m in range(0, 10_001, 50)]
+    outputs = stepped(site, [Tick(0, first), *(Tick(k) for k in range(1, 20_001))])
+    assert [o.used[0] for o in outputs] == [
+        -1 if k < 10_000 else 50 * ((k - 10_000) // 50) for k in range(20_001)
+    ]
+
+
+# The delay bookkeeping, on whole runs.
+
+
+def bookkeeping_holds(delay_ms: float) -> bool:
+    """Whether the record of tick k used tick k - 200 of each peer, and its state, exactly."""
+    made = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
+    expected = np.maximum(np.arange(2000) - 200, -1)
+    for name, site in made.sites.items():
+        peers = [made.sites[p] for p in made.scenario.peers(name)]
+        if not all((site.used[:, j] == expected).all() for j in range(2)):
+            return False
+        mean = 0.5 * peers[0].q[:-200] + 0.5 * peers[1].q[:-200]
+        if not (site.q_des[200:] == mean).all():
+            return False
+    return True
+
+
+def test_tick_k_uses_tick_k_minus_200_of_each_peer() -> None:
+    assert bookkeeping_holds(200.0)
+
+
+@pytest.mark.parametrize("delay_ms", [199.0, 199.999, 200.001, 201.0])
+def test_a_slip_of_one_tick_fails_that_check(delay_ms: float) -> None:
+    assert bookkeeping_holds(delay_ms) == (delay_ms == 199.999)  # due between two ticks: the later one
+
+
+def test_each_link_of_asymmetric_has_its_own_delay() -> None:
+    made = run("asymmetric", {"duration_s": 1.0})
+    for name, site in made.sites.items():
+        for j, peer in enumerate(made.scenario.peers(name)):
+            slip = round(made.scenario.links[f"{peer}->{name}"].delay_ms)
+            assert (site.used[:, j] == np.maximum(np.arange(1000) - slip, -1)).all()
+
+
+# The initial history (L7).
+
+
+def test_until_the_first_sample_is_due_a_peer_rests_at_its_start_pose() -> None:
+    made = run("free", {"duration_s": 1.0})
+    starts = {name: np.array(spec.q0_rad) for name, spec in made.scenario.sites.items()}
+    for name, site in made.sites.items():
+        a, b = (starts[p] for p in made.scenario.peers(name))
+        assert (site.q_des[:200] == 0.5 * a + 0.5 * b).all()
+        assert (site.qd_des[:200] == 0.0).all()
+        assert (site.used[:200] == -1).all()
+
+
+def test_a_history_of_zero_would_move_free_by_a_tenth_of_a_radian() -> None:
+    scenario = load("free")
+    zero = [
+        Site(setup(name, "free")._replace(links=tuple(link._replace(q0=(0.0, 0.0)) for link in s.links)))
+        for name in scenario.names
+        for s in [setup(name, "free")]
+    ]
+    q = np.zeros((3, 20_000, 2))
+    last = [site.step(Tick(0)) for site in zero]
+    for k in range(1, 20_000):
+        for i, output in enumerate(last):
+            q[i, k - 1] = output.q
+        came = [
+            [Arrival(n, k - 1, last[j].q, last[j].qd) for n, j in enumerate(j for j in range(3) if j != i)]
+            for i in range(3)
+        ]
+        last = [site.step(Tick(k, arrivals)) for site, arrivals in zip(zero, came, strict=True)]
+    q[:, -1] = [o.q for o in last]
+    right = run("free", {"duration_s": 20.0}).stack("q")
+    assert np.abs(q - right).max() == pytest.approx(0.117, abs=0.002)
+    assert q[0, -1, 0] == pytest.approx(-0.1415, abs=2e-3)
+    assert right[0, -1, 0] == pytest.approx(-0.1240, abs=2e-3)
