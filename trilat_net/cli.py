@@ -7,7 +7,7 @@ failed run or comparison, 2 on bad input, 128 + n when signal n ended it; an err
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -28,7 +28,7 @@ err = Console(stderr=True, highlight=False)
 class _Commands(TyperGroup):
     """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1."""
 
-    def invoke(self, ctx: typer.Context) -> object:
+    def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
