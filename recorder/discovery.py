@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from trilat_net.errors import SessionError, WireError
+from trilat_net.errors import ScenarioError, SessionError, WireError
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock
 from trilat_net.net.endpoints import default_endpoint, default_endpoints
@@ -40,12 +40,10 @@ class Discovery:
             clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
             while (reply := replies.poll()) is not None:
                 try:
-                    info = decode(reply[1], Info)
-                except WireError as error:
-                    raise SessionError(f"the first site of {self._session!r}: {error}") from None
-                if info.scenario:
-                    names = parse(info.scenario, info.member).names
-                    return list(default_endpoints(self._session, names).values())
+                    names = parse(decode(reply[1], Info).scenario, self._session).names
+                except (WireError, ScenarioError):
+                    continue  # no site of ours
+                return list(default_endpoints(self._session, names).values())
             if timeout_s is not None and clock.monotonic_ns() - begun_ns > timeout_s * 1e9:
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for the first site of session {self._session!r} "

@@ -106,7 +106,9 @@ class Recorder:
         """
         self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
         scenario = next(
-            parse(info.scenario, info.member) for info in self._joining.met.values() if info.scenario
+            parse(info.scenario, info.member)
+            for info in self._joining.met.values()
+            if info.scenario and epoch.boots.get(info.member) == info.boot
         )
         try:
             stream = self._path.open("xb")

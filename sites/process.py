@@ -173,6 +173,8 @@ class _Member:
             if now_ns > give_up_ns:
                 missing = self._joining.missing()
                 who = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+                for member, reason in self._joining.unreadable.items():
+                    who += f"; the answer of {member} cannot be understood: {reason}"
                 raise SessionError(
                     f"{self._name} waited {self._options.join_timeout_s:g} s in session "
                     f"{self._options.session!r}: {who}"
@@ -185,7 +187,7 @@ class _Member:
         self._voice.answer()
         while (change := self._presence.poll()) is not None:
             where = topics.address(change[0])
-            if where is None or self._epoch.boots.get(where.member) != int(where.boot):
+            if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
                 continue
             if not change[1]:
                 self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)

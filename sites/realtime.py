@@ -37,7 +37,7 @@ def prepare(cpu: int | None) -> dict[str, str]:
 def _attempt(step: Callable[[], str]) -> str:
     try:
         return step()
-    except (OSError, AttributeError) as error:
+    except (OSError, AttributeError, ValueError, OverflowError) as error:
         return f"not obtained ({getattr(error, 'strerror', None) or 'not on this platform'})"
 
 

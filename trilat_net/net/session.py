@@ -93,10 +93,12 @@ class Joining:
 
     Attributes:
         met: what the other members said of themselves, by name.
+        unreadable: whose answer could not be understood, and why.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, voice: Voice, sites: Sequence[str]) -> None:
         self.met: dict[str, Info] = {}
+        self.unreadable: dict[str, str] = {}
         self._bus, self._clock, self._session, self._voice = bus, clock, session, voice
         self._sites = tuple(sites)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
@@ -104,6 +106,7 @@ class Joining:
         self._asked_ns = -ASK_EVERY_NS
         self._replies = bus.ask(topics.key(session, "*", topics.INFO))
         self._announced: Event | None = None
+        self._announcer_gone = False
         self._attempt = 0
         self._ready: set[str] = set()
         self._refused: set[int] = set()
@@ -120,7 +123,8 @@ class Joining:
 
     def missing(self) -> list[str]:
         """Returns the members that have not been met."""
-        recorder = self._own.needs_recorder or bool(self._recorders)
+        needed = any(info.needs_recorder for info in (self._own, *self.met.values()))
+        recorder = needed or bool(self._recorders)
         wanted = [*self._sites, *([topics.RECORDER] if recorder else [])]
         return [name for name in wanted if name != self._own.member and name not in self.met]
 
@@ -142,10 +146,15 @@ class Joining:
         """Asks again and again who is there, and takes the answers."""
         now_ns = self._clock.monotonic_ns()
         while (reply := self._replies.poll()) is not None:
+            where = topics.address(reply[0])
             try:
-                self._take(decode(reply[1], Info))
-            except WireError as error:
-                raise SessionError(f"a member of {self._session!r} cannot be understood: {error}") from None
+                info = decode(reply[1], Info)
+            except WireError as error:  # another version of us, or a stranger: no reason to leave
+                if where is not None and where.member in (*self._sites, topics.RECORDER):
+                    self.unreadable[where.member] = str(error)
+                continue
+            if where is not None and where.member == info.member:
+                self._take(info)
         if now_ns - self._asked_ns >= ASK_EVERY_NS:
             self._asked_ns = now_ns
             self._replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
@@ -191,6 +200,8 @@ class Joining:
                 (self._recorders.add if alive else self._recorders.discard)(where.boot)
             if alive:
                 continue
+            if self._announced is not None and str(self._announced.boot) == where.boot:
+                self._announcer_gone = True
             met = self.met.get(where.member)
             if met is not None and str(met.boot) == where.boot:
                 del self.met[where.member]
@@ -202,42 +213,69 @@ class Joining:
                 event = decode(message[1], Event)
             except WireError:
                 continue  # a stranger's; the loop counts those, joining has no use for them
+            if event.boots.get(event.member) != event.boot:
+                continue  # from nobody whom the announcement is for
             if event.kind == "epoch":
                 self._consider(event)
-            elif event.kind == "ready" and self._announced and event.attempt == self._announced.attempt:
+            elif event.kind == "ready" and self._answers(event):
                 self._ready.add(event.member)
-            elif event.kind == "start" and self._announced and event.attempt == self._announced.attempt:
+            elif event.kind == "start" and self._answers(event) and event.boot == self._announced_by():
                 return self._announced
         return None
 
+    def _answers(self, event: Event) -> bool:
+        """True where an event belongs to the announcement in hand."""
+        announced = self._announced
+        return announced is not None and (event.attempt, event.boots) == (announced.attempt, announced.boots)
+
+    def _announced_by(self) -> int | None:
+        return None if self._announced is None else self._announced.boot
+
     def _consider(self, event: Event) -> None:
-        """Answers an announced epoch, if it is for this boot."""
-        if not self._sites and not any(info.scenario for info in self.met.values()):
+        """Answers an announced epoch, if it is the leader's and for this boot."""
+        if self._leads or (self._sites and event.member != self._sites[0]):
+            return
+        if not self._sites and not self._knows_scenario(event):
             return  # a recorder that has not learnt the scenario yet is not ready
         if event.boots.get(self._own.member) == self._own.boot:
-            self._announced = event
-            self._voice.say("ready", f"{self._own.member} is ready", attempt=event.attempt)
+            if self._bound(event):
+                return
+            self._announced, self._announcer_gone = event, False
+            self._voice.say("ready", f"{self._own.member} is ready", attempt=event.attempt, boots=event.boots)
         elif self._own.member in event.boots:
             raise SessionError(f"session {self._session!r} goes on with another {self._own.member}")
+
+    def _knows_scenario(self, event: Event) -> bool:
+        return any(info.scenario and event.boots.get(name) == info.boot for name, info in self.met.items())
+
+    def _bound(self, event: Event) -> bool:
+        """True where this member has said ready to another leader, who may still say start."""
+        announced = self._announced
+        if announced is None or announced.boot == event.boot or self._announcer_gone:
+            return False
+        return self._clock.monotonic_ns() < self._epoch(announced).mono_ns
 
     def _lead(self) -> Event | None:
         """Announces an epoch when all are there; returns it when all are ready in time."""
         now_ns = self._clock.monotonic_ns()
         announced = self._announced
         if announced is not None:
-            others = set(announced.boots) - {self._own.member}
-            if now_ns >= announced.epoch_mono_ns - DECIDE_NS or not others <= set(self.met):
+            boots = self._boots()
+            if now_ns >= announced.epoch_mono_ns - DECIDE_NS or not announced.boots.items() <= boots.items():
                 self._announced = None  # somebody was too late, or is gone: another attempt
-            elif self._ready >= others:
-                self._voice.say("start", "all are ready", attempt=announced.attempt)
+            elif self._ready | {self._own.member} >= set(announced.boots):
+                self._voice.say("start", "all are ready", attempt=announced.attempt, boots=announced.boots)
                 return announced
             return None
         if not self.missing():
             self._announce(now_ns)
         return None
 
+    def _boots(self) -> dict[str, int]:
+        return {name: info.boot for name, info in self.met.items()} | {self._own.member: self._own.boot}
+
     def _announce(self, now_ns: int) -> None:
-        boots = {name: info.boot for name, info in self.met.items()} | {self._own.member: self._own.boot}
+        boots = self._boots()
         self._ready = set()
         self._attempt += 1
         self._announced = self._voice.say(

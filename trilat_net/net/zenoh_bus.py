@@ -89,12 +89,16 @@ class _Replies:
 
 
 class _PresenceRing:
-    def __init__(self, subscriber: Any) -> None:
+    def __init__(self, subscriber: Any, own: set[str]) -> None:
         self._subscriber = subscriber
+        self._own = own
 
     def poll(self) -> tuple[str, bool] | None:
-        sample = self._subscriber.try_recv()
-        return None if sample is None else (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        while (sample := self._subscriber.try_recv()) is not None:
+            key = str(sample.key_expr)
+            if key not in self._own:  # liveliness knows no locality: own tokens come too
+                return key, sample.kind == zenoh.SampleKind.PUT
+        return None
 
 
 class _Question:
@@ -135,6 +139,7 @@ class ZenohBus:
         except zenoh.ZError as error:
             raise UsageError(_open_problem(str(error), listen, connect)) from None
         self._kept: list[Any] = []
+        self._tokens: set[str] = set()
 
     def publisher(self, key: str) -> Callable[[bytes], None]:
         """See `Bus`."""
@@ -190,12 +195,14 @@ class ZenohBus:
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
+        self._tokens.add(key)
         self._kept.append(self._session.liveliness().declare_token(key))
 
     def presence(self, key: str) -> Presence:
         """See `Bus`."""
         return _PresenceRing(
-            self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True)
+            self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True),
+            self._tokens,
         )
 
     def close(self) -> None:

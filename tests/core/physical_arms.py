@@ -1,0 +1,84 @@
+"""Physical arms drawn at random, and their dynamics derived again: from where the masses are.
+
+Nothing of `trilat_net.core.arm` is in here but the type that names lengths and masses.
+"""
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trilat_net.core.arm import Links
+
+Array = NDArray[np.float64]
+
+positive = st.floats(0.05, 5.0)
+links = st.builds(
+    Links,
+    l1_m=positive,
+    m1_kg=positive,
+    lc1_m=positive,  # a massless first link would make M singular where the arm is straight
+    I1_kg_m2=st.floats(0.0, 5.0),
+    l2_m=positive,
+    m2_kg=positive,
+    lc2_m=positive,
+    I2_kg_m2=st.floats(0.0, 5.0),
+)
+angle = st.floats(-7.0, 7.0)
+speed = st.floats(-10.0, 10.0)
+
+
+def vectors(entry: st.SearchStrategy[float]) -> st.SearchStrategy[Array]:
+    return st.tuples(entry, entry).map(np.array)
+
+
+angles, speeds = vectors(angle), vectors(speed)
+STEP = 1e-30
+
+
+def centres(a: Links, q: NDArray) -> list[NDArray]:
+    """Where the centres of mass are, in the vertical plane; q may be complex."""
+    first, both = q[0], q[0] + q[1]
+    elbow = a.l1_m * np.array([np.cos(first), np.sin(first)])
+    one = a.lc1_m * np.array([np.cos(first), np.sin(first)])
+    return [one, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
+
+
+def kinetic(a: Links, q: Array, qd: Array) -> float:
+    """Energy of the moving masses; their velocities by complex step along qd."""
+    one, two = (centre.imag / STEP for centre in centres(a, q + 1j * STEP * qd))
+    spin = a.I1_kg_m2 * qd[0] ** 2 + a.I2_kg_m2 * (qd[0] + qd[1]) ** 2
+    return float(0.5 * (a.m1_kg * one @ one + a.m2_kg * two @ two + spin))
+
+
+def potential(a: Links, g: float, q: NDArray) -> NDArray:
+    one, two = centres(a, q)
+    return g * (a.m1_kg * one[1] + a.m2_kg * two[1])
+
+
+def gravity(a: Links, g: float, q: Array) -> Array:
+    """The gradient of the potential energy, by complex step."""
+    return np.array([potential(a, g, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)])
+
+
+def inertia(a: Links, q: NDArray) -> NDArray:
+    """Sum of m J'J and I, with the Jacobians of the centres of mass; q may be complex."""
+    s1, c1 = np.sin(q[0]), np.cos(q[0])
+    s12, c12 = np.sin(q[0] + q[1]), np.cos(q[0] + q[1])
+    J1 = a.lc1_m * np.array([[-s1, 0 * s1], [c1, 0 * s1]])
+    J2 = np.array(
+        [[-a.l1_m * s1 - a.lc2_m * s12, -a.lc2_m * s12], [a.l1_m * c1 + a.lc2_m * c12, a.lc2_m * c12]]
+    )
+    spins = np.array([[a.I1_kg_m2 + a.I2_kg_m2, a.I2_kg_m2], [a.I2_kg_m2, a.I2_kg_m2]])
+    return a.m1_kg * J1.T @ J1 + a.m2_kg * J2.T @ J2 + spins
+
+
+def inertia_rates(a: Links, q: Array) -> Array:
+    """dM/dq_k, shape (2, 2, 2) with k last, by complex step."""
+    return np.stack([inertia(a, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)], axis=-1)
+
+
+def coriolis(a: Links, q: Array, qd: Array) -> Array:
+    """C(q, qd) by Christoffel symbols of the first kind."""
+    D = inertia_rates(a, q)
+    symbols = 0.5 * (D + D.transpose(0, 2, 1) - D.transpose(2, 0, 1))
+    return np.einsum("ijk,k->ij", symbols, qd)

@@ -1,0 +1,130 @@
+"""The dominance matrix and beta, Eq. (6), (7), (20)."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trilat_net.core.dominance import irreducible, perron, row_fault, upsilon
+
+Array = NDArray[np.float64]
+SMALLEST = 1e-6
+
+
+@st.composite
+def matrices(draw: st.DrawFn, zeros: bool = True) -> Array:
+    """Rows that sum to one, zero diagonal, other entries zero or at least 1e-6."""
+    size = draw(st.integers(2, 6))
+    share = st.one_of(st.floats(-6, 0).map(lambda x: 10**x), *([st.just(0.0)] if zeros else []))
+    a = np.array(draw(st.lists(st.lists(share, min_size=size, max_size=size), min_size=size, max_size=size)))
+    np.fill_diagonal(a, 0.0)
+    assume((a.sum(1) > 0).all())
+    a /= a.sum(1, keepdims=True)
+    assume(((a == 0) | (a >= SMALLEST)).all())
+    return a
+
+
+def strongly_connected(a: Array) -> bool:
+    """By a walk from the first site, there and back."""
+
+    def reached(edges: Array) -> set[int]:
+        found, new = {0}, [0]
+        while new:
+            new = [j for i in new for j in np.flatnonzero(edges[i]) if j not in found and not found.add(j)]
+        return found
+
+    return len(reached(a)) == len(reached(a.T)) == len(a)
+
+
+@given(a=matrices())
+def test_beta_is_the_positive_left_null_vector_of_upsilon(a: Array) -> None:
+    """beta'Upsilon = 0 after Eq. (20), to 1e-12, entry by entry positive."""
+    assume(strongly_connected(a))
+    beta = perron(a)
+    assert (beta > 0).all()
+    assert beta.sum() == pytest.approx(1.0, abs=1e-14)
+    assert np.abs(beta @ upsilon(a)).max() <= 1e-12
+
+
+@given(a=matrices(zeros=False))
+def test_beta_is_numpys_null_vector(a: Array) -> None:
+    left = np.linalg.svd(upsilon(a).T)[2][-1]
+    assert perron(a) == pytest.approx(left / left.sum(), abs=1e-9)
+
+
+@given(a=matrices())
+def test_a_matrix_is_irreducible_just_where_its_graph_is_strongly_connected(a: Array) -> None:
+    assert irreducible(a) == strongly_connected(a)
+
+
+@given(a=matrices(zeros=False), closed=st.integers(2, 5))
+def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
+    """The first sites follow each other alone: nobody else weighs anything."""
+    assume(closed < len(a))
+    a[:closed, closed:] = 0.0
+    a[:closed] /= a[:closed].sum(1, keepdims=True)
+    assert not irreducible(a)
+    with pytest.raises(ValueError, match="reducible"):
+        perron(a)
+
+
+def test_two_that_are_locked_leave_the_third_without_weight() -> None:
+    """Expert and slave locked, trainee following: a13 = a31 = 1."""
+    with pytest.raises(ValueError, match="reducible"):
+        perron(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.5], [1.0, 0.0, 0.0]]))
+
+
+@given(shares=st.tuples(*[st.floats(0.01, 0.99)] * 3))
+def test_beta_of_three_sites_in_closed_form(shares: tuple[float, float, float]) -> None:
+    """beta ~ (1 - a23 a32, 1 - a13 a31, 1 - a12 a21)."""
+    a12, a21, a31 = shares
+    a13, a23, a32 = 1 - a12, 1 - a21, 1 - a31
+    closed = np.array([1 - a23 * a32, 1 - a13 * a31, 1 - a12 * a21])
+    beta = perron(np.array([[0, a12, a13], [a21, 0, a23], [a31, a32, 0]]))
+    assert beta == pytest.approx(closed / closed.sum(), rel=1e-12)
+
+
+@given(share=st.floats(0.01, 0.99))
+def test_ones_are_a_left_null_vector_of_circulant_shares_only(share: float) -> None:
+    """The paper's beta = (1, 1, 1) fits one free parameter, not three."""
+    rest = 1 - share
+    circulant = np.array([[0, share, rest], [rest, 0, share], [share, rest, 0]])
+    assert perron(circulant) == pytest.approx([1 / 3] * 3, rel=1e-12)
+    skewed = np.array([[0, share, rest], [0.5, 0, 0.5], [0.3, 0.7, 0]])
+    assert np.abs(np.ones(3) @ upsilon(skewed)).max() > 1e-3
+
+
+@given(a=matrices())
+def test_ones_are_the_right_null_vector_always(a: Array) -> None:
+    """Which is what Eq. (7) says."""
+    assert np.abs(upsilon(a) @ np.ones(len(a))).max() <= 1e-15 * 8
+    assert all(row_fault(row, own) is None for own, row in enumerate(a))
+
+
+@given(a=matrices(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
+def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
+    """Eq. (7)."""
+    row = a[own].copy()
+    entry = int(np.argmax(row))
+    row[entry] += off
+    assume(0 <= row[entry] <= 1)
+    fault = row_fault(row, own)
+    assume(abs(abs(row.sum() - 1) - 1e-9) > 1e-15)
+    assert (fault is not None) == (abs(row.sum() - 1.0) > 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("row", "own", "words"),
+    [
+        ([0.2, 0.8, 0.0], 0, "does not follow itself"),
+        ([0.0, 1.5, -0.5], 0, "between 0 and 1"),
+        ([0.0, 0.5, 0.4], 0, "sum to 1"),
+        ([0.0, np.nan, 0.5], 0, "finite"),
+        ([0.0, np.inf, 0.5], 0, "finite"),
+    ],
+)
+def test_a_row_that_cannot_be_says_why(row: list[float], own: int, words: str) -> None:
+    fault = row_fault(np.array(row), own)
+    assert fault is not None
+    assert words in fault

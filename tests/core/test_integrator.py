@@ -1,0 +1,76 @@
+"""One period of the arm, Eq. (8), against energy and against SciPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.integrate import solve_ivp
+
+from tests.core import physical_arms as physics
+from tests.core.physical_arms import Array, angles, speeds
+from trilat_net.core.arm import Links, parameters
+from trilat_net.core.exogenous import torque_on_arm
+from trilat_net.core.integrator import STAGE_ROWS, advance
+
+ARM = Links(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
+NOBODY = np.zeros((0, 4))
+G = 9.81
+
+
+def carried(q0: Array, qd0: Array, h_s: float, periods: int, u: Array, pulses: Array) -> tuple[Array, Array]:
+    q, qd, work = q0.copy(), qd0.copy(), np.zeros((STAGE_ROWS, 2))
+    for k in range(periods):
+        advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, pulses, work)
+    return q, qd
+
+
+def energy(q: Array, qd: Array) -> float:
+    return physics.kinetic(ARM, q, qd) + float(physics.potential(ARM, G, q))
+
+
+@settings(max_examples=30)
+@given(q=angles, qd=physics.vectors(physics.st.floats(-3, 3)))
+def test_an_arm_that_is_left_alone_keeps_its_energy(q: Array, qd: Array) -> None:
+    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2), NOBODY)) == pytest.approx(energy(q, qd), abs=1e-7)
+
+
+@settings(max_examples=10)
+@given(q=angles, qd=speeds, u=physics.vectors(physics.st.floats(-50, 50)))
+def test_it_follows_the_equation_of_motion_with_order_four(q: Array, qd: Array, u: Array) -> None:
+    pulses = np.array([[-0.1, 0.35, 12.0, -5.0], [0.0, 0.3, 1.0, 2.0]])
+
+    def rate(t: float, x: Array) -> Array:
+        hands = sum(p[2:] * np.sin(np.pi * (t - p[0]) / (p[1] - p[0])) ** 2 for p in pulses)
+        rest = u + hands - physics.coriolis(ARM, x[:2], x[2:]) @ x[2:] - physics.gravity(ARM, G, x[:2])
+        return np.concatenate([x[2:], np.linalg.solve(physics.inertia(ARM, x[:2]), rest)])
+
+    exact = solve_ivp(rate, (0.0, 0.1), np.concatenate([q, qd]), "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+
+    def error(periods: int) -> float:
+        made = np.concatenate(carried(q, qd, 0.1 / periods, periods, u, pulses))
+        return float(np.abs(made - exact).max() / (1 + np.abs(exact).max()))
+
+    assert error(400) < 1e-6
+    coarse, fine = error(50), error(100)
+    assert fine < 1e-9 or 10 < coarse / fine < 26
+
+
+def test_a_pulse_is_zero_at_its_ends_full_in_the_middle_and_symmetric() -> None:
+    pulses = np.array([[1.0, 6.0, 10.0, -4.0]])
+    torque = np.empty(2)
+
+    def at(t_s: float) -> list[float]:
+        torque_on_arm(t_s, pulses, torque)
+        return torque.tolist()
+
+    assert at(0.5) == at(1.0) == at(6.0) == at(7.0) == [0.0, 0.0]
+    assert at(3.5) == pytest.approx([10.0, -4.0])
+    assert at(2.25) == pytest.approx([5.0, -2.0])
+    assert at(1.7) == pytest.approx(at(5.3))
+
+
+def test_pulses_add_up() -> None:
+    one, two = np.array([[1.0, 6.0, 10.0, -4.0]]), np.array([[2.0, 3.0, 5.0, 5.0]])
+    torques = np.empty((3, 2))
+    for row, pulses in zip(torques, (one, two, np.vstack([one, two])), strict=True):
+        torque_on_arm(2.4, pulses, row)
+    assert torques[2] == pytest.approx(torques[0] + torques[1])

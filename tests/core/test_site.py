@@ -1,0 +1,215 @@
+"""The step: pure, resumable, bounded, and finite whatever comes (L1, L3)."""
+
+import math
+import os
+import struct
+import subprocess
+import sys
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.sites import sample, setup, stepped
+from trilat_net.core.site import Site
+from trilat_net.core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
+from trilat_net.scenario import load, shipped
+from trilat_net.sim import virtual
+
+VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+
+
+def finite(output: Output) -> bool:
+    return all(math.isfinite(v) for field in VECTORS for v in getattr(output, field))
+
+
+def bits(output: Output) -> str:
+    return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(output[-2:])
+
+
+def executed(scenario: str, **overrides: object) -> list[str]:
+    """A virtual run, every record as text."""
+    run = virtual.run(load(scenario, {k.replace("__", "."): v for k, v in overrides.items()}))
+    return [f"{site.name} {output.tick} {bits(output)}" for site, _, output in run]
+
+
+arrivals = st.lists(
+    st.builds(
+        Arrival,
+        st.integers(0, 1),
+        st.integers(-1, 80),
+        st.tuples(*[st.floats(-3, 3)] * 2),
+        st.tuples(*[st.floats(-9, 9)] * 2),
+    ),
+    max_size=6,
+)
+
+
+@settings(max_examples=40)
+@given(came=st.lists(arrivals, min_size=1, max_size=40), scheme=st.sampled_from(["second_order", "digital"]))
+def test_two_fresh_sites_fed_the_same_ticks_give_the_same_bits(
+    came: list[list[Arrival]], scheme: str
+) -> None:
+    ticks = [Tick(k, c) for k, c in enumerate(came)]
+    one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
+    assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
+
+
+def test_a_record_holds_the_state_at_its_tick_and_its_inputs() -> None:
+    """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm, Eq. (8)."""
+    site = Site(setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]))
+    first = site.step(Tick(0))
+    assert (first.q, first.qd, first.t_ns) == ([0.3, -0.1], [0.2, 0.4], 0)
+    outputs = stepped(site, [Tick(k) for k in range(1, 3501)])
+    assert outputs[-1].tau_x == pytest.approx([-10.0, -10.0])
+    assert outputs[10].tau_x == [0.0, 0.0]
+    assert "-" not in str(outputs[10].tau_x)
+
+
+_PROGRAM = """
+from tests.core.test_site import executed
+for scheme in ("second_order", "digital"):
+    print("\\n".join(executed("asymmetric", scheme=scheme, duration_s=0.25, link__delay_ms=20,
+                              links={"m2->m1": {"delay_ms": 33.5}})))
+"""
+
+
+def test_without_the_compiler_a_run_has_the_same_bits() -> None:
+    """Both schemes, some hundred ticks of three sites."""
+
+    def text(disabled: str) -> str:
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        done = subprocess.run(
+            [sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout
+
+    plain = text("1")
+    assert plain.count("\n") == 2 * 3 * 250
+    assert plain == text("0")
+
+
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+@pytest.mark.parametrize("k", [1, 2, 21, 150])
+def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(scheme: str, k: int) -> None:
+    """Every record is a key-frame: records k-2 and k-1 and what waits in the links."""
+    built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
+    ticks = [Tick(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)]
+    whole = stepped(Site(built), ticks)
+    site = Site(built)
+    before, last = whole[max(0, k - 2)], whole[k - 1]
+    in_use = [sample(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
+    waiting = [sample(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)]
+    site.prime(k, in_use, waiting)
+    site.resume(before, last)
+    assert [bits(o) for o in stepped(site, ticks[k:])] == [bits(o) for o in whole[k:]]
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_rates_of_their_own_meet_on_the_grid(name: str) -> None:
+    """Any mix of rates runs; every site ages what it uses by the delay and less than two periods."""
+    scenario = load(name)
+    rates = dict(zip(scenario.names, (1000, 450, 333), strict=False))
+    changed = load(name, {f"sites.{n}.rate_hz": r for n, r in rates.items()} | {"duration_s": 1.0})
+    last: dict[str, Output] = {}
+    for site, _, output in virtual.run(changed):
+        last[site.name] = output
+    for n, output in last.items():
+        assert output.mode is Mode.RUN
+        for peer, used in zip(changed.peers(n), output.used, strict=True):
+            age_ns = output.t_ns - used * 10**9 // rates[peer]
+            extra = age_ns - changed.links[f"{peer}->{n}"].delay_ns
+            assert 0 <= extra <= 10**9 / rates[peer] + 1
+
+
+def four_sites() -> dict[str, object]:
+    names = ("a", "b", "c", "d")
+    return {
+        "sites": {n: {"q0_rad": [0.1 * i, -0.2 * i]} for i, n in enumerate(names)},
+        "dominance": {i: {j: (1 / 3) for j in names if j != i} for i in names},
+    }
+
+
+def test_nothing_knows_the_number_three() -> None:
+    last = {site.name: o for site, _, o in virtual.run(load("paper", {**four_sites(), "duration_s": 30.0}))}
+    assert len(last) == 4
+    assert all(o.used == [29_799] * 3 for o in last.values())
+    poses = [o.q for o in last.values()]
+    assert max(abs(a - b) for pose in poses for a, b in zip(pose, poses[0], strict=True)) < 0.02
+
+
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+def test_the_torque_limit_cuts(scheme: str) -> None:
+    site = Site(setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
+    torques = [o.tau for o in stepped(site, [Tick(k) for k in range(400)])]
+    assert max(abs(t) for tau in torques for t in tau) == 2.0
+    assert site.step(Tick(400)).mode is Mode.RUN
+
+
+def test_a_site_beyond_its_speed_limit_diverges_once_and_stays_where_it_is() -> None:
+    site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
+    outputs = stepped(site, [Tick(k) for k in range(400)])
+    k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
+    assert max(map(abs, outputs[k].qd)) > 0.5 >= max(map(abs, outputs[k - 1].qd))
+    assert all(o.mode is Mode.DIVERGED and (o.q, o.qd) == (outputs[k].q, outputs[k].qd) for o in outputs[k:])
+
+
+def test_a_run_that_diverges_ends_at_that_instant() -> None:
+    ran = list(virtual.run(load("free", {"limits.qd_limit_rad_s": 0.5})))
+    assert ran[-1].output.t_ns == ran[-3].output.t_ns < 20 * 10**9
+    assert any(r.output.mode is Mode.DIVERGED for r in ran[-3:])
+    assert all(r.output.mode is Mode.RUN for r in ran[:-3])
+
+
+extreme = st.sampled_from([1.7e308, -1.7e308, 1e200, -1e160, 5e-324, 0.0, 1.0])
+
+
+@settings(max_examples=60)
+@given(
+    came=st.lists(st.tuples(extreme, extreme, extreme, extreme), min_size=1, max_size=20),
+    Lambda=st.sampled_from([1.0, 5.0, 1e200]),
+    scheme=st.sampled_from(["second_order", "digital"]),
+)
+def test_no_record_ever_holds_what_is_not_finite(
+    came: list[tuple[float, float, float, float]], Lambda: float, scheme: str
+) -> None:
+    """Whatever finite numbers a peer sends, and whatever gains a person chose."""
+    site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
+    for k, numbers in enumerate([None, *came, None, None]):
+        numbers_of_tick = [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
+        assert finite(site.step(Tick(k, numbers_of_tick)))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"control.Gamma": 1e308},
+        {"control.Lambda": 1e200},
+        {"control.theta_hat0": 1e308},
+        {"control.Kp": 1e308},
+        {"sites.m1.q0_rad": 1e308},
+        {"sites.m1.qd0_rad_s": 1e308},
+        {"arm.g_m_s2": 1e308},
+    ],
+)
+def test_absurd_gains_and_poses_end_in_a_stop_not_in_numbers_that_are_none(
+    overrides: dict[str, float],
+) -> None:
+    ran = list(virtual.run(load("paper", {**overrides, "duration_s": 0.3})))
+    assert all(finite(r.output) for r in ran)
+
+
+def test_more_arrivals_than_a_tick_takes_are_refused() -> None:
+    site = Site(setup())
+    site.step(Tick(0, [sample(n) for n in range(MAX_ARRIVALS)]))
+    with pytest.raises(ValueError, match="4096"):
+        site.step(Tick(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
+
+
+def test_the_arrivals_crc_is_that_of_their_bytes() -> None:
+    """rx_crc: little-endian (peer i64, tick i64, q f64s, qd f64s) of each arrival."""
+
+    came = [Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77), Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9)]
+    packed = b"".join(struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in came)
+    assert Site(setup()).step(Tick(0, came)).rx_crc == zlib.crc32(packed)

@@ -1,0 +1,230 @@
+"""The contract of `Bus`, kept by the real one and by its fake."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from trilat_net.errors import UsageError
+from trilat_net.net.bus import Bus, Inbox, LocalNetwork, matches
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus, configuration
+
+from .networks import NETWORKS, Network
+from .waiting import drained, received, until
+
+
+@pytest.fixture(params=list(NETWORKS))
+def network(request: pytest.FixtureRequest) -> Iterator[Network]:
+    made = NETWORKS[request.param]()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def pair(network: Network) -> tuple[Bus, Bus]:
+    return network.join(), network.join()
+
+
+def opened(publish: Callable[[bytes], None], *inboxes: Inbox) -> None:
+    """Returns once every inbox hears the publisher, with nothing more under way and all of them empty."""
+    deaf = list(inboxes)
+
+    def heard() -> bool:
+        publish(b"probe")
+        deaf[:] = [inbox for inbox in deaf if not drained(inbox)]
+        return not deaf
+
+    until(heard)
+    publish(b"last probe")
+    for inbox in inboxes:
+        until(lambda inbox=inbox: any(payload == b"last probe" for _, payload in drained(inbox)))
+
+
+NUMBERS = [n.to_bytes(2, "big") for n in range(500)]
+
+
+def test_a_ring_gives_what_others_published_in_their_order(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
+    opened(publish, inbox)
+    for number in NUMBERS:
+        publish(number)
+    assert received(inbox, len(NUMBERS)) == [("t/a", number) for number in NUMBERS]
+
+
+def test_an_expression_stands_for_many_keys_and_no_others(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    one, any_number = receiver.inbox("t/*/x"), receiver.inbox("t/**")
+    publishers = {key: sender.publisher(key) for key in ("t/b/y", "t/a/x", "t/b/b/x", "other/a/x", "t/b/x")}
+    opened(publishers["t/b/x"], one, any_number)
+    for key, publish in publishers.items():
+        publish(key.encode())
+    assert [key for key, _ in received(one, 2)] == ["t/a/x", "t/b/x"]
+    assert [key for key, _ in received(any_number, 4)] == ["t/b/y", "t/a/x", "t/b/b/x", "t/b/x"]
+
+
+def test_own_messages_never_come_back(pair: tuple[Bus, Bus]) -> None:
+    sender, other = pair
+    own, theirs, publish = sender.inbox("t/a"), other.inbox("t/a"), sender.publisher("t/a")
+    opened(publish, theirs)
+    opened(other.publisher("t/a"), own)
+    publish(b"mine")
+    other.publisher("t/a")(b"theirs")
+    assert received(own, 1) == [("t/a", b"theirs")]
+    assert received(theirs, 1) == [("t/a", b"mine")]
+
+
+def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    heard: list[tuple[str, bytes]] = []
+    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
+    receiver.tap("t/*", lambda key, payload: heard.append((key, payload)))
+    opened(publish, inbox)
+    until(lambda: heard and heard[-1][1] == b"last probe")
+    heard.clear()
+    for number in NUMBERS:
+        publish(number)
+    until(lambda: len(heard) >= len(NUMBERS))
+    assert heard == [("t/a", number) for number in NUMBERS]
+
+
+def test_a_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    small, large, publish = receiver.inbox("t/a", 16), receiver.inbox("t/a"), sender.publisher("t/a")
+    opened(publish, small, large)
+    for number in NUMBERS:
+        publish(number)
+    assert len(received(large, len(NUMBERS))) == len(NUMBERS)
+    kept = [payload for _, payload in received(small, 16)]
+    assert kept == NUMBERS[-16:]
+
+
+def test_everyone_who_answers_is_heard_once(network: Network) -> None:
+    asker, *others = (network.join() for _ in range(3))
+    rings = {name: bus.questions(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)}
+
+    def answers() -> list[tuple[str, bytes]]:
+        replies = asker.ask("t/*/info")
+        heard: list[tuple[str, bytes]] = []
+
+        def all_answered() -> bool:
+            for name, ring in rings.items():
+                while (question := ring.poll()) is not None:
+                    question.answer(name.encode())
+            heard.extend(drained(replies))
+            return len(heard) >= 2
+
+        try:
+            until(all_answered, timeout_s=0.5)
+        except AssertionError:  # not every queryable is known yet
+            return []
+        return heard
+
+    assert sorted(until(answers)) == [("t/a/info", b"a"), ("t/b/info", b"b")]
+
+
+def test_nobody_who_answers_means_no_answer_and_no_error(pair: tuple[Bus, Bus]) -> None:
+    replies = pair[0].ask("t/*/info")
+    for _ in range(20):
+        assert replies.poll() is None
+
+
+def test_an_answer_after_the_asker_has_gone_harms_nobody(pair: tuple[Bus, Bus]) -> None:
+    asker, other = pair
+    questions = other.questions("t/a/info")
+
+    def asked() -> object:
+        asker.ask("t/*/info")
+        return questions.poll()
+
+    question = until(asked)
+    asker.close()
+    question.answer(b"too late")
+    other.publisher("t/a")(b"still here")
+
+
+def test_tokens_appear_and_disappear_with_their_member(pair: tuple[Bus, Bus]) -> None:
+    watcher, other = pair
+    presence = watcher.presence("t/*/alive/*")
+    other.announce("t/a/alive/1")
+    other.announce("t/b/something/1")
+    assert until(presence.poll) == ("t/a/alive/1", True)
+    other.close()
+    assert until(presence.poll) == ("t/a/alive/1", False)
+    assert presence.poll() is None
+
+
+def test_tokens_that_stand_already_come_first(pair: tuple[Bus, Bus]) -> None:
+    early, late = pair
+    early.announce("t/a/alive/1")
+    presence = late.presence("t/*/alive/*")
+    assert until(presence.poll) == ("t/a/alive/1", True)
+    early.announce("t/b/alive/2")
+    assert until(presence.poll) == ("t/b/alive/2", True)
+
+
+def test_a_member_does_not_see_its_own_token(pair: tuple[Bus, Bus]) -> None:
+    own, other = pair
+    presence = own.presence("t/*/alive/*")
+    own.announce("t/a/alive/1")
+    other.announce("t/b/alive/2")
+    assert until(presence.poll) == ("t/b/alive/2", True)
+
+
+def test_rings_with_nothing_in_them_give_none(network: Network) -> None:
+    bus = network.join()
+    rings = [bus.inbox("t/a"), bus.presence("t/*"), bus.questions("t/info"), bus.ask("t/*")]
+    assert [ring.poll() for ring in rings for _ in range(3)] == [None] * 12
+
+
+def test_leaving_twice_is_leaving_once(pair: tuple[Bus, Bus]) -> None:
+    for _ in range(2):
+        pair[0].close()
+
+
+@pytest.mark.parametrize(
+    ("expression", "key", "included"),
+    [
+        ("a/b", "a/b", True),
+        ("a/*", "a/b", True),
+        ("a/*", "a/b/c", False),
+        ("a/*", "a", False),
+        ("a/**", "a", True),
+        ("a/**", "a/b/c", True),
+        ("**/c", "a/b/c", True),
+        ("a/*/c", "a/b/c", True),
+        ("a/*/c", "b/b/c", False),
+    ],
+)
+def test_key_expressions(expression: str, key: str, included: bool) -> None:
+    assert matches(expression, key) is included
+
+
+def test_members_of_two_networks_never_meet() -> None:
+    one, other = LocalNetwork().join(), LocalNetwork().join()
+    inbox = other.inbox("**")
+    one.publisher("t/a")(b"1")
+    assert inbox.poll() is None
+
+
+def test_a_busy_port_is_the_callers_error_and_named() -> None:
+    (endpoint,) = free_endpoints(1)
+    first = ZenohBus([endpoint])
+    try:
+        with pytest.raises(UsageError, match=rf"{endpoint}: the port is in use"):
+            ZenohBus([endpoint])
+    finally:
+        first.close()
+
+
+@pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1:2"])
+@pytest.mark.parametrize("side", ["listen", "connect"])
+def test_a_malformed_endpoint_is_the_callers_error(endpoint: str, side: str) -> None:
+    with pytest.raises(UsageError, match="cannot"):
+        ZenohBus(**{side: [endpoint]}).close()
+
+
+def test_nothing_is_found_that_was_not_named() -> None:
+    settings = configuration(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
+    assert settings["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    assert settings["transport"]["shared_memory"] == {"enabled": False}

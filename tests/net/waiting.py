@@ -1,0 +1,41 @@
+"""Waiting in tests: for a condition, at most for a time, by a clock."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from trilat_net.net.bus import Inbox
+from trilat_net.net.clock import Clock, SystemClock
+
+T = TypeVar("T")
+STEP_NS = 2_000_000
+
+
+def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | None = None) -> T:
+    """Returns the first true result of `condition`; fails when none came in time."""
+    clock = clock or SystemClock()
+    give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
+    while not (result := condition()):
+        now_ns = clock.monotonic_ns()
+        assert now_ns < give_up_ns, f"not within {timeout_s:g} s"
+        clock.sleep_until(now_ns + STEP_NS)
+    return result
+
+
+def drained(inbox: Inbox) -> list[tuple[str, bytes]]:
+    """Everything that waits in a ring, oldest first."""
+    messages = []
+    while (message := inbox.poll()) is not None:
+        messages.append(message)
+    return messages
+
+
+def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:
+    """The next `count` messages of a ring."""
+    messages: list[tuple[str, bytes]] = []
+
+    def enough() -> bool:
+        messages.extend(drained(inbox))
+        return len(messages) >= count
+
+    until(enough)
+    return messages
