@@ -2,7 +2,8 @@
 
 The paper's Eq. (17) is wrong in a sign and a factor; corrected, with Kd common to all sites,
 
-    V_i' = -r'Kp r - 1/2 sum_j a_ij |qd_i - qd_j(t - T_ij)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j a_ij |qd_j|^2 + r'tau_h
+    V_i' = -r'Kp r - 1/2 sum_j a_ij |qd_i - qd_j(t - T_ij)|^2 - 1/2 |qd_i|^2
+             + 1/2 sum_j a_ij |qd_j|^2 + r'tau_h
 
 with |x|^2 = x'Kd x. Weighted with the left null vector of Upsilon, Eq. (20), the last two norms cancel.
 """

@@ -4,6 +4,7 @@ Eq. (6), (8)-(10), (13), (15) in continuous time; what is sampled must converge 
 """
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def distance(name: str, scheme: str, rate_hz: int) -> float:
 
 def order(name: str, scheme: str) -> list[float]:
     errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
-    return [float(np.log2(coarse / fine)) for coarse, fine in zip(errors, errors[1:], strict=False)]
+    return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]
 
 
 def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:

@@ -1,5 +1,7 @@
 """The energy balance of the corrected Lyapunov functional, Eq. (16)-(22), along virtual runs."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Bala
 
 def order(name: str, scheme: str) -> list[float]:
     residuals = [booked(name, scheme, rate_hz).residual for rate_hz in (500, 1000, 2000)]
-    return [float(np.log2(coarse / fine)) for coarse, fine in zip(residuals, residuals[1:], strict=False)]
+    return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(residuals)]
 
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric"])

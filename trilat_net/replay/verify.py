@@ -66,9 +66,28 @@ def verify(log: Log) -> Verdict:
     verdict = Verdict(whole_run=log.session.get("fingerprint") == fingerprint())
     with collector.paused():
         by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+        ends = last_ticks(log)
         for name in log.sites:
-            _Execution(log.scenario, log[name], by_tick, verdict).run()
+            _Execution(log.scenario, log[name], by_tick, ends, verdict).run()
     return verdict
+
+
+def last_ticks(log: Log) -> dict[str, int]:
+    """Returns the last tick that each site is known to have made, -1 where nothing is known.
+
+    By its own word at the end; where it never said one, by its records and by what its peers had from it.
+    """
+    said = {event.member: event.ticks - 1 for event in log.events if event.kind == "end"}
+    last = {name: max((state.tick for state in log[name].states[-1:]), default=-1) for name in log.sites}
+    for name in log.sites:
+        peers = log[name].peers
+        if said.keys() >= set(peers):
+            continue
+        for state in log[name].states:
+            for peer, tick, _ in state.rx:
+                if 0 <= peer < len(peers) and tick < log.scenario.ticks(peers[peer]):
+                    last[peers[peer]] = max(last[peers[peer]], tick)
+    return {name: said.get(name, known) for name, known in last.items()}
 
 
 def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
@@ -97,7 +116,8 @@ class _Execution:
     While it is `assured`, the site's state follows from the records before. It is lost at a gap, and when a
     sample comes into use that the log lacks; two records in a row bring it back. What arrived inside a gap
     is not known: samples between the one in use and the next one listed are taken to have come
-    (`assumed`), and as long as one of them is in use a difference counts as unjudged.
+    (`assumed`), and as long as one of them is in use a difference counts as unjudged. So it does when the
+    sample in use is one that arrived but whose own record is missing (`lacking`).
     """
 
     def __init__(
@@ -105,17 +125,20 @@ class _Execution:
         scenario: Scenario,
         site_log: SiteLog,
         by_tick: Mapping[str, Mapping[int, State]],
+        ends: Mapping[str, int],
         verdict: Verdict,
     ) -> None:
         self._site = Site(scenario.setup(site_log.name))
         self._log = site_log
         self._peers = site_log.peers
         self._by_tick = [by_tick[peer] for peer in site_log.peers]
-        self._ends = [scenario.ticks(peer) for peer in site_log.peers]
+        self._ends = [ends[peer] for peer in site_log.peers]
+        self._own_end = ends[site_log.name]
         self._verdict = verdict
         self._same = same_bits if verdict.whole_run else close
         self._assured = True
-        self._assumed_until = [-1] * len(self._peers)
+        self._assumed = [range(0)] * len(self._peers)
+        self._lacking: list[set[int]] = [set() for _ in self._peers]
 
     def run(self) -> None:
         """Executes every record."""
@@ -134,6 +157,8 @@ class _Execution:
                 verdict.unjudged += 1
                 continue
             self._judge(n, state)
+        if expected <= self._own_end:
+            verdict.gaps.append((self._log.name, expected, self._own_end))
 
     def _judge(self, n: int, state: State) -> None:
         """Steps one tick and compares."""
@@ -155,7 +180,7 @@ class _Execution:
         elif self._payload_agrees(n, state, output, arrivals):
             verdict.identical += 1
         elif difference := first_difference(state, output, self._peers, self._same):
-            self._book(state, difference)
+            self._book(state, output, difference)
         else:
             verdict.identical += 1
 
@@ -169,10 +194,11 @@ class _Execution:
             return False
         return payload == self._log.payloads[n]
 
-    def _book(self, state: State, difference: Difference) -> None:
+    def _book(self, state: State, output: Output, difference: Difference) -> None:
         in_doubt = any(
-            state.used.get(peer, -1) >= 0
-            and (state.used[peer] <= self._assumed_until[j] or state.used[peer] not in self._by_tick[j])
+            output.used[j] in self._assumed[j]
+            or state.used.get(peer, -1) in self._assumed[j]
+            or state.used.get(peer, -1) in self._lacking[j]
             for j, peer in enumerate(self._peers)
         )
         if in_doubt:
@@ -195,13 +221,12 @@ class _Execution:
             sample = self._by_tick[peer].get(tick)
             if sample is not None:
                 arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
-            elif 0 <= tick < self._ends[peer]:
+            elif 0 <= tick <= self._ends[peer]:
+                self._lacking[peer].add(tick)
                 lacking = Difference(state.site, state.tick, "", tick, None)
             else:
-                last = self._ends[peer] - 1
-                return arrivals, Difference(
-                    state.site, state.tick, f"rx[{self._peers[peer]}]", tick, f"a tick from 0 to {last}"
-                )
+                valid = f"a tick from 0 to {self._ends[peer]}"
+                return arrivals, Difference(state.site, state.tick, f"rx[{self._peers[peer]}]", tick, valid)
         return arrivals[:MAX_ARRIVALS], lacking
 
     def _resume(self, n: int) -> bool:
@@ -218,7 +243,7 @@ class _Execution:
                 return False
             in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
             listed = self._next_listed(j, n)
-            self._assumed_until[j] = listed - 1
+            self._assumed[j] = range(used + 1, listed)
             found = (self._by_tick[j].get(tick) for tick in range(used + 1, listed))
             waiting += [Arrival(j, s.tick, s.q, s.qd) for s in found if s is not None]
         self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
@@ -232,4 +257,4 @@ class _Execution:
             for j, tick, _ in state.rx:
                 if j == peer:
                     return tick
-        return self._ends[peer]
+        return self._ends[peer] + 1

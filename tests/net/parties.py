@@ -1,0 +1,125 @@
+"""Members on their way into a session, in one process, on a clock that a test moves."""
+
+from collections.abc import Sequence
+
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.clock import Clock, ManualClock
+from trilat_net.net.session import Epoch, Joining, Voice
+from trilat_net.net.wire import Event, Info, decode
+
+SESSION = "t"
+STEP_NS = 20_000_000
+HASH = "5c" * 32
+CLOCK = ManualClock().identity()
+
+
+def told(name: str, boot: int, **facts: object) -> Info:
+    """What a member answers when asked who it is; `facts` override."""
+    recorder = name == topics.RECORDER
+    return Info(
+        **{
+            "member": name,
+            "boot": boot,
+            "scenario_sha256": "" if recorder else HASH,
+            "scenario": "" if recorder else "the scenario",
+            "host": "h",
+            "clock": CLOCK,
+            "fingerprint": "f",
+            **facts,
+        }
+    )
+
+
+class Member:
+    """One start of one member."""
+
+    def __init__(self, bus: Bus, clock: Clock, sites: Sequence[str], info: Info) -> None:
+        self.info = info
+        self.bus = bus
+        self.epoch: Epoch | None = None
+        self.voice = Voice(bus, SESSION, info)
+        self.joining = Joining(bus, clock, SESSION, self.voice, sites)
+
+    def poll(self) -> None:
+        """One round of what a process does: join, and once it has the epoch, answer."""
+        if self.epoch is None:
+            self.epoch = self.joining.poll()
+            if self.epoch is not None:
+                self.voice.info = told(
+                    self.info.member,
+                    self.info.boot,
+                    scenario_sha256=self.info.scenario_sha256,
+                    running=True,
+                )
+        else:
+            self.voice.answer()
+
+
+class Party:
+    """A session's network, its clock, its present members, and all events that were said."""
+
+    def __init__(self, sites: Sequence[str]) -> None:
+        self.sites = tuple(sites)
+        self.clock = ManualClock(10**9, 1_700_000_000_000_000_000)
+        self.network = LocalNetwork()
+        self.members: dict[str, Member] = {}
+        self.stranger = self.network.join()
+        self._ear = self.network.join().inbox(topics.key(SESSION, "*", topics.EVENT))
+        self.said: list[Event] = []
+        self._boot = 100
+
+    def member(self, name: str, **facts: object) -> Member:
+        """A new start of a member, beside those that are there."""
+        self._boot += 1
+        clock = facts.pop("on_clock", self.clock)
+        sites = () if name == topics.RECORDER else self.sites
+        return Member(self.network.join(), clock, sites, told(name, **{"boot": self._boot, **facts}))
+
+    def start(self, *names: str, **facts: object) -> None:
+        """Starts members, in this order."""
+        for name in names:
+            self.members[name] = self.member(name, **facts)
+
+    def kill(self, name: str) -> None:
+        """Ends a member without a word."""
+        self.members.pop(name).bus.close()
+
+    def say(self, key_member: str, payload: bytes, channel: str = topics.EVENT) -> None:
+        """A stranger publishes on a member's key."""
+        self.stranger.publisher(topics.key(SESSION, key_member, channel))(payload)
+
+    def listen(self) -> list[Event]:
+        """Everything that was said so far."""
+        while (message := self._ear.poll()) is not None:
+            try:
+                self.said.append(decode(message[1], Event))
+            except Exception:
+                continue
+        return self.said
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.listen()]
+
+    def round(self, *names: str) -> None:
+        """Lets members poll once each, then time go on."""
+        for name in names or tuple(self.members):
+            self.members[name].poll()
+        self.clock.sleep_until(self.clock.monotonic_ns() + STEP_NS)
+
+    def rounds(self, count: int) -> None:
+        for _ in range(count):
+            self.round()
+
+    def agreed(self, within_s: float = 5.0) -> Epoch:
+        """Lets all poll until each has its epoch; returns the one that they agree on."""
+        for _ in range(int(within_s * 1e9) // STEP_NS):
+            if all(member.epoch for member in self.members.values()):
+                break
+            self.round()
+        epochs = {name: member.epoch for name, member in self.members.items()}
+        first = next(iter(epochs.values()))
+        assert first is not None
+        assert all(epoch == first for epoch in epochs.values()), epochs
+        assert first.boots == {name: member.info.boot for name, member in self.members.items()}
+        return first

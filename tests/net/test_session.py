@@ -1,0 +1,385 @@
+"""One epoch whatever the start order; nobody starts without `start`; strangers change nothing."""
+
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.errors import SessionError
+from trilat_net.net import topics
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.session import AHEAD_NS, DECIDE_NS, new_boot
+from trilat_net.net.wire import Event, Info, encode
+
+from .parties import SESSION, STEP_NS, Member, Party, told
+
+SITES = ("m1", "m2", "s")
+RECORDER = topics.RECORDER
+
+
+def party(*names: str) -> Party:
+    """A session of three sites in which these members have been started."""
+    made = Party(SITES)
+    made.start(*names)
+    return made
+
+
+@st.composite
+def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
+    """The members of a session, and what happens to them in which order before all are there."""
+    sites = [f"site{n}" for n in range(draw(st.integers(2, 5)))]
+    members = [*sites, RECORDER] if draw(st.booleans()) else sites
+    happenings = st.tuples(
+        st.sampled_from(["start", "kill", "poll", "poll", "poll"]), st.sampled_from(members)
+    )
+    return members, draw(st.lists(happenings, max_size=80))
+
+
+@given(lives())
+@settings(max_examples=150)
+def test_one_epoch_whatever_the_order_of_starts_deaths_and_polls(
+    life: tuple[list[str], list[tuple[str, str]]],
+) -> None:
+    members, happenings = life
+    session = Party([name for name in members if name != RECORDER])
+    for what, name in happenings:
+        begun = "start" in session.kinds()
+        if what == "start" and name not in session.members and not (begun and name == RECORDER):
+            session.start(name)
+        elif what == "kill" and name in session.members and not begun:
+            session.kill(name)
+        elif what == "poll" and name in session.members:
+            session.round(name)
+    begun = "start" in session.kinds()
+    for name in members:
+        if name not in session.members and not (begun and name == RECORDER):
+            session.start(name)
+    epoch = session.agreed()
+    started = [event for event in session.listen() if event.kind == "start"]
+    assert len(started) == 1
+    (announced,) = (
+        e
+        for e in session.said
+        if e.kind == "epoch" and e.attempt == started[0].attempt and e.boot == started[0].boot
+    )
+    assert (announced.epoch_mono_ns, announced.epoch_unix_ns) == (epoch.mono_ns, epoch.unix_ns)
+    assert announced.boots == epoch.boots
+
+
+@given(st.permutations([*SITES, RECORDER]), st.integers(0, 60))
+def test_any_start_order_with_pauses_agrees(order: list[str], pause: int) -> None:
+    session = Party(SITES)
+    for name in order[:-1]:
+        session.start(name)
+        session.rounds(pause)
+    for member in session.members.values():
+        assert member.epoch is None or order[-1] == RECORDER
+    session.start(order[-1])
+    if order[-1] == RECORDER and any(member.epoch for member in session.members.values()):
+        return  # nobody knew of it: the session began without a recorder
+    session.agreed()
+
+
+def test_the_epoch_lies_ahead_of_everybody() -> None:
+    session = party(*SITES)
+    epoch = session.agreed()
+    assert AHEAD_NS >= 500_000_000
+    assert epoch.mono_ns - session.clock.monotonic_ns() >= DECIDE_NS - STEP_NS
+
+
+def test_nobody_starts_without_start() -> None:
+    session = party(*SITES)
+    leader = session.members["m1"]
+    for _ in range(200):  # the leader does not poll: nothing is announced
+        session.round("m2", "s")
+    assert not session.kinds()
+    while "epoch" not in session.kinds():
+        session.round("m1")
+        session.round("s")
+        session.members["m2"].voice.answer()
+    session.round("m2", "s")  # all are ready, and the leader says nothing
+    assert session.kinds().count("ready") == 2
+    for _ in range(10):
+        session.round("m2", "s")
+    assert [session.members[name].epoch for name in SITES] == [None] * 3
+    session.round("m1")
+    assert leader.epoch is not None
+    assert session.agreed() == leader.epoch
+
+
+def test_who_is_not_ready_in_time_gets_another_attempt() -> None:
+    session = party(*SITES)
+    while "epoch" not in session.kinds():
+        session.round("m1", "m2")
+        session.members["s"].voice.answer()  # s is there, and then hangs
+    for _ in range(AHEAD_NS // STEP_NS):
+        session.round("m1", "m2")
+    assert session.members["m1"].epoch is None
+    session.agreed()
+    attempts = [event.attempt for event in session.listen() if event.kind == "epoch"]
+    assert attempts == sorted(set(attempts))
+    assert len(attempts) >= 2
+
+
+def test_a_leader_that_comes_last_leads() -> None:
+    session = party("s", "m2", RECORDER)
+    session.rounds(50)
+    session.start("m1")
+    session.agreed()
+    assert {event.member for event in session.listen() if event.kind in ("epoch", "start")} == {"m1"}
+
+
+def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
+    session = party(*SITES)
+    while "epoch" not in session.kinds():
+        session.round()
+    session.kill("s")
+    session.rounds(100)
+    assert [member.epoch for member in session.members.values()] == [None, None]
+    assert session.members["m1"].joining.missing() == ["s"]
+    session.start("s")
+    session.agreed()
+
+
+def test_a_leader_lost_before_the_start_is_followed_by_its_next_start() -> None:
+    session = party(*SITES)
+    while session.kinds().count("ready") < 2:
+        session.round("m1")
+        session.round("m2", "s")
+    session.kill("m1")
+    session.start("m1")
+    assert session.agreed().boots["m1"] == session.members["m1"].info.boot
+
+
+def test_a_recorder_that_announces_itself_is_waited_for() -> None:
+    session = party(*SITES)
+    session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")  # there, and not joining yet
+    session.rounds(100)
+    assert session.kinds() == []
+    assert session.members["m1"].joining.missing() == [RECORDER]
+    session.stranger.close()
+    session.agreed()
+
+
+@pytest.mark.parametrize("who", SITES)
+def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
+    session = Party(SITES)
+    for name in SITES:
+        session.start(name, needs_recorder=name == who)
+    session.rounds(100)
+    assert session.kinds() == []
+    session.start(RECORDER)
+    assert RECORDER in session.agreed().boots
+
+
+def test_missing_names_who_is_missing() -> None:
+    session = party("m2")
+    assert session.members["m2"].joining.missing() == ["m1", "s"]
+    session.start("s")
+    session.rounds(30)
+    assert session.members["m2"].joining.missing() == ["m1"]
+
+
+def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
+    other = "a1" * 32
+    session = party("m1", "m2")
+    session.start("s", scenario_sha256=other)
+    both = re.compile(f"(?=.*{other[:16]})(?=.*{'5c' * 8})")
+    with pytest.raises(SessionError, match=both):
+        session.rounds(30)
+    session.round("m1", "m2")
+    (refusal,) = [event for event in session.listen() if event.kind == "refused"]
+    assert (refusal.member, refusal.about) == ("m1", "s")
+    assert both.search(refusal.text)
+    session.kill("s")
+    session.start("s")
+    session.agreed()
+
+
+def test_a_refusal_is_said_once_for_each_start() -> None:
+    session = party("m1", "m2")
+    stubborn = session.member("s", scenario_sha256="a1" * 32)
+    for _ in range(100):
+        session.round()
+        stubborn.voice.answer()
+    assert session.kinds() == ["refused"]
+
+
+def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
+    """Polls members in turn; returns why those left that left."""
+    left: dict[int, str] = {}
+    for _ in range(100):
+        for member in members:
+            if member.info.boot not in left:
+                try:
+                    member.poll()
+                except SessionError as error:
+                    left[member.info.boot] = str(error)
+                    member.bus.close()
+        clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+    return list(left.values())
+
+
+@pytest.mark.parametrize("name", SITES)
+@pytest.mark.parametrize("boots", [(7, 9), (9, 7)])
+def test_of_two_starts_of_one_site_one_goes_and_the_session_begins(name: str, boots: tuple[int, int]) -> None:
+    session = Party(SITES)
+    twins = [session.member(name, boot=boot) for boot in boots]
+    others = [session.member(other) for other in SITES if other != name]
+    reasons = polled_until_refused(*twins, *others, clock=session.clock)
+    assert len(reasons) == 1
+    assert f"a {name} in session" in reasons[0] or f"another {name}" in reasons[0]
+    epochs = {str(member.epoch) for member in (*twins, *others) if member.epoch}
+    assert len(epochs) == 1
+    assert sum(member.epoch is not None for member in (*twins, *others)) == 3
+
+
+def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
+    """Two starts of m1 whose answers do not reach each other; the others hear both."""
+    session = Party(SITES)
+    twins = [session.member("m1", boot=boot) for boot in (7, 9)]
+    others = [session.member(name) for name in ("m2", "s")]
+    deaf = [twin.joining._take for twin in twins]
+    for twin, take in zip(twins, deaf, strict=True):
+        twin.joining._take = lambda info, take=take: None if info.member == "m1" else take(info)
+    with pytest.raises(SessionError, match="is running"):
+        for _ in range(200):
+            for member in (*twins, *others):
+                member.poll()
+            session.clock.sleep_until(session.clock.monotonic_ns() + STEP_NS)
+    epochs = [member.epoch for member in (*twins, *others) if member.epoch]
+    assert len(epochs) == 3
+    assert len({epoch.boots["m1"] for epoch in epochs}) == 1
+
+
+@pytest.mark.parametrize("name", [*SITES, RECORDER])
+def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(name: str) -> None:
+    session = party(*SITES)
+    epoch = session.agreed()
+    late = session.member(name)
+    with pytest.raises(SessionError, match="is running"):
+        for _ in range(30):
+            session.round()
+            late.poll()
+    assert {str(member.epoch) for member in session.members.values()} == {str(epoch)}
+
+
+def test_another_machine_gets_the_epoch_by_unix_time() -> None:
+    session = party("m1", "m2")
+
+    class Remote(ManualClock):
+        def identity(self) -> str:
+            return "another machine"
+
+    offset_ns = 123_456_789_000  # its monotonic clock reads this much more, its wall clock the same
+    there = session.clock.monotonic_ns() + offset_ns
+    remote = Remote(there, session.clock.unix_ns() - there)
+    session.start("s", on_clock=remote)
+    for _ in range(100):
+        session.round()
+        remote.sleep_until(remote.monotonic_ns() + STEP_NS)
+    here, away = session.members["m1"].epoch, session.members["s"].epoch
+    assert here is not None
+    assert away is not None
+    assert away.mono_ns == here.mono_ns + offset_ns
+    assert (away.unix_ns, away.boots) == (here.unix_ns, here.boots)
+
+
+def test_a_recorder_without_the_scenario_is_not_ready() -> None:
+    session = Party(SITES)
+    for name in SITES:
+        session.start(name, scenario="")
+    session.start(RECORDER)
+    session.rounds(200)
+    assert "epoch" in session.kinds()
+    assert "start" not in session.kinds()
+
+
+GARBAGE = [
+    b"",
+    b"\xc1",
+    b"\x80",
+    b"\xff" * 100,
+    b"\x81\xa1v\x02",
+    b"\x93\x01\x02\x03",
+    b"\x91" * 5_000,
+    bytes(70_000),
+]
+
+
+@pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
+@pytest.mark.parametrize("payload", GARBAGE, ids=range(len(GARBAGE)))
+def test_garbage_in_events_and_answers_does_not_keep_a_session_from_beginning(
+    name: str, payload: bytes
+) -> None:
+    session = party(*SITES)
+    asked = session.stranger.questions(topics.key(SESSION, name, topics.INFO))
+    for _ in range(30):
+        session.say(name, payload)
+        while (question := asked.poll()) is not None:
+            question.answer(payload)
+        session.round()
+    session.agreed()
+
+
+def test_tokens_that_are_none_of_ours_are_passed_over() -> None:
+    session = party(*SITES)
+    for token in (f"trilat/{SESSION}/m1/alive/xyz", f"trilat/{SESSION}/stranger/alive/0x1"):
+        session.stranger.announce(token)
+    session.rounds(5)
+    session.stranger.close()
+    session.agreed()
+
+
+FORGED = {
+    "an epoch of a stranger": Event(
+        member="nobody", boot=1, kind="epoch", text="", epoch_mono_ns=5, attempt=1, boots={"m2": 1}
+    ),
+    "an epoch for other boots": Event(
+        member="s", boot=1, kind="epoch", text="", epoch_mono_ns=5, attempt=1, boots={"s": 1, "m2": 1}
+    ),
+    "a start of nothing": Event(member="m1", boot=1, kind="start", text="", attempt=1),
+    "a ready of nobody": Event(member="nobody", boot=1, kind="ready", text="", attempt=1),
+    "an end before the beginning": Event(member="m1", boot=1, kind="end", text="", ticks=2**63),
+}
+
+
+@pytest.mark.parametrize("event", FORGED.values(), ids=FORGED.keys())
+def test_events_that_fit_no_announcement_change_nothing(event: Event) -> None:
+    session = party(*SITES)
+    for _ in range(30):
+        session.say(event.member, encode(event))
+        session.round()
+    assert {member.epoch.unix_ns for member in session.members.values() if member.epoch} == {
+        session.agreed().unix_ns
+    }
+
+
+def test_an_answer_under_the_key_of_another_counts_for_nobody() -> None:
+    session = party("m1", "m2")
+    asked = session.stranger.questions(topics.key(SESSION, "nobody", topics.INFO))
+    for _ in range(50):
+        while (question := asked.poll()) is not None:
+            question.answer(encode(told("s", 1)))
+        session.round()
+    assert session.members["m1"].joining.missing() == ["s"]
+
+
+def test_what_another_version_answers_is_remembered_for_the_error() -> None:
+    session = party("m1", "m2")
+    asked = session.stranger.questions(topics.key(SESSION, "s", topics.INFO))
+    newer: Info = told("s", 1, v=2)
+    for _ in range(50):
+        while (question := asked.poll()) is not None:
+            question.answer(encode(newer))
+        session.round()
+    assert session.members["m1"].joining.missing() == ["s"]
+    assert "version 2" in session.members["m1"].joining.unreadable["s"]
+
+
+def test_boots_are_random_64_bit_numbers() -> None:
+    boots = {new_boot() for _ in range(1000)}
+    assert len(boots) == 1000
+    assert all(0 <= boot < 2**64 for boot in boots)
+    assert max(boots) > 2**60

@@ -1,0 +1,274 @@
+"""Messages on the wire: every finite number bit for bit, and nothing else gets through."""
+
+import json
+import math
+import struct
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.core.tick import Arrival, Mode, Output
+from trilat_net.errors import WireError
+from trilat_net.net.wire import (
+    MAX_BYTES,
+    STATE_VECTORS,
+    VERSION,
+    Event,
+    Info,
+    LinkStats,
+    Sample,
+    State,
+    decode,
+    encode,
+    encode_state,
+    json_schema,
+)
+
+KINDS = (State, Sample, LinkStats, Event, Info)
+PEERS = ("m2", "s")
+LIMITS = [0.0, -0.0, 5e-324, -2.2e-308, math.pi, 1.7976931348623157e308, -1.7976931348623157e308]
+
+finite = st.one_of(st.sampled_from(LIMITS), st.floats(allow_nan=False, allow_infinity=False))
+not_finite = st.sampled_from([math.nan, -math.nan, math.inf, -math.inf])
+ticks = st.integers(0, 2**40 - 1)
+
+
+def row(length: int) -> st.SearchStrategy[list[float]]:
+    return st.lists(finite, min_size=length, max_size=length)
+
+
+outputs = st.builds(
+    Output,
+    tick=ticks,
+    t_ns=st.integers(0, 2**63 - 1),
+    mode=st.sampled_from(Mode),
+    used=st.lists(st.integers(-1, 2**40), min_size=2, max_size=2),
+    rx_crc=st.integers(0, 2**32 - 1),
+    **{name: row(length) for name, length in STATE_VECTORS.items()},
+)
+arrivals = st.lists(
+    st.builds(Arrival, st.integers(0, 1), ticks, row(2), row(2), st.integers(-(2**40), 2**40))
+)
+boots = st.integers(0, 2**64 - 1)
+
+
+def bits(numbers: Any) -> bytes:
+    return struct.pack(f"<{len(numbers)}d", *numbers)
+
+
+def payload(**changes: Any) -> bytes:
+    """A small record, changed."""
+    vectors = {name: [0.5] * length for name, length in STATE_VECTORS.items()}
+    output = Output(tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, **vectors)
+    record = msgpack.unpackb(encode_state("m1", 9, PEERS, output, [Arrival(1, 6, [0, 0], [0, 0], 2)], 0, 0))
+    return msgpack.packb({**record, **changes})
+
+
+@given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
+def test_a_record_comes_back_bit_for_bit(
+    output: Output, came: list[Arrival], boot: int, late_us: int
+) -> None:
+    data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
+    state, sample = decode(data, State), decode(data, Sample)
+    plain = msgpack.unpackb(data)
+    for name in STATE_VECTORS:
+        wanted = bits(getattr(output, name))
+        assert bits(getattr(state, name)) == wanted
+        assert bits(plain[name]) == wanted
+    assert bits(sample.q) + bits(sample.qd) == bits(output.q) + bits(output.qd)
+    assert (state.tick, state.t_ns, state.boot) == (output.tick, output.t_ns, boot)
+    assert state.mode == output.mode.name.lower() == plain["mode"]
+    assert state.used == dict(zip(PEERS, output.used, strict=True)) == plain["used"]
+    assert state.rx == [[a.peer, a.tick, a.latency_us] for a in came] == plain["rx"]
+    assert (state.rx_crc, state.late_us, state.busy_us) == (output.rx_crc, late_us, 12)
+    assert (sample.site, sample.boot, sample.tick) == ("m1", boot, output.tick)
+
+
+@given(output=outputs, came=arrivals)
+def test_msgspec_writes_what_is_read_just_so(output: Output, came: list[Arrival]) -> None:
+    """Either library reads the other's bytes."""
+    state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
+    again = decode(msgspec.msgpack.encode(state), State)
+    assert all(bits(getattr(again, name)) == bits(getattr(state, name)) for name in STATE_VECTORS)
+    assert again.rx == state.rx
+
+
+@given(
+    output=outputs,
+    name=st.sampled_from(sorted(STATE_VECTORS)),
+    value=not_finite,
+    entry=st.integers(0, 1),
+)
+def test_what_is_not_finite_is_refused_at_both_ends(
+    output: Output, name: str, value: float, entry: int
+) -> None:
+    numbers = [*getattr(output, name)]
+    numbers[entry] = value
+    with pytest.raises(WireError) as refused:
+        encode_state("m1", 1, PEERS, output._replace(**{name: numbers}), [], 0, 0)
+    assert refused.value.reason == "not finite"
+    record = msgpack.unpackb(encode_state("m1", 1, PEERS, output, [], 0, 0))
+    data = msgpack.packb({**record, name: numbers})
+    for kind in (State, Sample) if name in ("q", "qd") else (State,):
+        with pytest.raises(WireError) as refused:
+            decode(data, kind)
+        assert refused.value.reason == "not finite"
+
+
+@pytest.mark.parametrize("name", sorted(STATE_VECTORS))
+@pytest.mark.parametrize("off", [-1, 1])
+def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
+    with pytest.raises(WireError, match=f"{name} has"):
+        decode(payload(**{name: [0.0] * (STATE_VECTORS[name] + off)}), State)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"v": VERSION + 1}, "version"),
+        ({"v": 0}, "version"),
+        ({"v": "1"}, "malformed"),
+        ({"tick": -1}, "malformed"),
+        ({"tick": 2**40}, "malformed"),
+        ({"tick": 1.5}, "malformed"),
+        ({"boot": -1}, "malformed"),
+        ({"q": "text"}, "malformed"),
+        ({"q": [0.0, "1"]}, "malformed"),
+        ({"q": [0.0, None]}, "malformed"),
+        ({"rx": [[0, 1]]}, "malformed"),
+        ({"rx": [[0, 1, 2, 3]]}, "malformed"),
+        ({"used": {"m2": 0.5}}, "malformed"),
+        ({"stranger": 1}, "malformed"),
+    ],
+)
+def test_what_is_no_record_of_ours_is_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(WireError) as refused:
+        decode(payload(**changes), State)
+    assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_oversized_payload_is_refused_before_it_is_looked_at(kind: type) -> None:
+    with pytest.raises(WireError) as refused:
+        decode(b"\xc1" * (MAX_BYTES + 1), kind)
+    assert refused.value.reason == "oversized"
+
+
+def only_wire_errors(data: bytes) -> None:
+    """Whatever the bytes: each kind of message comes out whole, or `WireError` does."""
+    for kind in KINDS:
+        try:
+            message = decode(data, kind)
+        except WireError:
+            continue
+        assert message.v == VERSION
+
+
+@given(data=st.binary(max_size=300))
+def test_random_bytes_raise_wire_errors_only(data: bytes) -> None:
+    only_wire_errors(data)
+
+
+@pytest.mark.parametrize("end", range(0, len(payload()), 3))
+def test_a_truncated_record_is_refused(end: int) -> None:
+    with pytest.raises(WireError):
+        decode(payload()[:end], State)
+
+
+@given(st.lists(st.tuples(st.integers(0, len(payload()) - 1), st.integers(0, 255)), min_size=1, max_size=4))
+def test_a_mutated_record_raises_wire_errors_only(changes: list[tuple[int, int]]) -> None:
+    data = bytearray(payload())
+    for at, byte in changes:
+        data[at] = byte
+    only_wire_errors(bytes(data))
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+        max_leaves=12,
+    )
+)
+def test_any_other_messagepack_raises_wire_errors_only(value: Any) -> None:
+    only_wire_errors(msgpack.packb(value))
+    only_wire_errors(payload(q=value))
+
+
+@pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1q", b"\xdc\x00\x01"])
+def test_deep_nesting_is_refused(opening: bytes) -> None:
+    only_wire_errors(opening * (MAX_BYTES // len(opening)))
+    data = payload(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
+    only_wire_errors(data)
+    with pytest.raises(WireError):
+        decode(data, Sample)
+
+
+def test_lengths_that_promise_more_than_there_is_are_refused() -> None:
+    for head in (
+        b"\xdf\xff\xff\xff\xff",
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdb\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+    ):
+        only_wire_errors(head)
+        only_wire_errors(payload(q=0)[:-1] + head)
+
+
+@given(
+    kind=st.text(max_size=20),
+    text=st.text(max_size=200),
+    boot=boots,
+    others=st.dictionaries(st.text(max_size=8), boots, max_size=3),
+)
+def test_events_come_back(kind: str, text: str, boot: int, others: dict[str, int]) -> None:
+    event = Event(member="m1", boot=boot, kind=kind, text=text, boots=others, epoch_mono_ns=2**62)
+    assert decode(encode(event), Event) == event
+
+
+@given(counts=st.dictionaries(st.sampled_from(PEERS), st.integers(-1, 2**40)), boot=boots, tick=ticks)
+def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick: int) -> None:
+    stats = LinkStats(
+        v=VERSION,
+        site="m1",
+        boot=boot,
+        tick=tick,
+        t_ns=5,
+        mode="run",
+        age_us=counts,
+        accepted=counts,
+        late=counts,
+        duplicate=counts,
+        refused=counts,
+        dropped=counts,
+        late_max_us=1,
+        busy_max_us=2,
+        overruns=3,
+    )
+    assert decode(encode(stats), LinkStats) == stats
+    info = Info(
+        member="s", boot=boot, scenario_sha256="a", scenario="b", host="h", clock="c", fingerprint="f"
+    )
+    assert decode(encode(info), Info) == info
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_json_schema_is_an_object_that_names_every_field(kind: type[msgspec.Struct]) -> None:
+    """What viewers accept: an object at the root, no reference out of it, plain JSON."""
+    schema = json_schema(kind)
+    assert schema["type"] == "object"
+    assert set(schema["properties"]) == set(kind.__struct_fields__)
+    text = json.dumps(schema)
+    assert json.loads(text) == schema
+    assert "$ref" not in text
+    assert "$id" not in text
+
+
+def test_the_json_schema_knows_units() -> None:
+    schema = json_schema(State)
+    assert schema["properties"]["q"]["x-unit"] == "rad"
+    assert schema["properties"]["tau"]["x-unit"] == "N m"
