@@ -189,8 +189,17 @@ LARGEST = 1e9
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize(
     "key",
-    ["control.Gamma", "control.Lambda", "control.theta_hat0", "control.Kp", "control.Kd", "arm.g_m_s2"]
-    + ["sites.m1.q0_rad", "sites.m1.qd0_rad_s", "arm.m2_kg", "limits.tau_limit_nm"],
+    [
+        "control.Gamma",
+        "control.Lambda",
+        "control.theta_hat0",
+        "control.Kp",
+        "control.Kd",
+        "arm.g_m_s2",
+        "sites.m1.q0_rad",
+        "sites.m1.qd0_rad_s",
+        "limits.tau_limit_nm",
+    ],
 )
 def test_absurd_scenarios_are_refused_or_end_in_a_stop_but_never_in_numbers_that_are_none(
     key: str, scheme: str

@@ -163,7 +163,7 @@ class Joining:
         own = self._own
         if info.boot == own.boot:
             return
-        invited = self._announced is not None and own.boot in self._announced.boots.values()
+        invited = self._announced is not None and not self._leads
         if info.running and not invited:
             raise SessionError(f"session {self._session!r} is running; {info.member} is at tick {info.ticks}")
         if info.member == own.member:
@@ -261,8 +261,8 @@ class Joining:
         announced = self._announced
         if announced is not None:
             boots = self._boots()
-            if now_ns >= announced.epoch_mono_ns - DECIDE_NS or not announced.boots.items() <= boots.items():
-                self._announced = None  # somebody was too late, or is gone: another attempt
+            if now_ns >= announced.epoch_mono_ns - DECIDE_NS or announced.boots != boots or self.missing():
+                self._announced = None  # somebody was too late, is gone, or has come: another attempt
             elif self._ready | {self._own.member} >= set(announced.boots):
                 self._voice.say("start", "all are ready", attempt=announced.attempt, boots=announced.boots)
                 return announced

@@ -9,6 +9,7 @@ Payloads are MessagePack maps with string keys and plain lists, encoded by `msgp
 
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Annotated, Any, TypeVar
 
 import msgpack
@@ -213,6 +214,9 @@ STATE_VECTORS = {
 }
 """Vectors of a record and how many numbers each has."""
 
+_SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
+_STATE_CHECK = (tuple(STATE_VECTORS), attrgetter(*STATE_VECTORS), tuple(STATE_VECTORS.values()))
+
 
 def encode_state(
     site: str,
@@ -303,17 +307,16 @@ def decode(payload: bytes, kind: type[M]) -> M:
 
 def _check_numbers(message: Sample | State) -> None:
     """Refuses vectors of the wrong length and numbers that are not finite."""
-    fields = STATE_VECTORS if isinstance(message, State) else SAMPLE_VECTORS
-    total = 0.0
-    for name, length in fields.items():
-        vector = getattr(message, name)
+    fields, vectors_of, lengths = _STATE_CHECK if isinstance(message, State) else _SAMPLE_CHECK
+    vectors = vectors_of(message)
+    # a sum is finite only if its terms are; what follows is for the message that fails, and for finite
+    # terms whose sum overflows
+    if tuple(map(len, vectors)) == lengths and _isfinite(sum(map(sum, vectors))):
+        return
+    for name, vector, length in zip(fields, vectors, lengths, strict=True):
         if len(vector) != length:
             raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
-        total += sum(vector)
-    if _isfinite(total):  # only if every term is; the second look is for terms whose sum overflows
-        return
-    for name in fields:
-        if not all(map(_isfinite, getattr(message, name))):
+        if not all(map(_isfinite, vector)):
             raise WireError("not finite", f"{name} of {message.site} at tick {message.tick}")
 
 

@@ -13,11 +13,10 @@ from .. import collector
 from ..core.fingerprint import fingerprint
 from ..core.site import Site
 from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
-from ..errors import WireError
 from ..log.reader import Log, SiteLog
-from ..net.wire import State, encode_state
+from ..net.wire import State
 from ..scenario import Scenario
-from .difference import Difference, close, first_difference, same_bits
+from .difference import Difference, close, first_difference, identical, same_bits
 
 
 @dataclass(slots=True)
@@ -176,23 +175,15 @@ class _Execution:
         if missing is not None:  # the log lacks a sample that came in: its CRC cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
         if state.boot != states[0].boot:
-            verdict.differ(Difference(state.site, state.tick, "boot", state.boot, states[0].boot))
-        elif self._payload_agrees(n, state, output, arrivals):
+            verdict.differ(Difference(self._log.name, state.tick, "boot", state.boot, states[0].boot))
+        elif state.site != self._log.name:
+            verdict.differ(Difference(self._log.name, state.tick, "site", state.site, self._log.name))
+        elif identical(state, output, self._peers):
             verdict.identical += 1
         elif difference := first_difference(state, output, self._peers, self._same):
             self._book(state, output, difference)
         else:
             verdict.identical += 1
-
-    def _payload_agrees(self, n: int, state: State, output: Output, arrivals: list[Arrival]) -> bool:
-        """True where the record, encoded again, is the payload byte for byte: the common, fast case."""
-        try:
-            payload = encode_state(
-                self._log.name, state.boot, self._peers, output, arrivals, state.late_us, state.busy_us
-            )
-        except WireError:
-            return False
-        return payload == self._log.payloads[n]
 
     def _book(self, state: State, output: Output, difference: Difference) -> None:
         in_doubt = any(

@@ -1,0 +1,276 @@
+"""The file: readable by the plain `mcap` package, the same twice, and honest where it is torn (L5)."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from tests.log_editing import edited, opened, recorded
+from trilat_net.core.fingerprint import fingerprint
+from trilat_net.errors import LogError
+from trilat_net.log.reader import open_log
+from trilat_net.log.writer import LogWriter
+from trilat_net.net.wire import encode_state
+from trilat_net.scenario import load, shipped
+from trilat_net.sim import virtual
+
+TICKS = 120
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
+    digests = set()
+    for _ in range(2):
+        stream = io.BytesIO()
+        virtual.record(load(name, {"duration_s": 0.3}), stream)
+        digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
+    assert len(digests) == 1
+
+
+def test_another_seed_is_another_file() -> None:
+    assert recorded("paper", {"duration_s": 0.05}) != recorded("paper", {"duration_s": 0.05, "seed": 2})
+
+
+def test_there_is_no_path_and_no_wall_clock_in_a_virtual_log() -> None:
+    data = edited(recorded("paper"))
+    assert str(Path(__file__).parents[2]).encode() not in data
+    for _, _, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+        assert message.log_time == message.publish_time < 10**9
+
+
+def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
+    scenario = load("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
+    sent = {
+        (site.name, output.tick): encode_state(
+            site.name, virtual.virtual_boot(scenario, site.name), site.peers, output, arrivals, 0, 0
+        )
+        for site, arrivals, output in virtual.run(scenario)
+    }
+    reader = make_reader(io.BytesIO(recorded("paper")), validate_crcs=True)
+    found = 0
+    for schema, channel, message in reader.iter_messages():
+        assert schema is not None
+        assert schema.id != 0
+        assert schema.encoding == "jsonschema"
+        assert json.loads(schema.data)["type"] == "object"
+        assert channel.message_encoding == "msgpack"
+        root, session, member, kind = channel.topic.removeprefix("/").split("/")
+        assert (root, session) == ("trilat", "paper")
+        if kind == "state":
+            found += 1
+            assert message.data == sent[member, message.sequence]
+            assert message.publish_time == message.sequence * 1_000_000
+            assert channel.metadata == {"member": member, "rate_hz": "1000"}
+    assert found == len(sent) == 3 * TICKS
+
+
+def required_and_typed(schema: dict, value: object) -> None:
+    """Checks a value against the parts of JSON Schema that our schemas use."""
+    kinds = {"object": dict, "array": list, "string": str, "integer": int, "number": (int, float)}
+    assert isinstance(value, kinds[schema["type"]])
+    if isinstance(value, dict):
+        assert set(schema.get("required", [])) <= set(value)
+        for key, entry in value.items():
+            assert key in schema.get("properties", {}) or schema["additionalProperties"] is not False
+            extra = schema.get("additionalProperties")
+            inner = schema.get("properties", {}).get(key, extra)
+            if isinstance(inner, dict) and "type" in inner:
+                required_and_typed(inner, entry)
+    if isinstance(value, list):
+        assert schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", 10**6)
+        for entry in value:
+            required_and_typed(schema["items"], entry)
+
+
+def test_every_message_is_one_that_its_schema_allows() -> None:
+    kinds = set()
+    for schema, channel, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+        assert schema is not None
+        required_and_typed(json.loads(schema.data), msgpack.unpackb(message.data))
+        kinds.add(channel.topic.rpartition("/")[2])
+    assert kinds == {"state", "link", "event"}
+
+
+def test_session_scenario_and_accounts_stand_in_the_file() -> None:
+    reader = make_reader(io.BytesIO(recorded("paper")))
+    metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
+    session = metadata["trilat.session"]
+    scenario = load("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
+    assert session["driver"] == "virtual"
+    assert session["epoch_unix_ns"] == "0"
+    assert session["scenario_sha256"] == scenario.sha256
+    assert session["seed"] == "1"
+    assert session["fingerprint"] == fingerprint()
+    assert {"commit", "python", "platform", "version_numpy", "version_trilat-net"} <= set(session)
+    (attachment,) = reader.iter_attachments()
+    assert (attachment.name, attachment.data.decode()) == ("scenario.toml", scenario.text)
+    for site in scenario.names:
+        text = metadata["trilat.accounts"][f"/{site}"]
+        assert text == "received 120, missing 0, duplicate 0, reordered 0, largest gap 0"
+
+
+def test_session_and_scenario_stand_before_the_first_message() -> None:
+    """So that they survive a crash right after the start."""
+    stream = io.BytesIO()
+    LogWriter(stream, load("free"), "lab", "live", 10**18)
+    log = opened(stream.getvalue())
+    assert log.scenario == load("free")
+    assert (log.driver, log.complete, log.accounts) == ("live", False, {})
+    assert len(log["m1"]) == 0
+
+
+def test_a_live_log_counts_from_its_epoch() -> None:
+    stream = io.BytesIO()
+    writer = LogWriter(stream, load("free"), "lab", "live", 10**18, {"mood": "calm"})
+    key = "trilat/lab/m1/state"
+    assert writer.knows(key)
+    assert not writer.knows("trilat/lab/stranger/state")
+    for k in (0, 2, 2):
+        writer.add_state("m1", key, b"\x80", k * 1_000_000, 10**18 + 5, k)
+    writer.finish({"m1": 4, "m2": 0, "s": 0}, {"dropped": "1"})
+    reader = make_reader(io.BytesIO(stream.getvalue()))
+    assert [m.publish_time - 10**18 for _, _, m in reader.iter_messages()] == [0, 2_000_000]
+    metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
+    assert metadata["trilat.session"]["mood"] == "calm"
+    assert metadata["trilat.accounts"]["dropped"] == "1"
+    assert metadata["trilat.accounts"]["/m1"].startswith("received 2, missing 2, duplicate 1")
+
+
+def test_the_reader_gives_arrays_with_time() -> None:
+    log = opened(recorded("paper"))
+    assert log.sites == ("m1", "m2", "s")
+    assert log.complete
+    m1 = log["m1"]
+    assert (m1.tick == np.arange(TICKS)).all()
+    assert np.allclose(m1.t_s, np.arange(TICKS) * 1e-3)
+    assert (m1.q.shape, m1.theta_hat.shape, m1.busy_us.shape) == ((TICKS, 2), (TICKS, 5), (TICKS - 1,))
+    assert (m1.e == m1.q - m1.q_des).all()
+    assert (m1.used["s"] == np.maximum(np.arange(TICKS) - 20, -1)).all()
+    age = m1.age_s("s", 1000)
+    assert np.isnan(age[:20]).all()
+    assert age[20:] == pytest.approx(0.02)
+    assert [event.kind for event in log.events] == ["end"] * 3
+    assert [stats.tick for stats in log.link_stats("m1")][:1] != []
+    with pytest.raises(KeyError, match="m1, m2, s"):
+        log["stranger"]
+
+
+# What is torn, damaged, or not ours.
+
+
+def whole_or_refused(data: bytes, whole: bool) -> None:
+    """A log says that it is not complete, or is refused; nothing else comes out."""
+    try:
+        log = opened(data)
+        for site in log.sites:
+            _ = log[site].states
+    except LogError:
+        return
+    assert log.complete == whole
+
+
+@pytest.mark.parametrize("chunk_bytes", [4096, 1 << 20])
+def test_a_file_cut_anywhere_opens_as_far_as_it_is_whole(chunk_bytes: int) -> None:
+    data = edited(recorded("paper"), chunk_bytes=chunk_bytes)
+    before = 0
+    for end in range(0, len(data), max(1, len(data) // 400)):
+        whole_or_refused(data[:end], whole=False)
+        try:
+            records = len(opened(data[:end])["m1"])
+        except LogError:
+            continue
+        assert records >= before
+        before = records
+    assert before == TICKS
+    assert opened(data).complete
+
+
+@settings(max_examples=300)
+@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(1, 255)), min_size=1, max_size=3))
+def test_a_damaged_file_raises_log_errors_only(changes: list[tuple[float, int]]) -> None:
+    data = bytearray(edited(recorded("paper", {"duration_s": 0.02}), chunk_bytes=4096))
+    for share, flip in changes:
+        data[int(share * len(data))] ^= flip
+    try:
+        log = opened(bytes(data))
+        for site in log.sites:
+            _ = log[site].states
+        _ = log.driver
+    except LogError:
+        pass
+
+
+@pytest.mark.parametrize("data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99])
+def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
+    with pytest.raises(LogError):
+        opened(data)
+    path = tmp_path / "no.mcap"
+    path.write_bytes(data)
+    with pytest.raises(LogError, match=r"no\.mcap"):
+        open_log(path)
+
+
+def test_an_mcap_file_of_others_is_refused() -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    schema = writer.register_schema("s", "jsonschema", b"{}")
+    writer.add_message(writer.register_channel("/t", "json", schema), 1, b"{}", 1)
+    writer.finish()
+    with pytest.raises(LogError, match=r"no log of trilat-net"):
+        opened(stream.getvalue())
+
+
+def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.add_metadata("trilat.session", {})
+    writer.add_attachment(0, 0, "scenario.toml", "application/toml", load("free").text.encode())
+    writer.finish()
+    with pytest.raises(LogError):
+        len(opened(stream.getvalue())["m1"])
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "none.mcap"):
+        with pytest.raises(LogError, match="cannot be read"):
+            open_log(path)
+
+
+@pytest.mark.parametrize("text", ["not toml [", "name = 'x'", "\udcff"])
+def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
+    def scenario(_: str) -> str:
+        return text.replace("\udcff", "")
+
+    with pytest.raises(LogError, match="scenario"):
+        opened(edited(recorded("paper"), scenario=scenario))
+
+
+@pytest.mark.parametrize("change", [{"v": 2}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
+def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) -> None:
+    data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
+    with pytest.raises(LogError, match="record of m1"):
+        _ = opened(data)["m1"].states
+
+
+class FullDisk(io.BytesIO):
+    """A disk with no room left after some bytes."""
+
+    def write(self, data: bytes) -> int:
+        if self.tell() > 20_000:
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+def test_a_disk_that_is_full_is_a_log_error() -> None:
+    with pytest.raises(LogError, match="No space left"):
+        virtual.record(load("paper", {"duration_s": 5.0}), FullDisk())
