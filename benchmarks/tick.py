@@ -7,7 +7,8 @@ import numpy as np
 from trilat_net.core.kernel import site_tick
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Arrival, Tick
-from trilat_net.net.wire import Sample, decode, encode_state
+from trilat_net.net.messages import Sample
+from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import load
 
 from .stopwatch import each_us

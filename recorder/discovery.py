@@ -6,8 +6,9 @@ from trilat_net.errors import ScenarioError, SessionError, WireError
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock
 from trilat_net.net.endpoints import default_endpoint, default_endpoints
+from trilat_net.net.messages import Info
 from trilat_net.net.session import ASK_EVERY_NS, token
-from trilat_net.net.wire import Info, decode
+from trilat_net.net.wire import decode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import parse
 

@@ -15,8 +15,8 @@ from trilat_net.errors import SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
+from trilat_net.net.messages import Info
 from trilat_net.net.session import Epoch, Joining, Voice
-from trilat_net.net.wire import Info
 from trilat_net.scenario import parse
 
 from .recording import Recording

@@ -10,8 +10,9 @@ from typing import BinaryIO
 from trilat_net.errors import WireError
 from trilat_net.log.writer import LogWriter
 from trilat_net.net import topics
+from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.session import Epoch, Voice
-from trilat_net.net.wire import Event, LinkStats, State, decode, encode
+from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario
 
 from .tap import Arrived, Tap

@@ -7,7 +7,7 @@ from rich.live import Live
 from rich.table import Table
 
 from trilat_net.core.grid import NS_PER_S
-from trilat_net.net.wire import LinkStats
+from trilat_net.net.messages import LinkStats
 from trilat_net.scenario import Scenario
 
 LINE_EVERY = 20

@@ -12,7 +12,8 @@ from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.tick import MAX_ARRIVALS, Arrival
 from trilat_net.errors import WireError
 from trilat_net.net.bus import Inbox
-from trilat_net.net.wire import Sample, decode
+from trilat_net.net.messages import Sample
+from trilat_net.net.wire import decode
 
 
 class Intake:

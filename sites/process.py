@@ -18,9 +18,10 @@ from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.messages import Event, Info
 from trilat_net.net.session import Epoch, Joining, Voice, new_boot
 from trilat_net.net.stats import LoopStats
-from trilat_net.net.wire import Event, Info, decode, encode_state
+from trilat_net.net.wire import decode, encode_state
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import Scenario
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.wire import Event, LinkStats, decode
+from trilat_net.net.messages import Event, LinkStats
+from trilat_net.net.wire import decode
 
 
 class Watch:

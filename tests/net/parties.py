@@ -7,8 +7,9 @@ from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, ManualClock
+from trilat_net.net.messages import Event, Info
 from trilat_net.net.session import Epoch, Joining, Voice
-from trilat_net.net.wire import Event, Info, decode
+from trilat_net.net.wire import decode
 
 SESSION = "t"
 STEP_NS = 20_000_000

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import ManualClock
+from trilat_net.net.messages import Event, Info
 from trilat_net.net.session import AHEAD_NS, DECIDE_NS, new_boot
-from trilat_net.net.wire import Event, Info, encode
+from trilat_net.net.wire import encode
 
 from .parties import SESSION, STEP_NS, Member, Party, told
 

@@ -13,20 +13,8 @@ from hypothesis import strategies as st
 
 from trilat_net.core.tick import Arrival, Mode, Output
 from trilat_net.errors import WireError
-from trilat_net.net.wire import (
-    MAX_BYTES,
-    STATE_VECTORS,
-    VERSION,
-    Event,
-    Info,
-    LinkStats,
-    Sample,
-    State,
-    decode,
-    encode,
-    encode_state,
-    json_schema,
-)
+from trilat_net.net.messages import STATE_VECTORS, VERSION, Event, Info, LinkStats, Sample, State, json_schema
+from trilat_net.net.wire import MAX_BYTES, decode, encode, encode_state
 
 KINDS = (State, Sample, LinkStats, Event, Info)
 PEERS = ("m2", "s")

@@ -20,7 +20,8 @@ from ..core.arm import Array
 from ..core.grid import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
-from ..net.wire import Event, LinkStats, State, decode
+from ..net.messages import Event, LinkStats, State
+from ..net.wire import decode
 from ..scenario import Scenario, parse
 from .chunks import Walk
 from .writer import ACCOUNTS, SCENARIO, SESSION

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from ..errors import LogError
 from ..net import topics
-from ..net.wire import VERSION, Event, LinkStats, State, json_schema
+from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
 from .accounting import Account
 from .provenance import provenance

@@ -17,7 +17,8 @@ from ..errors import SessionError, WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .wire import Event, Info, decode, encode
+from .messages import Event, Info
+from .wire import decode, encode
 
 AHEAD_NS = 700_000_000
 """How far ahead an epoch is announced."""

@@ -5,7 +5,7 @@ from collections import Counter
 from ..core.grid import NS_PER_S
 from ..core.site import Site
 from ..core.tick import Output
-from .wire import VERSION, LinkStats
+from .messages import VERSION, LinkStats
 
 PER_SECOND = 10
 

@@ -1,218 +1,31 @@
-"""Messages on the wire: the types are the schema.
+"""Messages to bytes and back.
 
 Law: decoding never trusts. What arrives is a message of this version with finite numbers in range, or a
 `WireError` whose reason is counted; encoding refuses what decoding would.
 
 Payloads are MessagePack maps with string keys and plain lists, encoded by `msgpack` and decoded by
-`msgspec` straight into the types below.
+`msgspec` straight into the types of `messages`.
 """
 
 import math
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import msgpack
 import msgspec
-from msgspec import Meta
 
-from ..core.arm import JOINTS, PARAMETERS
 from ..core.tick import Arrival, Output
 from ..errors import WireError
+from .messages import SAMPLE_VECTORS, STATE_VECTORS, VERSION, Event, Info, LinkStats, Sample, State
 
-VERSION = 1
 MAX_BYTES = 65_536
-
-U64 = Annotated[int, Meta(ge=0)]
-TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
-
-
-def _unit(unit: str, text: str, **limits: Any) -> Meta:
-    return Meta(description=text, extra_json_schema={"x-unit": unit}, **limits)
-
-
-Angles = Annotated[list[float], _unit("rad", "joint angles")]
-Speeds = Annotated[list[float], _unit("rad/s", "joint velocities")]
-Torques = Annotated[list[float], _unit("N m", "joint torques")]
-
-
-class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The complete record of one tick of one site; what each vector means stands at `core.tick.Output`.
-
-    Attributes:
-        v: version of this schema.
-        site: who sends.
-        boot: the sender's process start, random.
-        tick: its tick.
-        t_ns: nominal time, ns since the session's epoch.
-        mode: "run" or "diverged".
-        q: joint angles.
-        qd: joint velocities.
-        q_des: reference, Eq. (6).
-        qd_des: its derivative.
-        tau: control torque, Eq. (13).
-        tau_x: exogenous torque as Eq. (8) subtracts it.
-        theta_hat: estimate of theta, Eq. (24).
-        used: per peer the tick of the sample in use, -1 before the first.
-        rx: arrivals in the order accepted: index of the peer among the sender's peers, its tick, latency us.
-        rx_crc: CRC-32 of those arrivals as the step took them in.
-        cmd: commands that took effect.
-        mem: whatever else the controller remembers.
-        late_us: wake-up minus deadline of this tick.
-        busy_us: computing time of the tick before.
-    """
-
-    v: int
-    site: str
-    boot: U64
-    tick: TickNumber
-    t_ns: Annotated[int, _unit("ns", "nominal time since the session's epoch")]
-    mode: str
-    q: Angles
-    qd: Speeds
-    q_des: Angles
-    qd_des: Speeds
-    tau: Torques
-    tau_x: Torques
-    theta_hat: list[float]
-    used: dict[str, int]
-    rx: list[Annotated[list[int], Meta(min_length=3, max_length=3)]]
-    rx_crc: U64
-    cmd: list[str]
-    mem: list[float]
-    late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
-    busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
-
-
-class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """What a peer needs of a `State`: the fields that it reads, by the same names."""
-
-    v: int
-    site: str
-    boot: U64
-    tick: TickNumber
-    q: list[float]
-    qd: list[float]
-
-
-class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Statistics of a site's loop and of its links, ten times a second.
-
-    Attributes:
-        v: version of this schema.
-        site: who sends.
-        boot: the sender's process start.
-        tick: the tick after which they were taken.
-        t_ns: nominal time of that tick, ns since the epoch.
-        mode: the site's mode.
-        age_us: per peer, now minus the stamp of the sample in use; -1 before the first.
-        accepted: per peer, samples taken in since the start.
-        late: per peer, those that came after they were due.
-        duplicate: per peer, those that came twice.
-        refused: per peer, those whose stamp was out of range.
-        dropped: messages that were none of ours or overflowed, by reason.
-        late_max_us: largest lateness of a wake-up since the last statistics.
-        busy_max_us: largest computing time of a tick since then.
-        overruns: ticks since the start whose work began after the next one was due.
-    """
-
-    v: int
-    site: str
-    boot: U64
-    tick: TickNumber
-    t_ns: int
-    mode: str
-    age_us: Annotated[dict[str, int], _unit("us", "now minus the stamp of the sample in use")]
-    accepted: dict[str, int]
-    late: dict[str, int]
-    duplicate: dict[str, int]
-    refused: dict[str, int]
-    dropped: dict[str, int]
-    late_max_us: Annotated[int, _unit("us", "largest lateness of a wake-up")]
-    busy_max_us: Annotated[int, _unit("us", "largest computing time of a tick")]
-    overruns: int
-
-
-class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Something that happened once; `text` says it to people, the other fields to programs.
-
-    Attributes:
-        v: version of this schema.
-        member: who says it: a site, or "recorder".
-        boot: the sender's process start.
-        kind: "epoch", "ready", "start", "lost", "back", "diverged", "end", "stored", "refused", "setup".
-        text: the sentence.
-        t_ns: nominal time, ns since the epoch; -1 before it.
-        attempt: number of the announcement that it belongs to.
-        epoch_mono_ns: the epoch on the monotonic clock `clock`.
-        epoch_unix_ns: the epoch in Unix time.
-        clock: identity of that monotonic clock.
-        boots: members of the session and their boots.
-        about: the member that it concerns.
-        ticks: how many ticks.
-    """
-
-    v: int = VERSION
-    member: str
-    boot: U64
-    kind: str
-    text: str
-    t_ns: int = -1
-    attempt: int = 0
-    epoch_mono_ns: int = 0
-    epoch_unix_ns: int = 0
-    clock: str = ""
-    boots: dict[str, int] = {}
-    about: str = ""
-    ticks: int = 0
-
-
-class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a member answers when asked who it is.
-
-    Attributes:
-        v: version of this schema.
-        member: a site, or "recorder".
-        boot: its process start.
-        scenario_sha256: hash of the resolved scenario; "" for the recorder, which learns it.
-        scenario: the resolved text; "" for the recorder.
-        host: name of its machine.
-        clock: identity of its monotonic clock.
-        fingerprint: of its platform's arithmetic.
-        needs_recorder: whether it waits for a recorder.
-        running: whether its session's epoch is fixed.
-        ticks: how many ticks it has made.
-    """
-
-    v: int = VERSION
-    member: str
-    boot: U64
-    scenario_sha256: str
-    scenario: str
-    host: str
-    clock: str
-    fingerprint: str
-    needs_recorder: bool = False
-    running: bool = False
-    ticks: int = 0
-
 
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Sample, LinkStats, Event, Info)
 }
 _isfinite = math.isfinite
-
-SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}
-STATE_VECTORS = {
-    **SAMPLE_VECTORS,
-    "q_des": JOINTS,
-    "qd_des": JOINTS,
-    "tau": JOINTS,
-    "tau_x": JOINTS,
-    "theta_hat": PARAMETERS,
-}
-"""Vectors of a record and how many numbers each has."""
 
 _SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
 _STATE_CHECK = (tuple(STATE_VECTORS), attrgetter(*STATE_VECTORS), tuple(STATE_VECTORS.values()))
@@ -318,10 +131,3 @@ def _check_numbers(message: Sample | State) -> None:
             raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
         if not all(map(_isfinite, vector)):
             raise WireError("not finite", f"{name} of {message.site} at tick {message.tick}")
-
-
-def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Returns the JSON Schema of a message type, root object, as viewers want it."""
-    (_,), components = msgspec.json.schema_components([kind])
-    schema: dict[str, Any] = components[kind.__name__]
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..core.tick import Output
-from ..net.wire import STATE_VECTORS, State
+from ..net.messages import STATE_VECTORS, State
 
 TOLERANCE = 1e-9
 """Where platforms differ, values a and b count as equal when |a - b| <= TOLERANCE (1 + |a|)."""

@@ -14,7 +14,7 @@ from ..core.fingerprint import fingerprint
 from ..core.site import Site
 from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
 from ..log.reader import Log, SiteLog
-from ..net.wire import State
+from ..net.messages import State
 from ..scenario import Scenario
 from .difference import Difference, close, first_difference, identical, same_bits
 

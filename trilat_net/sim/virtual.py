@@ -15,8 +15,9 @@ from ..core.site import Site
 from ..core.tick import Arrival, Mode, Output, Tick, diverged_text
 from ..log.writer import LogWriter
 from ..net import topics
+from ..net.messages import Event
 from ..net.stats import LoopStats
-from ..net.wire import Event, encode, encode_state
+from ..net.wire import encode, encode_state
 from ..scenario import Scenario
 from .network import Network, PromptNetwork
 

@@ -1,0 +1,386 @@
+"""Scenarios: what loads runs, and what cannot be right is refused where it stands."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.core.setup import Scheme
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load, override, parse, shipped, shipped_text, template_text
+
+TEXT = shipped_text("paper")
+
+
+def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
+    with pytest.raises(ScenarioError) as error:
+        parse(text, "mine.toml", overrides)
+    assert str(error.value).startswith("mine.toml: ")
+    assert error.value.exit_code == 2
+    return error.value
+
+
+def test_shipped_are_the_five() -> None:
+    assert shipped() == ["asymmetric", "free", "paper", "paper_rods", "two_sites"]
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_a_shipped_scenario_loads_and_is_called_by_its_name(name: str) -> None:
+    scenario = load(name)
+    assert scenario.name == name
+    assert scenario.title
+    assert scenario.assumed
+    assert scenario.beta is not None
+    assert [scenario.setup(site).name for site in scenario.names] == list(scenario.names)
+
+
+def test_paper_is_section_iv() -> None:
+    scenario = load("paper")
+    assert (scenario.duration_s, scenario.scheme) == (20.0, "second_order")
+    assert {link.delay_ms for link in scenario.links.values()} == {200.0}
+    assert scenario.alpha.tolist() == [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]
+    m1 = scenario.setup("m1")
+    assert m1.theta.tolist() == [3.0, 1.0, 1.0, 2.0, 1.0]
+    assert m1.pulses.tolist() == [[1.0, 6.0, 10.0, 10.0]]
+    assert (m1.Lambda.tolist(), m1.Kp.tolist(), m1.Kd.tolist()) == ([1, 1], [1, 1], [3, 3])
+    assert (m1.Gamma.tolist(), m1.theta_hat0.tolist()) == ([1] * 5, [0] * 5)
+    assert [link.peer for link in m1.links] == ["m2", "s"]
+    assert m1.links[0].delay_ns == 200_000_000
+
+
+def test_the_template_is_valid_and_its_defaults_are_what_it_says() -> None:
+    scenario = parse(template_text(), "template")
+    assert scenario.name == "mine"
+    spelt_out = "\n".join(line.removeprefix("# ") for line in template_text().splitlines() if "=" in line)
+    assert "Kd = 3.0" in spelt_out
+    control = scenario.sites["m1"].control
+    assert (control.Kd, control.Gamma) == ((3.0, 3.0), (1.0,) * 5)
+    assert scenario.sites["s"].limits.tau_limit_nm == 200.0
+
+
+number = st.floats(0.001, 1e6)
+changes = st.fixed_dictionaries(
+    {},
+    optional={
+        "control.Kd": number | st.tuples(number, number).map(list),
+        "control.Gamma": st.lists(number, min_size=5, max_size=5),
+        "sites.m1.control.Kp": number,
+        "sites.s.q0_rad": st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2),
+        "sites.m2.rate_hz": st.integers(1, 20_000),
+        "arm.m1_kg": number,
+        "duration_s": st.floats(1e-6, 86_400.0),
+        "seed": st.integers(0, 2**63 - 1),
+        "scheme": st.sampled_from(["second_order", "digital"]),
+        "link.delay_ms": st.floats(0, 10_000),
+        "title": st.text(max_size=60),
+        "about": st.text(max_size=60)
+        | st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]),
+        "assumed": st.lists(st.text(max_size=20), max_size=3),
+    },
+)
+
+
+@settings(max_examples=150)
+@given(overrides=changes)
+def test_the_canonical_text_loads_to_the_same_scenario(overrides: dict[str, Any]) -> None:
+    scenario = parse(TEXT, overrides=overrides)
+    again = parse(scenario.text)
+    assert again == scenario
+    assert again.text == scenario.text
+    assert again.sha256 == scenario.sha256
+    assert list(again.sites) == list(scenario.sites)
+
+
+def test_the_hash_names_the_experiment() -> None:
+    hashes = [load("paper").sha256, load("free").sha256]
+    hashes += [load("paper", {key: 2}).sha256 for key in ("seed", "control.Kd", "arm.m1_kg", "link.delay_ms")]
+    assert len(set(hashes)) == len(hashes)
+    assert load("paper", {"control.Kd": 3}).sha256 == load("paper").sha256
+
+
+# Overrides and defaults.
+
+
+def test_an_override_reads_key_equals_value() -> None:
+    tables: dict[str, Any] = {}
+    texts = ["control.Kd=5", "scheme=digital", "sites.m1.q0_rad=[0.1, 2]", 'title="a = b"', "seed = 7"]
+    override(tables, texts)
+    assert tables == {
+        "control": {"Kd": 5},
+        "scheme": "digital",
+        "sites": {"m1": {"q0_rad": [0.1, 2]}},
+        "title": "a = b",
+        "seed": 7,
+    }
+
+
+@pytest.mark.parametrize("text", ["control.Kd", "=5", "", " =5"])
+def test_an_override_without_key_or_value_is_refused(text: str) -> None:
+    assert "KEY=VALUE" in str(refused([text]))
+
+
+def test_an_override_below_a_value_is_refused() -> None:
+    assert refused(["seed.x=1"]).path == "seed"
+
+
+def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
+    control = load("paper", {"control.Kd": 5, "control.Gamma": 0.5}).sites["s"].control
+    assert control.Kd == (5.0, 5.0)
+    assert control.Gamma == (0.5,) * 5
+    scenario = load("paper", {"sites.m1.q0_rad": 0.25, "sites.m1.control.Kp": [2, 3]})
+    assert scenario.sites["m1"].q0_rad == (0.25, 0.25)
+    assert scenario.sites["m1"].control.Kp == (2.0, 3.0)
+    assert scenario.sites["m2"].control.Kp == (1.0, 1.0)
+
+
+def test_a_site_overrides_single_keys_of_its_arm_and_a_link_its_delay() -> None:
+    scenario = load(
+        "paper", {"sites.s.arm.m1_kg": 2, "links": {"m1->s": {"delay_ms": 350.0}}, "sites.m2.rate_hz": 500}
+    )
+    assert scenario.sites["s"].arm.m1_kg == 2.0
+    assert scenario.sites["m1"].arm.m1_kg == 1.0
+    assert scenario.links["m1->s"].delay_ns == 350_000_000
+    assert scenario.links["s->m1"].delay_ns == 200_000_000
+    setup = scenario.setup("m1")
+    assert [link.rate_hz for link in setup.links] == [500, 1000]
+
+
+def test_a_delay_is_rounded_to_whole_microseconds() -> None:
+    scenario = load("paper", {"link.delay_ms": 0.0004})
+    assert scenario.links["m1->s"].delay_ns == 0
+    assert load("paper", {"link.delay_ms": 0.0006}).links["m1->s"].delay_ns == 1000
+
+
+def test_each_scheme_has_its_name() -> None:
+    assert load("paper", {"scheme": "digital"}).setup("m1").scheme is Scheme.DIGITAL
+    assert load("paper").setup("m1").scheme is Scheme.SECOND_ORDER
+
+
+def test_without_hands_is_the_same_experiment_with_nobody_at_the_arms() -> None:
+    scenario = load("paper").without_hands()
+    assert all(spec.hands == () for spec in scenario.sites.values())
+    assert scenario.setup("m1").pulses.shape == (0, 4)
+    assert scenario.sites["m1"].control == load("paper").sites["m1"].control
+
+
+def test_shares_that_are_not_named_are_zero() -> None:
+    scenario = load("paper", {"dominance.m1": {"s": 1}})
+    assert scenario.alpha[0].tolist() == [0.0, 0.0, 1.0]
+    assert scenario.beta is not None
+
+
+def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
+    """Expert and slave locked, trainee following: it runs, and only the certificate is without weights."""
+    rows = {"m1": {"s": 1}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 1}}
+    assert load("paper", {"dominance": rows}).beta is None
+    assert np.allclose(load("asymmetric").beta, [0.426, 0.155, 0.419], atol=5e-4)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("key", "nearest"),
+    [
+        ("durations_s", "duration_s"),
+        ("control.kd", "Kd"),
+        ("control.Lamda", "Lambda"),
+        ("arm.m1", "m1_kg"),
+        ("limits.tau_limit", "tau_limit_nm"),
+        ("link.delay", "delay_ms"),
+        ("sites.m1.q0", "q0_rad"),
+        ("sites.m1.controls", "control"),
+        ("sites.m1.control.Kpp", "Kp"),
+        ("sites.m1.arm.l1", "l1_m"),
+        ("dominance.m3", "m1"),
+        ("dominance.m1.m22", "m2"),
+        ("links.m1->ss", "m1->s"),
+        ("links.m1->s.delay", "delay_ms"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_its_path_and_the_nearest_name(key: str, nearest: str) -> None:
+    table = {"links.m1->ss": {"delay_ms": 1.0}}.get(key, 1.0)
+    error = refused({key: table})
+    assert error.path == key
+    assert "unknown key" in error.problem
+    assert f"did you mean '{nearest}'" in error.problem
+
+
+def test_a_key_unlike_any_other_is_refused_with_all_that_are_valid() -> None:
+    assert "valid are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
+
+
+def test_a_misspelt_key_of_a_pulse_is_refused() -> None:
+    pulse = {"kind": "pulse", "start": 1.0, "end_s": 2.0, "peak_nm": 1.0}
+    error = refused({"sites.m1.hands": [pulse]})
+    assert error.path == "sites.m1.hands[0].start"
+    assert "'start_s'" in error.problem
+
+
+@pytest.mark.parametrize(
+    ("overrides", "path"),
+    [
+        ({"link.delay_ms": -1.0}, "delay_ms"),
+        ({"links": {"s->m2": {"delay_ms": -0.5}}}, "links.s->m2.delay_ms"),
+        ({"link.delay_ms": 10_001.0}, "delay_ms"),
+        ({"rate_hz": 0}, "rate_hz"),
+        ({"sites.m2.rate_hz": 0}, "sites.m2.rate_hz"),
+        ({"sites.m2.rate_hz": 20_001}, "sites.m2.rate_hz"),
+        ({"rate_hz": 999.5}, "rate_hz"),
+        ({"duration_s": 0.0}, "duration_s"),
+        ({"duration_s": -3}, "duration_s"),
+        ({"duration_s": "long"}, "duration_s"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"control.Kd": [1.0]}, "control.Kd"),
+        ({"control.Kd": [1.0, 2.0, 3.0]}, "control.Kd"),
+        ({"control.Gamma": [1.0, 2.0]}, "control.Gamma"),
+        ({"control.theta_hat0": [0.0] * 6}, "control.theta_hat0"),
+        ({"sites.s.q0_rad": [0.0]}, "sites.s.q0_rad"),
+        ({"sites.s.control.Kp": [1.0, -1.0]}, "sites.s.control.Kp[1]"),
+        ({"control.Lambda": 0}, "control.Lambda"),
+        ({"control.Kp": "much"}, "control.Kp"),
+        ({"control.Kp": True}, "control.Kp"),
+        ({"arm.m1_kg": 0.0}, "arm.m1_kg"),
+        ({"arm.l2_m": -1.0}, "arm.l2_m"),
+        ({"limits.tau_limit_nm": 0.0}, "limits.tau_limit_nm"),
+        ({"scheme": "third_order"}, "scheme"),
+        ({"control.law": "magic"}, "control.law"),
+        ({"sites.m1.role": "boss"}, "sites.m1.role"),
+        ({"name": "two words"}, "name"),
+        ({"name": ""}, "name"),
+        ({"title": 3}, "title"),
+        ({"sites.m1": 3}, "sites.m1"),
+        ({"sites": 3}, "sites"),
+        ({"arm": 3}, "arm"),
+        ({"links": 3}, "links"),
+        ({"dominance": 3}, "dominance"),
+        ({"dominance.m1": 3}, "dominance.m1"),
+        ({"dominance.m1.m2": "half"}, "dominance.m1.m2"),
+        ({"sites.m1.hands": 3}, "sites.m1.hands"),
+        ({"sites.m1.hands": [3]}, "sites.m1.hands[0]"),
+        ({"sites.recorder": {}}, "sites.recorder"),
+        ({"sites.Upper": {}}, "sites.Upper"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_with_its_path(overrides: dict[str, Any], path: str) -> None:
+    error = refused(overrides)
+    assert path in error.path
+    assert error.problem
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize(
+    ("key", "path"),
+    [
+        ("duration_s", "duration_s"),
+        ("link.delay_ms", "link.delay_ms"),
+        ("control.Kd", "control.Kd"),
+        ("arm.g_m_s2", "arm.g_m_s2"),
+        ("dominance.m1.m2", "dominance.m1.m2"),
+        ("sites.s.q0_rad", "sites.s.q0_rad"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused(key: str, path: str, value: float) -> None:
+    error = refused({key: value})
+    assert error.path == path
+    assert "finite" in error.problem
+
+
+def test_infinity_within_a_list_is_refused_too() -> None:
+    assert refused(["control.Gamma=[1, 1, inf, 1, 1]"]).path == "control.Gamma[2]"
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ({"m2": 0.5, "s": 0.4}, "sum to 0.9"),
+        ({"m2": 0.5, "s": 0.5 + 1e-8}, "sum to 1"),
+        ({"m2": 1.5, "s": -0.5}, "between 0 and 1"),
+        ({"m1": 0.2, "m2": 0.4, "s": 0.4}, "does not follow itself"),
+        ({}, "sum to 0"),
+    ],
+)
+def test_rows_of_alpha_are_checked(row: dict[str, float], words: str) -> None:
+    """Eq. (7), to 1e-9."""
+    error = refused({"dominance.m1": row})
+    assert error.path == "dominance.m1"
+    assert words in error.problem
+
+
+def test_rows_of_alpha_may_be_off_by_rounding() -> None:
+    assert load("paper", {"dominance.m1": {"m2": 1 / 3, "s": 2 / 3 + 1e-10}})
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ('name = "a"\n[sites.a]\n', "dominance"),
+        ('name = "a"\n[dominance]\n', "sites"),
+        ("[sites.a]\n[dominance]\n", "name"),
+        ('name = "a"\n[sites.a]\n[dominance]\na = {}', "sites"),
+        ('name = "a"\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }', "dominance.b"),
+        (
+            'name = "a"\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }',
+            "links.b->a.delay_ms",
+        ),
+    ],
+)
+def test_what_is_missing_is_named(text: str, path: str) -> None:
+    assert refused((), text).path == path
+
+
+def test_the_smallest_scenario_is_two_sites_and_a_delay() -> None:
+    text = 'name = "a"\n[link]\ndelay_ms = 3\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }'
+    scenario = parse(text)
+    assert (scenario.duration_s, scenario.sites["a"].rate_hz) == (20.0, 1000)
+
+
+@pytest.mark.parametrize(("start_s", "end_s"), [(3.0, 3.0), (5.0, 1.0)])
+def test_a_pulse_ends_after_it_begins(start_s: float, end_s: float) -> None:
+    pulse = {"kind": "pulse", "start_s": start_s, "end_s": end_s, "peak_nm": [1.0, 1.0]}
+    error = refused({"sites.m1.hands": [pulse]})
+    assert error.path == "sites.m1.hands[0].end_s"
+
+
+def test_an_arm_whose_inertia_is_singular_in_some_pose_is_refused() -> None:
+    """Property 1 does not hold for a massless first link with a point mass at the tip of the second."""
+    assert refused({"arm.lc1_m": 0.0, "arm.I1_kg_m2": 0.0}).path.endswith("arm")
+
+
+def test_text_that_is_no_toml_is_refused() -> None:
+    assert "is not TOML" in str(refused((), "name = "))
+    with pytest.raises(tomllib.TOMLDecodeError):
+        tomllib.loads("name = ")
+
+
+def test_files_are_read_by_path(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(template_text(), encoding="utf-8")
+    assert load(path) == load(str(path)) == parse(template_text())
+    scenario = load(path)
+    assert load(scenario) is scenario
+    assert load(scenario, {"seed": 5}).seed == 5
+
+
+def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
+    latin = tmp_path / "latin.toml"
+    latin.write_bytes("title = 'Stärke'".encode("latin-1"))
+    for path, words in (
+        (tmp_path / "none.toml", "No such file"),
+        (tmp_path, "directory"),
+        (latin, "not UTF-8"),
+    ):
+        with pytest.raises(ScenarioError, match=words) as error:
+            load(path)
+        assert str(path) in str(error.value)
+
+
+def test_a_name_that_is_not_shipped_is_refused_with_the_nearest() -> None:
+    with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
+        load("papre")
+    assert "./mine.toml" in str(error.value)

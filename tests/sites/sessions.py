@@ -1,0 +1,104 @@
+"""Whole sessions in one process: every member's real code on a local bus and a relayed clock."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgpack
+
+from recorder.recorder import Recorder
+from sites.process import Options, _Member
+from trilat_net.interrupt import Interrupt
+from trilat_net.log.reader import Log, open_log
+from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.messages import State
+from trilat_net.net.wire import decode, encode_state
+from trilat_net.scenario import Scenario
+from trilat_net.sim import virtual
+
+from .relay import Relay, RelayClock
+
+SESSION = "t"
+RECORDER_BOOT = 77
+Stranger = Callable[[Bus, RelayClock], None]
+
+
+@dataclass
+class Session:
+    """A session in one process: its parts before it runs, and what came of it."""
+
+    scenario: Scenario
+    path: Path
+    relay: Relay = field(default_factory=Relay)
+    network: LocalNetwork = field(default_factory=LocalNetwork)
+    members: dict[str, _Member] = field(default_factory=dict)
+    interrupts: dict[str, Interrupt] = field(default_factory=dict)
+    clocks: dict[str, RelayClock] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+
+    def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
+        """Adds a site."""
+        options = Options(SESSION, [], [], 10.0, needs_recorder)
+        self.interrupts[name] = Interrupt()
+
+        def run(clock: RelayClock) -> int:
+            bus = self.network.join()
+            try:
+                self.members[name] = _Member(
+                    self.scenario, name, options, bus, clock, self.interrupts[name], self.said.append
+                )
+                return self.members[name].live()
+            finally:
+                bus.close()
+
+        self.clocks[name] = self.relay.add(name, run, at_ns)
+
+    def recorder(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Adds the recorder."""
+
+        def run(clock: RelayClock) -> Sequence[str]:
+            bus = self.network.join()
+            try:
+                recorder = Recorder(bus, clock, SESSION, RECORDER_BOOT, self.path, stopped, self.said.append)
+                epoch = recorder.join(30.0)
+                assert epoch is not None
+                recording = recorder.record(epoch)
+                problem = recording.problem()
+                return [*recording.summary(), *([problem] if problem else [])]
+            finally:
+                bus.close()
+
+        self.relay.add("recorder", run)
+
+    def stranger(self, act: Stranger, at_ns: int = 0) -> None:
+        """Adds somebody who does what `act` does."""
+        self.relay.add(f"stranger {len(self.clocks)}", lambda clock: act(self.network.join(), clock), at_ns)
+
+    def run(self) -> Log:
+        """Runs it, and returns its log."""
+        self.relay.run()
+        return open_log(self.path)
+
+
+def computed(state: State) -> bytes:
+    """All that a tick computed, as bytes: what must not depend on when its samples came."""
+    return msgpack.packb(
+        [
+            *(state.site, state.tick, state.t_ns, state.mode, state.q, state.qd, state.q_des, state.qd_des),
+            *(state.tau, state.tau_x, state.theta_hat, state.used),
+        ]
+    )
+
+
+def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
+    """Per site what every tick computes in plain virtual time."""
+    ticks: dict[str, list[bytes]] = {name: [] for name in scenario.names}
+    for site, arrivals, output in virtual.run(scenario):
+        payload = encode_state(site.name, 0, site.peers, output, arrivals, 0, 0)
+        ticks[site.name].append(computed(decode(payload, State)))
+    return ticks
+
+
+def in_log(log: Log) -> dict[str, list[bytes]]:
+    """Per site what every tick of a log computed."""
+    return {name: [computed(state) for state in log[name].states] for name in log.sites}

@@ -1,0 +1,162 @@
+"""What comes in is a peer's sample, or it is counted by reason and dropped; nothing raises."""
+
+from collections import Counter
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sites.intake import Intake
+from trilat_net.core.link import AHEAD_LIMIT_NS
+from trilat_net.core.tick import MAX_ARRIVALS
+from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.messages import VERSION
+from trilat_net.net.wire import MAX_BYTES
+
+PEERS = ("m2", "s")
+BOOTS = (11, 12)
+RATE_HZ = 1000
+
+
+def payload(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
+    message = {
+        "v": VERSION,
+        "site": PEERS[peer],
+        "boot": BOOTS[peer],
+        "tick": tick,
+        "q": [0.1 * tick, 0.2],
+        "qd": [0.3, 0.4],
+    }
+    return msgpack.packb({**message, **changed})
+
+
+class Desk:
+    """An intake with two peers, and their ends of the rings."""
+
+    def __init__(self, capacity: int = 16_384, rates: tuple[int, int] = (RATE_HZ, RATE_HZ)) -> None:
+        network = LocalNetwork()
+        receiver, sender = network.join(), network.join()
+        rings: list[Inbox] = [receiver.inbox(name, capacity) for name in PEERS]
+        self.send = [sender.publisher(name) for name in PEERS]
+        self.dropped: Counter[str] = Counter()
+        self.intake = Intake(PEERS, rings, rates, self.dropped)
+        self.intake.admit(BOOTS)
+
+
+def test_samples_come_peer_by_peer_each_in_its_order() -> None:
+    desk = Desk()
+    for tick in (0, 1, 3, 2):
+        desk.send[1](payload(tick, 1))
+        desk.send[0](payload(tick, 0))
+    arrivals = desk.intake.drain(5_000_000)
+    assert [(a.peer, a.tick) for a in arrivals] == [(p, t) for p in (0, 1) for t in (0, 1, 3, 2)]
+    assert [a.q for a in arrivals[:2]] == [[0.0, 0.2], [0.1, 0.2]]
+    assert desk.intake.drain(6_000_000) == []
+
+
+def test_latency_is_now_minus_the_nominal_stamp_at_the_senders_rate() -> None:
+    desk = Desk(rates=(300, 1000))
+    desk.send[0](payload(100, 0))  # 333 333 333 ns
+    desk.send[1](payload(100, 1))  # 100 ms
+    assert [a.latency_us for a in desk.intake.drain(400_000_000)] == [66_666, 300_000]
+
+
+REFUSED = {
+    "malformed": [
+        b"",
+        b"\xc1",
+        b"garbage",
+        msgpack.packb([1, 2]),
+        payload(q="text"),
+        payload(q=[1.0]),
+        payload(qd=[1.0, 2.0, 3.0]),
+        payload(q=[None, 1.0]),
+        payload(tick=-1),
+        payload(tick=2**40),
+        payload(tick=1.5),
+        payload(boot=-1),
+        b"\x91" * 10_000,
+    ],
+    "oversized": [payload(padding="x" * MAX_BYTES), bytes(MAX_BYTES + 1)],
+    "version": [payload(v=VERSION + 1), payload(v=0)],
+    "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],
+    "stranger": [payload(boot=99), payload(site="s"), payload(site="nobody")],
+    "ahead": [payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1), payload(tick=2**40 - 1)],
+}
+
+
+@pytest.mark.parametrize(("reason", "sent"), [(r, p) for r, ps in REFUSED.items() for p in ps])
+def test_what_is_no_sample_of_a_peer_is_counted_by_reason_and_dropped(reason: str, sent: bytes) -> None:
+    desk = Desk()
+    desk.send[0](payload(0))
+    desk.send[0](sent)
+    desk.send[0](payload(1))
+    assert [a.tick for a in desk.intake.drain(0)] == [0, 1]
+    assert desk.dropped == {reason: 1}
+
+
+@given(st.lists(st.binary(max_size=200), max_size=20))
+def test_no_bytes_raise(sent: list[bytes]) -> None:
+    desk = Desk()
+    for junk in sent:
+        desk.send[0](junk)
+    assert desk.intake.drain(0) == []
+    assert sum(desk.dropped.values()) == len(sent)
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "more"]),
+        st.recursive(
+            st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
+            lambda inner: (
+                st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+            ),
+            max_leaves=6,
+        ),
+    )
+)
+def test_no_field_of_any_type_raises(changed: dict[str, Any]) -> None:
+    desk = Desk()
+    desk.send[0](payload(**{"tick": 3, **changed}))
+    arrivals = desk.intake.drain(10_000_000_000)
+    assert len(arrivals) + sum(desk.dropped.values()) - desk.dropped["missing"] == 1
+
+
+def test_the_last_stamp_that_is_not_too_far_ahead_is_taken() -> None:
+    desk = Desk()
+    desk.send[0](payload(AHEAD_LIMIT_NS // 1_000_000))
+    assert [a.tick for a in desk.intake.drain(0)] == [10_000]
+
+
+def test_one_tick_takes_a_bounded_number_and_the_rest_waits_in_order() -> None:
+    desk = Desk()
+    for tick in range(MAX_ARRIVALS + 10):
+        desk.send[0](payload(tick, 0))
+    for tick in range(5):
+        desk.send[1](payload(tick, 1))
+    first = desk.intake.drain(10_000_000_000)
+    assert [(a.peer, a.tick) for a in first] == [(0, tick) for tick in range(MAX_ARRIVALS)]
+    rest = desk.intake.drain(10_000_000_000)
+    assert [(a.peer, a.tick) for a in rest] == [
+        *((0, tick) for tick in range(MAX_ARRIVALS, MAX_ARRIVALS + 10)),
+        *((1, tick) for tick in range(5)),
+    ]
+
+
+def test_what_a_ring_lost_is_counted_as_missing() -> None:
+    desk = Desk(capacity=4)
+    for tick in range(10):
+        desk.send[0](payload(tick, 0))
+    assert [a.tick for a in desk.intake.drain(1_000_000_000)] == [6, 7, 8, 9]
+    assert desk.dropped == {"missing": 6}
+
+
+def test_duplicates_are_handed_on_because_the_record_lists_them() -> None:
+    desk = Desk()
+    for tick in (0, 1, 1, 0):
+        desk.send[0](payload(tick, 0))
+    assert [a.tick for a in desk.intake.drain(1_000_000_000)] == [0, 1, 1, 0]
+    assert not desk.dropped

@@ -1,0 +1,242 @@
+"""The live loop: an absolute grid, lateness that enters no formula, and the numbers of virtual time."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from sites.intake import Intake
+from sites.loop import Ports, run_loop
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Mode
+from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.messages import LinkStats, State
+from trilat_net.net.session import Epoch
+from trilat_net.net.stats import LoopStats
+from trilat_net.net.wire import decode
+from trilat_net.scenario import Scenario, load
+
+from .relay import RelayClock
+from .sessions import SESSION, Session, in_log, in_virtual_time
+
+EPOCH = Epoch(5_000_000_123, 0, {})
+
+
+class LateClock(ManualClock):
+    """Wakes late where it is told to; remembers the deadlines it was asked for."""
+
+    def __init__(self, oversleep: dict[int, int] | None = None) -> None:
+        super().__init__()
+        self.deadlines: list[int] = []
+        self._oversleep = oversleep or {}
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        late_ns = self._oversleep.get(len(self.deadlines), 0)
+        self.deadlines.append(deadline_ns)
+        super().sleep_until(deadline_ns + late_ns)
+
+
+class Alone:
+    """One site's loop without peers who speak."""
+
+    def __init__(self, clock: ManualClock, overrides: dict[str, object] | None = None) -> None:
+        scenario = load("two_sites", {"duration_s": 2.0, **(overrides or {})})
+        self.site = Site(scenario.setup("m"))
+        self.stats = LoopStats(self.site, 1, [scenario.sites["s"].rate_hz])
+        self.states: list[State] = []
+        self.links: list[LinkStats] = []
+        self.slack: list[tuple[int, int]] = []
+        self.stopped: Callable[[], bool] = lambda: False
+        self._clock, self._ticks = clock, scenario.ticks("m")
+
+    def run(self) -> object:
+        ports = Ports(
+            self._clock,
+            Intake((), (), (), self.stats.dropped),
+            lambda payload: self.states.append(decode(payload, State)),
+            lambda payload: self.links.append(decode(payload, LinkStats)),
+            lambda k, t_ns: self.slack.append((k, t_ns)),
+            lambda: self.stopped(),
+        )
+        return run_loop(self.site, 1, self._ticks, EPOCH, self.stats, ports)
+
+
+@pytest.mark.parametrize("rate_hz", [100, 333, 1000, 1024, 3000])
+def test_ticks_lie_on_an_absolute_grid_at_any_rate(rate_hz: int) -> None:
+    clock = LateClock()
+    Alone(clock, {"rate_hz": rate_hz}).run()
+    assert len(clock.deadlines) == 2 * rate_hz
+    assert clock.deadlines[0] == EPOCH.mono_ns
+    assert clock.deadlines[rate_hz] == EPOCH.mono_ns + 1_000_000_000  # one second, exactly: no drift
+    for k, deadline_ns in enumerate(clock.deadlines):
+        off = (deadline_ns - EPOCH.mono_ns) * rate_hz - k * 1_000_000_000
+        assert -rate_hz < off <= 0  # rounded down, by less than a nanosecond
+
+
+def test_missed_ticks_run_back_to_back_and_are_counted() -> None:
+    alone = Alone(LateClock({5: 7_300_000}))
+    alone.run()
+    late = [state.late_us for state in alone.states]
+    assert late[:14] == [0] * 5 + [7300, 6300, 5300, 4300, 3300, 2300, 1300, 300, 0]
+    assert not any(late[14:])
+    assert [state.tick for state in alone.states] == list(range(2000))
+    assert alone.stats.overruns == 7
+    assert [link.late_max_us for link in alone.links[:3]] == [0, 7300, 0]
+
+
+def test_lateness_enters_no_formula() -> None:
+    prompt, late = Alone(LateClock()), Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
+    prompt.run()
+    late.run()
+    assert [msgspec.structs.replace(state, late_us=0) for state in late.states] == prompt.states
+    assert max(state.late_us for state in late.states) == 400_000
+
+
+def test_statistics_and_slack_come_ten_times_a_second_after_the_tick() -> None:
+    alone = Alone(LateClock())
+    alone.run()
+    assert [link.tick for link in alone.links] == list(range(0, 2000, 100))
+    assert alone.slack == [(link.tick, link.t_ns) for link in alone.links]
+
+
+def test_a_loop_that_is_stopped_makes_no_further_tick() -> None:
+    alone = Alone(LateClock())
+    alone.stopped = lambda: len(alone.states) >= 30
+    output = alone.run()
+    assert [state.tick for state in alone.states] == list(range(30))
+    assert output.tick == 29
+    none = Alone(LateClock())
+    none.stopped = lambda: True
+    assert none.run() is None
+    assert none.states == []
+
+
+def test_a_run_that_leaves_its_limits_ends_with_a_record_that_says_so() -> None:
+    alone = Alone(LateClock(), {"limits.qd_limit_rad_s": 0.05, "sites.m.q0_rad": [0.4, -0.2]})
+    output = alone.run()
+    assert output.mode is Mode.DIVERGED
+    assert [state.mode for state in alone.states] == ["run"] * (len(alone.states) - 1) + ["diverged"]
+    assert 0 < len(alone.states) < 2000
+
+
+SCENARIOS = {
+    "paper": {"duration_s": 3.0},
+    "asymmetric": {"duration_s": 2.0},
+    "two_sites": {"duration_s": 1.0, "sites.m.rate_hz": 333, "sites.s.rate_hz": 500},
+    "paper_rods": {"duration_s": 1.0, "scheme": "digital", "link.delay_ms": 0},
+}
+
+
+def session_of(scenario: Scenario, folder: Path) -> Session:
+    session = Session(scenario, folder / "run.mcap")
+    session.recorder()
+    for name in scenario.names:
+        session.site(name)
+    return session
+
+
+@pytest.mark.usefixtures("unprepared")
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
+    scenario = load(name, SCENARIOS[name])
+    log = session_of(scenario, tmp_path).run()
+    assert log.complete
+    assert [len(log[site]) for site in log.sites] == [scenario.ticks(site) for site in scenario.names]
+    assert in_log(log) == in_virtual_time(scenario)
+    assert verify(log).passed
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
+    scenario = load("paper", {"duration_s": 2.0})
+    session = session_of(scenario, tmp_path)
+    session.clocks["m2"].stall(3_000_000_000, 190_000_000)
+    log = session.run()
+    assert max(log["m2"].late_us) > 150_000
+    assert in_log(log) == in_virtual_time(scenario)
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_stall_beyond_the_delay_changes_nothing_before_the_first_late_sample(tmp_path: Path) -> None:
+    scenario = load("paper", {"duration_s": 2.0})
+    session = session_of(scenario, tmp_path)
+    session.clocks["m2"].stall(3_000_000_000, 300_000_000)
+    log = session.run()
+    twins = compare_with_virtual(log)
+    assert twins.fed.first is None
+    assert twins.fed.identical == twins.fed.records == 6000
+    assert twins.late
+    first = twins.late[0]
+    assert first.peer == "m2"
+    live, plain = in_log(log), in_virtual_time(scenario)
+    for site in log.sites:
+        assert live[site][: first.due_tick] == plain[site][: first.due_tick]
+    assert live != plain
+    assert verify(log).passed
+
+
+def shout(bus: Bus, clock: RelayClock) -> None:
+    """Publishes what is no message on every key of a session, for as long as it may run."""
+    targets = [
+        bus.publisher(topics.key(SESSION, member, channel))
+        for member in ("m1", "m2", "s", "recorder", "nobody")
+        for channel in (topics.STATE, topics.EVENT, topics.LINK, "more")
+    ]
+    for n in range(100):
+        for publish in targets:
+            publish((b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000)[n % 5])
+        clock.sleep_until(clock.monotonic_ns() + 17_000_000)
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Path) -> None:
+    scenario = load("paper", {"duration_s": 1.0})
+    session = session_of(scenario, tmp_path)
+    session.stranger(shout)
+    session.stranger(lambda bus, _: bus.announce(f"trilat/{SESSION}/m1/alive/no-number"))
+    session.stranger(lambda bus, _: bus.close(), at_ns=2_500_000_000)
+    log = session.run()
+    assert in_log(log) == in_virtual_time(scenario)
+    dropped = log.link_stats("m1")[-1].dropped
+    assert dropped["malformed"] > 0
+    assert dropped["oversized"] > 0
+    assert int(log.accounts["dropped: malformed"]) > 0
+    assert int(log.accounts["dropped: oversized"]) > 0
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_token_that_is_no_number_does_not_end_a_loop(tmp_path: Path) -> None:
+    scenario = load("two_sites", {"duration_s": 1.0})
+    session = session_of(scenario, tmp_path)
+
+    def come_and_go(bus: Bus, clock: RelayClock) -> None:
+        bus.announce(f"trilat/{SESSION}/m/alive/no-number")
+        clock.sleep_until(clock.monotonic_ns() + 300_000_000)
+        bus.close()
+
+    session.stranger(come_and_go, at_ns=2_000_000_000)
+    assert session.run().complete
+    assert session.relay.results["m"] == session.relay.results["s"] == 0
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_site_that_is_asked_to_end_ends_in_order_and_its_exit_code_says_so(tmp_path: Path) -> None:
+    scenario = load("two_sites", {"duration_s": 2.0})
+    session = session_of(scenario, tmp_path)
+
+    def interrupt(_bus: Bus, _clock: RelayClock) -> None:
+        session.interrupts["s"].number = 2
+
+    session.stranger(interrupt, at_ns=2_600_000_000)
+    log = session.run()
+    assert (session.relay.results["m"], session.relay.results["s"]) == (0, 130)
+    assert len(log["m"]) == 2000
+    ticks = len(log["s"])
+    assert 0 < ticks < 2000
+    assert [e.ticks for e in log.events if e.kind == "end" and e.member == "s"] == [ticks]
+    assert log.complete
+    assert verify(log).passed

@@ -1,0 +1,82 @@
+"""Every step warns and goes on: what a process obtained is said, whatever it was."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import json, os, sys
+from sites import realtime
+
+{before}
+obtained = realtime.prepare({cpu})
+import gc
+print(json.dumps([obtained, gc.isenabled(), sorted(os.sched_getaffinity(0))]))
+"""
+
+
+def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool, list[int]]:
+    """What a process of its own obtains: it would not be given back."""
+    program = PROGRAM.format(before=before, cpu=cpu)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return tuple(json.loads(done.stdout))
+
+
+STEPS = ["affinity", "timer_slack", "memory", "scheduling", "collector"]
+
+
+def test_every_step_says_what_it_obtained() -> None:
+    obtained, collecting, _ = prepared()
+    assert list(obtained) == STEPS
+    assert all(obtained.values())
+    assert not collecting
+    assert obtained["collector"] == "frozen and off"
+
+
+def test_a_process_stays_on_its_processor() -> None:
+    _, _, (cpu, *_) = prepared()
+    obtained, _, cpus = prepared(cpu)
+    assert cpus == [cpu]
+    assert obtained["affinity"] == f"cpu {cpu}"
+
+
+@pytest.mark.parametrize("cpu", [-1, 1023, 100_000, 2**40, 2**80])
+def test_a_processor_that_is_not_there_is_a_warning(cpu: int) -> None:
+    obtained, _, _ = prepared(cpu)
+    assert obtained["affinity"].startswith("not obtained (")
+
+
+def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
+    refuse = (
+        "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
+        "os.sched_setscheduler = os.setpriority = realtime._libc_call = refuse"
+    )
+    obtained, collecting, _ = prepared(before=refuse)
+    assert obtained["scheduling"].startswith("normal (")
+    assert obtained["memory"] == obtained["timer_slack"] == "not obtained (Operation not permitted)"
+    assert not collecting
+
+
+def test_another_priority_is_better_than_none() -> None:
+    refuse = (
+        "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
+        "os.sched_setscheduler = refuse\n"
+        "os.setpriority = lambda *_: None"
+    )
+    assert prepared(before=refuse)[0]["scheduling"] == "nice -10 (SCHED_FIFO was not permitted)"
+
+
+@pytest.mark.parametrize("platform", ["darwin", "win32"])
+def test_other_platforms_have_less_and_go_on(platform: str) -> None:
+    lack = (
+        f"sys.platform = {platform!r}\n"
+        "for name in ('sched_setaffinity', 'sched_setscheduler', 'SCHED_FIFO', 'setpriority'):\n"
+        "    delattr(os, name)"
+    )
+    obtained, _, _ = prepared(0, before=lack)
+    assert obtained["affinity"] == "not obtained (not on this platform)"
+    assert obtained["memory"] == "not obtained (not on this platform)"
+    assert obtained["scheduling"].startswith("normal (")
