@@ -63,6 +63,7 @@ def test_the_template_is_valid_and_its_defaults_are_what_it_says() -> None:
 
 
 number = st.floats(0.001, 1e6)
+texts = st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]) | st.text(max_size=60)
 changes = st.fixed_dictionaries(
     {},
     optional={
@@ -76,7 +77,7 @@ changes = st.fixed_dictionaries(
         "seed": st.integers(0, 2**63 - 1),
         "scheme": st.sampled_from(["second_order", "digital"]),
         "link.delay_ms": st.floats(0, 10_000),
-        "title": st.text(max_size=60),
+        "title": texts,
         "about": st.text(max_size=60)
         | st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]),
         "assumed": st.lists(st.text(max_size=20), max_size=3),
@@ -196,7 +197,7 @@ def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
         ("sites.m1.controls", "control"),
         ("sites.m1.control.Kpp", "Kp"),
         ("sites.m1.arm.l1", "l1_m"),
-        ("dominance.m3", "m1"),
+        ("dominance.m3", "m2"),
         ("dominance.m1.m22", "m2"),
         ("links.m1->ss", "m1->s"),
         ("links.m1->s.delay", "delay_ms"),

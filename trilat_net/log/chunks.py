@@ -71,7 +71,11 @@ class Walk:
             if record is None:
                 return
             if isinstance(record, Chunk):
-                yield from self._in_chunk(self._uncompressed(record))
+                data = self._uncompressed(record)
+                try:
+                    yield from self._in_chunk(data)
+                except (struct.error, UnicodeDecodeError) as error:
+                    raise LogError(f"{self._name}: a chunk is damaged: {error}") from None
             elif isinstance(record, Message):
                 yield Item(self._topics.get(record.channel_id, ""), record.data, record.log_time)
             elif isinstance(record, Channel):
@@ -84,14 +88,22 @@ class Walk:
                 self.complete = True
 
     def _uncompressed(self, chunk: Chunk) -> bytes:
-        if chunk.compression == "zstd":
-            data = zstandard.ZstdDecompressor().decompress(chunk.data, chunk.uncompressed_size)
-        elif chunk.compression == "lz4":
-            data = lz4.frame.decompress(chunk.data)
-        else:
-            data = chunk.data
+        """Returns a chunk's records.
+
+        Raises:
+            LogError: the chunk is damaged.
+        """
+        try:
+            if chunk.compression == "zstd":
+                data = zstandard.ZstdDecompressor().decompress(chunk.data, chunk.uncompressed_size)
+            elif chunk.compression == "lz4":
+                data = lz4.frame.decompress(chunk.data)
+            else:
+                data = chunk.data
+        except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+            raise LogError(f"{self._name}: a chunk is damaged: {error}") from None
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-            raise LogError(f"{self._name}: a chunk is damaged (its CRC differs)")
+            raise LogError(f"{self._name}: a chunk is damaged: its CRC differs")
         return data
 
     def _in_chunk(self, data: bytes) -> Iterator[Item]:
@@ -102,7 +114,7 @@ class Walk:
             if opcode == _OP_MESSAGE:
                 channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, offset)
                 payload = data[offset + _MESSAGE.size : offset + length]
-                yield Item(self._topics[channel], payload, log_time_ns)
+                yield Item(self._topics.get(channel, ""), payload, log_time_ns)
             elif opcode == _OP_CHANNEL:
                 channel, _, size = _CHANNEL.unpack_from(data, offset)
                 start = offset + _CHANNEL.size

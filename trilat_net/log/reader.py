@@ -170,9 +170,10 @@ class Log:
         payloads: dict[str, list[bytes]] = {}
         for item in walk.messages():
             payloads.setdefault(item.topic, []).append(item.payload)
-        if SESSION not in walk.metadata or SCENARIO not in walk.attachments:
-            raise LogError(f"{source}: is an MCAP file, but no log of trilat-net")
-        self.session = walk.metadata[SESSION]
+        self.session = walk.metadata.get(SESSION, {})
+        lacking = {"session", "driver"} - self.session.keys() or {SCENARIO} - walk.attachments.keys()
+        if lacking:
+            raise LogError(f"{source}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}")
         try:
             self.scenario: Scenario = parse(walk.attachments[SCENARIO].decode(), f"{source}: scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
