@@ -1,40 +1,18 @@
 """A log against virtual time: fed with its arrivals, and plain (the flagship corollary of L2)."""
 
-import io
-from collections.abc import Mapping
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.log_editing import edited, opened, recorded
+from tests.replay.deliveries import DUE, PEERS, SCENARIO, delivered
 from trilat_net.experiment import compare_with_virtual, twin_without_hands
 from trilat_net.log.reader import Log
 from trilat_net.replay.comparison import late_samples, schedule
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
-from trilat_net.sim.network import RecordedNetwork
-
-SCENARIO = load("free", {"duration_s": 0.12, "link.delay_ms": 20.0})
-PEERS = {name: SCENARIO.peers(name) for name in SCENARIO.names}
-DUE = 20  # ticks after its stamp
 
 
-def delivered(delays: Mapping[tuple[str, int, int], int]) -> Log:
-    """A log of a run in which some samples were under way for other than one tick.
-
-    Args:
-        delays: (receiver, index of the peer, tick of the sample) -> ticks under way.
-    """
-    at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
-    for receiver in SCENARIO.names:
-        for peer in (0, 1):
-            for tick in range(120):
-                arrives = tick + delays.get((receiver, peer, tick), 1)
-                at[receiver].setdefault(arrives, []).append([peer, tick, 0])
-    stream = io.BytesIO()
-    virtual.record(SCENARIO, stream, RecordedNetwork(at, PEERS))
-    return opened(stream.getvalue())
+def opened_delivered(delays: dict[tuple[str, int, int], int]) -> Log:
+    return opened(delivered(delays))
 
 
 links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integers(0, 80))
@@ -45,7 +23,7 @@ links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integer
 def test_a_run_without_late_samples_equals_plain_virtual_time(
     delays: dict[tuple[str, int, int], int],
 ) -> None:
-    twins = compare_with_virtual(delivered(delays))
+    twins = compare_with_virtual(opened_delivered(delays))
     assert twins.late == []
     assert twins.fed == (360, 360, None)
     assert twins.plain == (360, 360, None)
@@ -56,7 +34,7 @@ def test_a_run_without_late_samples_equals_plain_virtual_time(
 def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
     delays: dict[tuple[str, int, int], int],
 ) -> None:
-    log = delivered(delays)
+    log = opened_delivered(delays)
     twins = compare_with_virtual(log)
     assert twins.fed == (360, 360, None)
     expected = {(receiver, peer, tick) for (receiver, peer, tick), way in delays.items() if way > DUE}
@@ -66,7 +44,7 @@ def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
 
 
 def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
-    log = delivered({("m2", 1, 40): 25})
+    log = opened_delivered({("m2", 1, 40): 25})
     (late,) = late_samples(log)
     assert late == ("m2", "s", 40, 60, 65)
     assert str(late) == "sample 40 of s was due at tick 60 of m2 and came at tick 65"
@@ -78,7 +56,7 @@ def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
 
 def test_a_late_sample_that_a_newer_one_overtakes_at_once_is_counted_and_harmless_later() -> None:
     """It is missed for one tick; from then on the newest is in use as ever, but the state has moved."""
-    twins = compare_with_virtual(delivered({("m1", 0, 30): 39}))
+    twins = compare_with_virtual(opened_delivered({("m1", 0, 30): 39}))
     assert [sample.tick for sample in twins.late] == [30]
     assert twins.plain.first is not None
     assert twins.plain.first[:2] == ("m1", 50)

@@ -120,7 +120,7 @@ def test_no_bytes_raise(sent: list[bytes]) -> None:
 )
 def test_no_field_of_any_type_raises(changed: dict[str, Any]) -> None:
     desk = Desk()
-    desk.send[0](payload(**{"tick": 3, **changed}))
+    desk.send[0](msgpack.packb({**msgpack.unpackb(payload(3)), **changed}))
     arrivals = desk.intake.drain(10_000_000_000)
     assert len(arrivals) + sum(desk.dropped.values()) - desk.dropped["missing"] == 1
 

@@ -22,6 +22,7 @@ SESSION, ACCOUNTS, SCENARIO = "trilat.session", "trilat.accounts", "scenario.tom
 SCHEMAS: dict[str, type[msgspec.Struct]] = {topics.STATE: State, topics.LINK: LinkStats, topics.EVENT: Event}
 
 _CHUNK_BYTES = 1 << 20
+_LAST_NS = (1 << 64) - 1  # of the file's time stamps; a stranger's may be anything
 
 
 class LogWriter:
@@ -111,7 +112,7 @@ class LogWriter:
                 channel_id=self._channels[key],
                 log_time=log_time_ns,
                 data=payload,
-                publish_time=max(0, self._epoch_unix_ns + t_ns),
+                publish_time=min(max(0, self._epoch_unix_ns + t_ns), _LAST_NS),
                 sequence=max(0, tick) & 0xFFFFFFFF,
             )
         except OSError as error:

@@ -1,0 +1,378 @@
+"""What the recorder writes, what it refuses and counts, and what it knows is missing."""
+
+import io
+from pathlib import Path
+
+import msgpack
+import msgspec
+import pytest
+from mcap.reader import make_reader
+
+from recorder import tap as tap_module
+from recorder.recorder import Recorder
+from recorder.recording import SETTLE_NS, Recording
+from recorder.tap import Tap
+from tests.sites.relay import Relay, RelayClock
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Tick
+from trilat_net.errors import UsageError
+from trilat_net.experiment import verify
+from trilat_net.log.reader import Log, open_log
+from trilat_net.net import topics
+from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.session import Epoch, Voice
+from trilat_net.net.stats import LoopStats
+from trilat_net.net.wire import Event, Info, decode, encode, encode_state
+from trilat_net.scenario import load
+
+SESSION = "t"
+MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
+BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
+EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
+SCENARIO = load("two_sites", {"duration_s": 0.05})
+TICKS = SCENARIO.ticks("m")
+
+
+def states(name: str, boot: int | None = None) -> list[bytes]:
+    """The records of a site that hears nobody."""
+    site = Site(SCENARIO.setup(name))
+    boot = BOOTS[name] if boot is None else boot
+    return [encode_state(name, boot, site.peers, site.step(Tick(k)), [], 0, 0) for k in range(TICKS)]
+
+
+def statistics(name: str) -> bytes:
+    site = Site(SCENARIO.setup(name))
+    return encode(LoopStats(site, BOOTS[name], [1000]).take(site.step(Tick(0))))
+
+
+def end(name: str, ticks: int = TICKS, boot: int | None = None) -> bytes:
+    boot = BOOTS[name] if boot is None else boot
+    return encode(Event(member=name, boot=boot, kind="end", text="done", t_ns=50_000_000, ticks=ticks))
+
+
+class Desk:
+    """A recording into memory, with a clock that the test moves."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock(MONO_NS)
+        network = LocalNetwork()
+        bus, listener = network.join(), network.join()
+        self._heard: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.EVENT))
+        info = Info(
+            member=topics.RECORDER,
+            boot=BOOTS[topics.RECORDER],
+            scenario_sha256="",
+            scenario="",
+            host="h",
+            clock="c",
+            fingerprint="f",
+        )
+        self.stream = io.BytesIO()
+        self.tap = Tap(self.clock)
+        self.recording = Recording(self.stream, SCENARIO, SESSION, EPOCH, Voice(bus, SESSION, info))
+
+    def take(self, name: str, channel: str, *payloads: bytes) -> None:
+        """Messages come in, a millisecond after each other, and are written."""
+        for payload in payloads:
+            self.clock.sleep_until(self.clock.monotonic_ns() + 1_000_000)
+            self.tap.take(topics.key(SESSION, name, channel), payload)
+        self.write()
+
+    def write(self) -> None:
+        self.recording.write(self.tap, self.clock.monotonic_ns())
+
+    def whole(self, *names: str) -> None:
+        """Sites that send every record and say so."""
+        for name in names:
+            self.take(name, topics.STATE, *states(name))
+            self.take(name, topics.EVENT, end(name))
+
+    def over(self) -> bool:
+        return self.recording.over(self.clock.monotonic_ns())
+
+    def stored(self) -> list[tuple[str, int]]:
+        """What the recorder said it has: (site, ticks)."""
+        heard = []
+        while (message := self._heard.poll()) is not None:
+            event = decode(message[1], Event)
+            assert event.kind == "stored"
+            heard.append((event.about, event.ticks))
+        return heard
+
+    def log(self) -> Log:
+        self.recording.finish(self.tap)
+        self.stream.seek(0)
+        return open_log(self.stream)
+
+
+def test_payloads_stand_in_the_file_byte_for_byte() -> None:
+    desk = Desk()
+    desk.whole("m", "s")
+    desk.take("m", topics.LINK, statistics("m"))
+    desk.log()
+    written: dict[str, list[bytes]] = {}
+    for _, channel, message in make_reader(io.BytesIO(desk.stream.getvalue())).iter_messages():
+        written.setdefault(channel.topic, []).append(message.data)
+    assert written["/trilat/t/m/state"] == states("m")
+    assert written["/trilat/t/s/state"] == states("s")
+    assert written["/trilat/t/m/link"] == [statistics("m")]
+    assert written["/trilat/t/s/event"] == [end("s")]
+
+
+def test_log_time_is_arrival_and_publish_time_is_nominal() -> None:
+    desk = Desk()
+    desk.take("m", topics.STATE, *states("m"))
+    desk.log()
+    messages = [m for _, _, m in make_reader(io.BytesIO(desk.stream.getvalue())).iter_messages()]
+    assert [m.log_time - UNIX_NS for m in messages] == [1_000_000 * (k + 1) for k in range(TICKS)]
+    assert [m.publish_time - UNIX_NS for m in messages] == [1_000_000 * k for k in range(TICKS)]
+    assert [m.sequence for m in messages] == list(range(TICKS))
+
+
+def test_what_was_recorded_can_be_executed_again() -> None:
+    desk = Desk()
+    desk.whole("m", "s")
+    log = desk.log()
+    assert log.complete
+    assert (log.driver, log.session["session"]) == ("live", SESSION)
+    verdict = verify(log)
+    assert (verdict.identical, verdict.records) == (2 * TICKS, 2 * TICKS)
+
+
+STRANGERS = {
+    "another start of the site": ("m", topics.STATE, states("m", boot=99)[3]),
+    "another site's record": ("m", topics.STATE, states("s")[3]),
+    "an unknown site": ("nobody", topics.STATE, states("m")[3]),
+    "an unknown member's event": ("nobody", topics.EVENT, end("m")),
+    "an end of another start": ("m", topics.EVENT, end("m", boot=99)),
+    "an end in the recorder's name": (topics.RECORDER, topics.EVENT, end("m")),
+    "another site's statistics": ("m", topics.LINK, statistics("s")),
+}
+
+
+@pytest.mark.parametrize(("name", "channel", "payload"), STRANGERS.values(), ids=STRANGERS.keys())
+def test_strangers_are_counted_and_dropped(name: str, channel: str, payload: bytes) -> None:
+    desk = Desk()
+    desk.take(name, channel, payload)
+    assert desk.recording.dropped == {"stranger": 1}
+    assert desk.stored() == []
+    desk.whole("m", "s")
+    log = desk.log()
+    assert verify(log).identical == 2 * TICKS
+    assert log.accounts["dropped: stranger"] == "1"
+
+
+@pytest.mark.parametrize("channel", [topics.STATE, topics.LINK, topics.EVENT])
+@pytest.mark.parametrize(
+    ("reason", "payload"),
+    [("malformed", b""), ("malformed", b"\xc1"), ("malformed", b"\x80"), ("oversized", bytes(70_000))],
+)
+def test_malformed_payloads_are_counted_and_dropped(channel: str, reason: str, payload: bytes) -> None:
+    desk = Desk()
+    desk.take("m", channel, payload)
+    desk.whole("m", "s")
+    assert desk.recording.dropped[reason] == 1
+    assert desk.log().accounts[f"dropped: {reason}"] == "1"
+    assert desk.recording.problem() is None
+
+
+@pytest.mark.parametrize("t_ns", [-(2**63), -1, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("kind", ["state", "link", "event"])
+def test_no_time_stamp_of_any_size_ends_the_recording(kind: str, t_ns: int) -> None:
+    desk = Desk()
+    message = {"state": states("m")[0], "link": statistics("m"), "event": end("m")}[kind]
+    fields = msgpack.unpackb(message)
+    desk.take("m", kind, msgpack.packb({**fields, "t_ns": t_ns}))
+    desk.whole("s")
+    assert len(desk.log()["s"]) == TICKS
+
+
+def test_duplicates_are_written_once_and_counted() -> None:
+    desk = Desk()
+    desk.take("m", topics.STATE, *states("m"), *states("m")[:7])
+    log = desk.log()
+    assert len(log["m"]) == TICKS
+    assert "duplicate 7" in log.accounts["/m"]
+    assert desk.recording.dropped["duplicate"] == 7
+
+
+def test_gaps_are_counted_named_and_a_problem() -> None:
+    desk = Desk()
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:10], *records[13:30], *records[31:-2])
+    desk.take("m", topics.EVENT, end("m"))
+    desk.whole("s")
+    log = desk.log()
+    assert desk.recording.problem() == f"6 of {TICKS} records of m are missing"
+    assert "missing 6" in log.accounts["/m"]
+    assert "largest gap 3" in log.accounts["/m"]
+    assert f"gaps 10-12 30-30 {TICKS - 2}-{TICKS - 1}" in log.accounts["/m"]
+    assert any("m: 44 of 50 records, 6 missing" in line for line in desk.recording.summary())
+
+
+def test_reordered_records_are_no_gap() -> None:
+    desk = Desk()
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:5], records[6], records[5], *records[7:])
+    desk.take("m", topics.EVENT, end("m"))
+    desk.whole("s")
+    assert desk.stored() == [("m", TICKS), ("s", TICKS)]
+    assert desk.recording.problem() is None
+    assert verify(desk.log()).identical == 2 * TICKS
+
+
+def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap_module, "CAPACITY", 20)
+    desk = Desk()
+    for payload in states("m"):
+        desk.tap.take(topics.key(SESSION, "m", topics.STATE), payload)
+    log = desk.log()
+    assert len(log["m"]) == 20
+    assert log.accounts["overflowed"] == str(TICKS - 20)
+    assert any(str(TICKS - 20) in line and "the queue was full" in line for line in desk.recording.summary())
+
+
+def test_stored_is_said_only_when_every_record_is_in() -> None:
+    desk = Desk()
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:-1])
+    desk.take("m", topics.EVENT, end("m"))
+    assert desk.stored() == []
+    desk.take("m", topics.STATE, records[-1])
+    assert desk.stored() == [("m", TICKS)]
+    desk.write()
+    assert desk.stored() == []
+    assert [e.about for e in desk.log().events if e.kind == "stored"] == ["m"]
+
+
+def test_a_recording_is_over_when_every_site_has_ended_with_all_its_records() -> None:
+    desk = Desk()
+    assert not desk.over()
+    desk.whole("m")
+    assert not desk.over()
+    desk.whole("s")
+    assert desk.over()
+    assert desk.recording.problem() is None
+
+
+def alive(name: str, boot: int | str) -> str:
+    return topics.key(SESSION, name, topics.ALIVE) + f"/{boot}"
+
+
+def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> None:
+    desk = Desk()
+    desk.whole("m")
+    desk.take("s", topics.STATE, *states("s")[:20])
+    desk.recording.presence(alive("s", BOOTS["s"]), False)
+    assert not desk.over()
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + SETTLE_NS + 1)
+    assert desk.over()
+    assert desk.recording.problem() == "s disappeared after 20 records"
+    log = desk.log()
+    assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
+
+
+def test_a_site_that_comes_back_in_time_goes_on() -> None:
+    desk = Desk()
+    desk.whole("m")
+    desk.recording.presence(alive("s", BOOTS["s"]), False)
+    assert not desk.over()
+    desk.recording.presence(alive("s", BOOTS["s"]), True)
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    assert not desk.over()
+    desk.whole("s")
+    assert desk.over()
+
+
+@pytest.mark.parametrize("key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"])
+def test_tokens_of_others_end_nothing(key: str) -> None:
+    desk = Desk()
+    desk.whole("m")
+    desk.recording.presence(key, False)
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    desk.over()
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    assert not desk.over()
+
+
+def test_a_crash_leaves_all_that_was_flushed() -> None:
+    desk = Desk()
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:30])
+    desk.recording.flush()
+    desk.take("m", topics.STATE, *records[30:])
+    log = open_log(io.BytesIO(desk.stream.getvalue()))  # nobody finishes
+    assert not log.complete
+    assert log.accounts == {}
+    assert [state.tick for state in log["m"].states][:30] == list(range(30))
+    assert verify(log).passed
+
+
+def test_what_still_waits_at_the_end_is_written() -> None:
+    desk = Desk()
+    for payload in states("m"):
+        desk.tap.take(topics.key(SESSION, "m", topics.STATE), payload)
+    desk.tap.take("nonsense", b"")
+    log = desk.log()
+    assert len(log["m"]) == TICKS
+    assert log.accounts["dropped: stranger"] == "1"
+
+
+def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
+    """A recorder whose session begins, and whose sites then say nothing; it is asked to stop at a time."""
+    network = LocalNetwork()
+
+    def run(clock: RelayClock) -> None:
+        path = folder / "run.mcap"
+        recorder = Recorder(
+            network.join(),
+            clock,
+            SESSION,
+            BOOTS[topics.RECORDER],
+            path,
+            lambda: clock.monotonic_ns() > stop_ns,
+            str,
+        )
+        site = Info(
+            member="m",
+            boot=BOOTS["m"],
+            scenario_sha256=SCENARIO.sha256,
+            scenario=SCENARIO.text,
+            host="h",
+            clock="c",
+            fingerprint="f",
+        )
+        recorder._joining.met["x"] = msgspec.structs.replace(site, member="x", boot=5, scenario="garbage")
+        recorder._joining.met["m"] = site
+        recorder.record(EPOCH)
+
+    def publish(clock: RelayClock) -> None:
+        send = network.join().publisher(topics.key(SESSION, "m", topics.STATE))
+        for k, payload in enumerate(states("m")):
+            clock.sleep_until(MONO_NS + k * 1_000_000)
+            send(payload)
+
+    relay.add("recorder", run)
+    relay.add("m", publish)
+    relay.run()
+
+
+def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> None:
+    recorder_alone(tmp_path, Relay(), MONO_NS + 30_500_000)
+    log = open_log(tmp_path / "run.mcap")
+    assert log.complete
+    assert 30 <= len(log["m"]) < TICKS
+    assert verify(log).passed
+
+
+def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) -> None:
+    recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
+    assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256
+
+
+def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"precious")
+    with pytest.raises(UsageError, match=r"run\.mcap: cannot be written: File exists"):
+        recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
+    assert (tmp_path / "run.mcap").read_bytes() == b"precious"

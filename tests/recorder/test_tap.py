@@ -1,0 +1,45 @@
+"""Messages are stamped where they come in; the queue is bounded and what overflows is counted."""
+
+import pytest
+
+from recorder import tap as module
+from recorder.tap import Tap
+from trilat_net.net.clock import ManualClock
+
+
+def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
+    clock = ManualClock(100)
+    tap = Tap(clock)
+    tap.take("a", b"1")
+    clock.sleep_until(250)
+    tap.take("b", b"2")
+    clock.sleep_until(900)
+    assert list(tap.drain()) == [("a", b"1", 100), ("b", b"2", 250)]
+    assert list(tap.drain()) == []
+
+
+def test_what_comes_while_it_is_drained_comes_out_too() -> None:
+    tap = Tap(ManualClock())
+    tap.take("a", b"1")
+    drained = []
+    for message in tap.drain():
+        drained.append(message.payload)
+        if len(drained) < 3:
+            tap.take("a", b"more")
+    assert drained == [b"1", b"more", b"more"]
+
+
+def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CAPACITY", 5)
+    tap = Tap(ManualClock())
+    for n in range(8):
+        tap.take("a", bytes([n]))
+    assert tap.overflowed == 3
+    assert [message.payload for message in tap.drain()] == [bytes([n]) for n in range(5)]
+    tap.take("a", b"again")
+    assert [message.payload for message in tap.drain()] == [b"again"]
+    assert tap.overflowed == 3
+
+
+def test_a_minute_of_three_sites_at_1_khz_waits_without_loss() -> None:
+    assert module.CAPACITY >= 60 * 3 * 1000

@@ -1,0 +1,37 @@
+"""Runs over a network that scatters samples: early, late, out of order, twice, or never."""
+
+import io
+from collections.abc import Mapping
+
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
+from trilat_net.sim.network import RecordedNetwork
+
+SCENARIO = load("free", {"duration_s": 0.12, "link.delay_ms": 20.0})
+PEERS = {name: SCENARIO.peers(name) for name in SCENARIO.names}
+DUE = 20  # ticks after its stamp
+
+
+NONE: frozenset[tuple[str, int, int]] = frozenset()
+
+
+def delivered(
+    delays: Mapping[tuple[str, int, int], int], lost: frozenset[tuple[str, int, int]] = NONE
+) -> bytes:
+    """A log of a run in which some samples were under way for other than one tick.
+
+    Args:
+        delays: (receiver, index of the peer, tick of the sample) -> ticks under way.
+        lost: samples that never arrive.
+    """
+    at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
+    for receiver in SCENARIO.names:
+        for peer in (0, 1):
+            for tick in range(120):
+                if (receiver, peer, tick) in lost:
+                    continue
+                arrives = tick + delays.get((receiver, peer, tick), 1)
+                at[receiver].setdefault(arrives, []).append([peer, tick, 0])
+    stream = io.BytesIO()
+    virtual.record(SCENARIO, stream, RecordedNetwork(at, PEERS))
+    return stream.getvalue()

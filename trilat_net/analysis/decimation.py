@@ -1,0 +1,72 @@
+"""Fewer points for the same picture.
+
+Law: every bucket keeps its smallest and its largest value, of every column. Nothing is strided: a spike of
+one tick at 1 kHz is what a figure is looked at for.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arm import Array
+from ..log.reader import Ints
+
+
+class Trace(NamedTuple):
+    """Columns over time, ready to be drawn; a row of NaN stands in every gap that can be seen.
+
+    Attributes:
+        tick: ticks, shape (P,).
+        t_s: nominal time, shape (P,), s.
+        values: shape (P, C).
+    """
+
+    tick: Ints
+    t_s: Array
+    values: Array
+
+
+def kept(values: Array, buckets: int) -> Ints:
+    """Returns the rows to keep, ascending: the first, the last, and each bucket's extremes per column.
+
+    Args:
+        values: shape (K, C); NaN is no extreme, but a bucket of nothing else keeps one.
+        buckets: into how many equal runs of rows the K rows are parted.
+    """
+    rows, columns = values.shape
+    if rows <= 2 * buckets or not columns:
+        return np.arange(rows)
+    size = -(-rows // buckets)
+    # the last bucket is filled up with its last row, which changes no extreme
+    index = np.minimum(np.arange(-(-rows // size) * size), rows - 1).reshape(-1, size)
+    keep = [np.array([0, rows - 1])]
+    for column in range(columns):
+        block = values[index, column]
+        absent = np.isnan(block)
+        for extreme in (np.where(absent, np.inf, block).argmin(1), np.where(absent, -np.inf, block).argmax(1)):
+            keep.append(np.take_along_axis(index, extreme[:, np.newaxis], 1)[:, 0])
+    return np.unique(np.concatenate(keep))
+
+
+def thin(tick: Ints, t_s: Array, values: Array, buckets: int) -> Trace:
+    """Returns a trace with at most 2 C + 3 points per bucket.
+
+    Args:
+        tick: ticks, shape (K,), ascending.
+        t_s: their nominal time, shape (K,), s.
+        values: shape (K, C).
+        buckets: how many; about one per pixel is enough.
+    """
+    if not len(tick):
+        return Trace(tick, t_s, values)
+    # a gap narrower than a bucket is narrower than a pixel, and there may be thousands of those
+    widest = max(1.0, (tick[-1] - tick[0]) / buckets)
+    before = np.flatnonzero(np.diff(tick) > widest)
+    keep = np.union1d(kept(values, buckets), np.concatenate([before, before + 1]))
+    after = np.searchsorted(keep, before) + 1
+    step_s = (t_s[before + 1] - t_s[before]) / (tick[before + 1] - tick[before]) if len(before) else t_s[:0]
+    return Trace(
+        np.insert(tick[keep], after, tick[before] + 1),
+        np.insert(t_s[keep], after, t_s[before] + step_s),
+        np.insert(values[keep], after, np.nan, axis=0),
+    )

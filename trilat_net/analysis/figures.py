@@ -1,0 +1,52 @@
+"""Every figure of a log, by the name of its file. Each is one function of a log."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from ..log.reader import Log
+from . import style
+from .motion import hands_moved, operator_torques, parameter_estimates, positions, tracking_errors
+from .poses import arms
+from .timing import loop_timing, sample_age
+
+__all__ = [
+    "all_figures",
+    "arms",
+    "hands_moved",
+    "loop_timing",
+    "operator_torques",
+    "parameter_estimates",
+    "positions",
+    "sample_age",
+    "tracking_errors",
+    "write_figures",
+]
+
+
+def all_figures(log: Log, twin: Log | None) -> Iterator[tuple[str, Figure]]:
+    """Yields every figure with the name of its file, without suffix.
+
+    Args:
+        log: the log.
+        twin: the same experiment with nobody at the arms, or None.
+    """
+    yield "operator_torques", operator_torques(log)
+    yield "positions", positions(log)
+    yield "tracking_errors", tracking_errors(log)
+    yield "parameter_estimates", parameter_estimates(log)
+    yield "hands_moved", hands_moved(log, twin)
+    yield "arms", arms(log)
+    yield "sample_age", sample_age(log)
+    yield "loop_timing", loop_timing(log)
+
+
+def write_figures(log: Log, folder: Path, twin: Log | None) -> list[Path]:
+    """Writes every figure as PNG into a folder that exists, and returns the paths."""
+    paths = []
+    for name, figure in all_figures(log, twin):
+        path = folder / f"{name}.png"
+        figure.savefig(path, dpi=style.DPI)
+        paths.append(path)
+    return paths

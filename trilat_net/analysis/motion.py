@@ -1,0 +1,168 @@
+"""Figures of what the arms did: pushes, positions, errors, estimates, and what the pushes left behind.
+
+Law: figures speak of the torque ON the arm, which is the negative of the record's tau_x.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..core.arm import JOINTS, PARAMETERS
+from ..log.reader import Log
+from . import quantities, style
+
+THETA_UNITS = ("kg m²", "kg m²", "kg m²", "kg m", "kg m")
+"""Of the five parameters of Eq. (24)."""
+
+NO_HANDS = "nobody at the arms: no site has hands in this run"
+NO_TWIN = "no run without hands to compare with"
+
+
+def operator_torques(log: Log) -> Figure:
+    """Returns the torques of the operators' hands ON the arms over time, N m; Fig. 3 of the paper."""
+    sites = quantities.sites_with_hands(log)
+    if not sites:
+        return style.says(NO_HANDS)
+    with style.paper():
+        figure = style.new_figure(2.2)
+        row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
+        for joint, axes in enumerate(row):
+            axes.set_title(f"joint {joint + 1}")
+            for site in sites:
+                part = log[site]
+                torque = quantities.hand_torques(part)[:, joint]
+                style.draw(axes, part.tick, part.t_s, torque, **_line(log, site))
+        row[0].set_ylabel("torque on the arm (N m)")
+        style.time_axis(log, row)
+        style.legend(figure, style.site_entries(log, sites))
+    return figure
+
+
+def positions(log: Log) -> Figure:
+    """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
+    with style.paper():
+        figure = style.new_figure(0.7 + 1.25 * len(log.sites))
+        grid = style.panels(figure, len(log.sites), JOINTS, sharex=True, sharey="col")
+        for site, row in zip(log.sites, grid, strict=True):
+            part = log[site]
+            actual, desired = quantities.angles(part), quantities.references(part)
+            for joint, axes in enumerate(row):
+                style.draw(axes, part.tick, part.t_s, actual[:, joint], **_line(log, site, 1.6))
+                style.draw(axes, part.tick, part.t_s, desired[:, joint], **_REFERENCE)
+                _note_absence(log, site, axes)
+            row[0].set_ylabel(f"angle of {site} (rad)")
+        _joint_titles(grid[0])
+        style.time_axis(log, grid[-1])
+        actual_entries = [(f"{style.title(log, s)}, actual", _line(log, s, 1.6)) for s in log.sites]
+        style.legend(figure, [*actual_entries, ("desired", _REFERENCE)])
+    return figure
+
+
+def tracking_errors(log: Log) -> Figure:
+    """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it settles.
+
+    The lowest panel shows, at every time, the largest error of any joint that is still to come: where it
+    crosses the dashed line, the site has settled.
+    """
+    with style.paper():
+        figure = style.new_figure(3.6)
+        top, bottom = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
+        row = style.panels(top, 1, JOINTS, sharex=True, sharey=True)[0]
+        settling = style.panels(bottom, 1, 1)[0, 0]
+        for site in log.sites:
+            part, line = log[site], _line(log, site)
+            e = quantities.errors(part)
+            for joint, axes in enumerate(row):
+                style.draw(axes, part.tick, part.t_s, e[:, joint], **line)
+            remaining = quantities.remaining_error(part)
+            positive = np.where(remaining > 0.0, remaining, np.nan)
+            style.draw(settling, part.tick, part.t_s, positive, **line)
+        _joint_titles(row)
+        row[0].set_ylabel("tracking error (rad)")
+        settling.set_yscale("log")
+        settling.axhline(quantities.SETTLED_RAD, **_REFERENCE)
+        settling.set_ylabel("largest error\nstill to come (rad)")
+        style.time_axis(log, [*row, settling])
+        limit = (f"settled: {quantities.SETTLED_RAD:g} rad", _REFERENCE)
+        style.legend(figure, [*style.site_entries(log, log.sites), limit])
+    return figure
+
+
+def parameter_estimates(log: Log, sites: Sequence[str] | None = None) -> Figure:
+    """Returns the estimates of the five parameters over time with the true values; Fig. 6 of the paper.
+
+    Args:
+        log: the log.
+        sites: whose estimates; None for all. The paper shows master 1.
+    """
+    chosen = log.sites if sites is None else tuple(sites)
+    with style.paper():
+        figure = style.new_figure(3.6)
+        grid = style.panels(figure, 2, 3, sharex=True)
+        for index, axes in enumerate(grid.flat[:PARAMETERS]):
+            _estimate(log, chosen, index, axes)
+        grid.flat[PARAMETERS].set_axis_off()
+        style.time_axis(log, [*grid[1, :2], grid[0, 2]])
+        grid[0, 2].tick_params(labelbottom=True)
+        entries = [*style.site_entries(log, chosen), ("true value", _REFERENCE)]
+        handles = [axes for axes in entries]
+        style.legend(figure, handles)
+    return figure
+
+
+def hands_moved(log: Log, twin: Log | None) -> Figure:
+    """Returns how far the hands moved every site over time, rad: the log minus a run without hands.
+
+    Args:
+        log: the log.
+        twin: the same experiment with nobody at the arms, or None.
+    """
+    if twin is None:
+        return style.says(NO_TWIN if quantities.sites_with_hands(log) else NO_HANDS)
+    with style.paper():
+        figure = style.new_figure(2.2)
+        row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
+        for site in log.sites:
+            tick, t_s, moved = quantities.moved_by_hands(log, twin, site)
+            for joint, axes in enumerate(row):
+                style.draw(axes, tick, t_s, moved[:, joint], **_line(log, site))
+        _joint_titles(row)
+        row[0].set_ylabel("moved by the hands (rad)")
+        style.time_axis(log, row)
+        style.legend(figure, style.site_entries(log, log.sites))
+    return figure
+
+
+def _estimate(log: Log, sites: Sequence[str], index: int, axes: Axes) -> None:
+    """Draws the estimates of one parameter, and its true value once where all sites have the same."""
+    truths = {site: float(quantities.true_parameters(log, site)[index]) for site in sites}
+    for site in sites:
+        part = log[site]
+        style.draw(
+            axes, part.tick, part.t_s, quantities.estimates(part)[:, index], **_line(log, site)
+        )
+    if len(set(truths.values())) == 1:
+        axes.axhline(truths[sites[0]], **_REFERENCE)
+    else:
+        for site, truth in truths.items():
+            axes.axhline(truth, **{**_REFERENCE, "color": style.colour(log, site)})
+    axes.set_ylabel(rf"$\hat\theta_{index + 1}$ ({THETA_UNITS[index]})")
+
+
+_REFERENCE = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+
+
+def _line(log: Log, site: str, width: float = 1.1) -> dict[str, object]:
+    return {"color": style.colour(log, site), "linestyle": style.dashes(log, site), "linewidth": width}
+
+
+def _joint_titles(row: Sequence[Axes]) -> None:
+    for joint, axes in enumerate(row):
+        axes.set_title(f"joint {joint + 1}")
+
+
+def _note_absence(log: Log, site: str, axes: Axes) -> None:
+    if not len(log[site]):
+        style.note(axes, f"no records of {site}")

@@ -1,0 +1,156 @@
+"""How figures look: one colour per site in all of them, sizes for a page of two columns.
+
+Law: a figure is made from a log and nothing else; no global state of matplotlib is left changed.
+
+The first three colours are the "high contrast" set of Paul Tol's notes on colour: safe for the colour
+blind, and apart in lightness, so that they are apart in grey print. More sites than colours: dashes.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from ..core.arm import Array
+from ..log.reader import Ints, Log
+from .decimation import thin
+
+Grid = NDArray[np.object_]
+
+COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
+DARK_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
+"""The same sites on a dark page."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+REFERENCE = "#333333"
+FAINT = "#8c8c8c"
+
+WIDTH_IN = 7.0
+DPI = 200
+BUCKETS = 700
+"""Per panel: half a page is 700 pixels wide."""
+
+_RC = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture everywhere
+    "font.size": 8.0,
+    "axes.labelsize": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.titlepad": 4.0,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.use_mathtext": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.1,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "legend.columnspacing": 1.6,
+    "figure.constrained_layout.h_pad": 0.03,
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.dpi": DPI,
+    "savefig.dpi": DPI,
+    "path.simplify": True,
+}
+
+
+@contextmanager
+def paper() -> Iterator[None]:
+    """Makes figures inside the block look like ours; outside, nothing changes."""
+    with mpl.rc_context(_RC):
+        yield
+
+
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """Returns an empty figure of a size in inches."""
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def panels(figure: Figure, rows: int, columns: int, **options: Any) -> Grid:
+    """Returns the panels of a figure as an array, shape (rows, columns), of `Axes`."""
+    grid: Grid = figure.subplots(rows, columns, squeeze=False, **options)
+    return grid
+
+
+def colour(log: Log, site: str) -> str:
+    """Returns the colour of a site, the same in every figure."""
+    return COLOURS[log.sites.index(site) % len(COLOURS)]
+
+
+def dashes(log: Log, site: str) -> Any:
+    """Returns the line style of a site: solid until the colours are used up."""
+    return DASHES[log.sites.index(site) // len(COLOURS) % len(DASHES)]
+
+
+def title(log: Log, site: str) -> str:
+    """Returns what a legend calls a site."""
+    return f"{site} ({log.scenario.sites[site].role})"
+
+
+def draw(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws one quantity over time, thinned.
+
+    Args:
+        axes: where.
+        tick: ticks, shape (K,).
+        t_s: their time, shape (K,), s.
+        values: shape (K,).
+        **options: of the line.
+    """
+    trace = thin(tick, t_s, values[:, np.newaxis], BUCKETS)
+    axes.plot(trace.t_s, trace.values[:, 0], **options)
+
+
+def time_axis(log: Log, row: Sequence[Axes]) -> None:
+    """Gives the lowest panels their time axis: the time of the whole run, in every figure."""
+    for axes in row:
+        axes.set_xlabel("time (s)")
+        axes.set_xlim(0.0, span_s(log))
+
+
+def span_s(log: Log) -> float:
+    """Returns the time that figures show, s: up to the last record, or the scenario's duration without any."""
+    ends = [float(log[name].t_s[-1]) for name in log.sites if len(log[name])]
+    period_s = 1.0 / min(spec.rate_hz for spec in log.scenario.sites.values())
+    return max(max(ends), period_s) if ends else log.scenario.duration_s
+
+
+def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Puts a legend above the panels, where it hides nothing.
+
+    Args:
+        figure: whose.
+        entries: (text, options of the line).
+    """
+    handles = [Line2D([], [], label=text, **options) for text, options in entries]
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 6))
+
+
+def site_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the entries of a legend of sites."""
+    return [(title(log, s), {"color": colour(log, s), "linestyle": dashes(log, s)}) for s in sites]
+
+
+def says(text: str) -> Figure:
+    """Returns a figure that says why there is nothing to draw."""
+    figure = new_figure(1.0)
+    figure.text(0.5, 0.5, text, ha="center", va="center", color=REFERENCE)
+    return figure
+
+
+def note(axes: Axes, text: str) -> None:
+    """Says in an empty panel why it is empty."""
+    axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)

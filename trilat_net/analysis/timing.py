@@ -1,0 +1,119 @@
+"""Figures of the loop and of the links: lateness, computing time, age of the samples in use.
+
+Law: in virtual time there is no clock, and a figure of one says so instead of drawing zeros.
+"""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..core.arm import Array
+from ..log.reader import Ints, Log
+from . import quantities, style
+
+NO_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
+NO_TIMES = "no lateness and no computing time in this log"
+_BINS_PER_DECADE = 20
+_PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+
+
+def has_clock(log: Log) -> bool:
+    """True where the log has a lateness or a computing time that is not zero."""
+    return any(np.any(log[name].late_us) or np.any(log[name].busy_us) for name in log.sites)
+
+
+def no_clock_text(log: Log) -> str:
+    """Returns why there are no times to draw."""
+    return NO_CLOCK if log.driver == "virtual" else NO_TIMES
+
+
+def bin_edges(log: Log) -> Array:
+    """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the logarithm.
+
+    The last edge lies above every time in the log; what is below the first, 1 us, counts in the first bin.
+    """
+    largest = max(
+        (int(times.max()) for s in log.sites for times in (log[s].late_us, log[s].busy_us) if len(times)),
+        default=1,
+    )
+    decades = np.log10(max(largest, 10) * 1.1)
+    count = int(np.ceil(decades * _BINS_PER_DECADE))
+    edges: Array = np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
+    return edges
+
+
+def histogram(times_us: Ints, edges: Array) -> Ints:
+    """Returns how many times lie in each bin, shape (B,).
+
+    Args:
+        times_us: shape (K,), us.
+        edges: as from `bin_edges`, us.
+    """
+    return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
+
+
+def loop_timing(log: Log) -> Figure:
+    """Returns histograms of each site's lateness and computing time, us."""
+    if not has_clock(log):
+        return style.says(no_clock_text(log))
+    edges = bin_edges(log)
+    with style.paper():
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
+        grid = style.panels(figure, len(log.sites), 2, sharex=True, sharey=True)
+        for site, (late, busy) in zip(log.sites, grid, strict=True):
+            _bars(log, site, late, log[site].late_us, edges)
+            _bars(log, site, busy, log[site].busy_us, edges)
+            late.set_ylabel(f"ticks of {site} (count)")
+        grid[-1, 0].set_xlabel("wake-up after the deadline (µs)")
+        grid[-1, 1].set_xlabel("computing time of a tick (µs)")
+        style.legend(figure, [("one period", _PERIOD)])
+    return figure
+
+
+def sample_age(log: Log) -> Figure:
+    """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
+    with style.paper():
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
+        grid = style.panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+        for site, row in zip(log.sites, grid, strict=True):
+            _ages(log, site, row)
+        for axes in grid[:, 0]:
+            axes.set_ylabel("age (ms)")
+        grid[0, 0].set_ylim(0.0, _age_limit_ms(log))
+        style.time_axis(log, grid[-1])
+        sent = [(f"from {text}", line) for text, line in style.site_entries(log, log.sites)]
+        style.legend(figure, [*sent, ("delay as set", _PERIOD)])
+    return figure
+
+
+def _ages(log: Log, site: str, row: style.Grid) -> None:
+    part = log[site]
+    for peer, age_ms, axes in zip(part.peers, quantities.ages_ms(log, site).T, row, strict=True):
+        line = {"color": style.colour(log, peer), "linestyle": style.dashes(log, peer)}
+        style.draw(axes, part.tick, part.t_s, age_ms, **line)
+        axes.axhline(log.scenario.links[f"{peer}->{site}"].delay_ms, **_PERIOD)
+        axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+        if not np.any(np.isfinite(age_ms)):
+            style.note(axes, "no sample in use")
+
+
+def _age_limit_ms(log: Log) -> float:
+    ages = [quantities.ages_ms(log, site) for site in log.sites]
+    largest = max((float(a[np.isfinite(a)].max(initial=0.0)) for a in ages), default=0.0)
+    return 1.25 * max(largest, *(link.delay_ms for link in log.scenario.links.values()), 1.0)
+
+
+def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.7)
+    axes.stairs(histogram(times_us, edges), edges, baseline=0.5, fill=True, color=style.colour(log, site))
+    axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **_PERIOD)
+    if not len(times_us):
+        style.note(axes, f"no times of {site}")
+        return
+    p50, p99, p999, largest = (f"{value:.0f}" for value in np.percentile(times_us, _PERCENTILES))
+    axes.set_title(f"{site}: p50 {p50}, p99 {p99}, p99.9 {p999}, max {largest} µs", loc="left", pad=2.0)
+
+
+_PERIOD = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
