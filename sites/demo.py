@@ -98,7 +98,8 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
         clock = SystemClock()
         try:
             with closing(ZenohBus([], endpoints)) as bus:
-                _attend(Watch(bus, session), display, children, recorder, interrupt, outcome, clock)
+                watch = Watch(bus, session, scenario.names)
+                _attend(watch, display, children, recorder, interrupt, outcome, clock)
         finally:
             _end_all(children, recorder, clock)
         outcome.interrupted = interrupt.number

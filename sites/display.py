@@ -48,7 +48,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """Prints a sentence above the table."""
-        self._console.print(text, highlight=False)
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def _table(self, latest: dict[str, LinkStats]) -> Table:
         table = Table(title=f"{self._scenario.name}, {self._scenario.duration_s:g} s", title_justify="left")

@@ -119,6 +119,7 @@ class _Member:
         self._publish_link = bus.publisher(topics.key(session, name, topics.LINK))
         self._peer_events = [bus.inbox(topics.key(session, p, topics.EVENT), 256) for p in self._site.peers]
         self._ended_by = ""
+        self._gone: set[str] = set()
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         warm_up(scenario, name)
         self._voice = Voice(
@@ -186,16 +187,21 @@ class _Member:
     def _slack(self, _k: int, t_ns: int) -> None:
         """Ten times a second: answers questions, and says who is gone or back."""
         self._voice.answer()
-        while (change := self._presence.poll()) is not None:
-            where = topics.address(change[0])
-            if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
-                continue
-            if not change[1]:
-                self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
+        self._watch(t_ns)
         for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):
             for event in _events(inbox):
                 if event.kind == "diverged" and event.boot == self._epoch.boots[peer]:
                     self._ended_by = event.text
+
+    def _watch(self, t_ns: int) -> None:
+        """Notes which members are gone, and says so."""
+        while (change := self._presence.poll()) is not None:
+            where = topics.address(change[0])
+            if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
+                continue
+            (self._gone.discard if change[1] else self._gone.add)(where.member)
+            if not change[1]:
+                self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
 
     def _leave(self, output: Output | None) -> int:
         """Says how the run ended, and stays until the recorder has all of it."""
@@ -206,7 +212,7 @@ class _Member:
             self._voice.say("diverged", diverged_text(self._name, output), t_ns=t_ns, ticks=ticks)
         self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
         if topics.RECORDER in self._epoch.boots:
-            self._await_recorder(ticks)
+            self._await_recorder(ticks, t_ns)
         dropped = ", ".join(f"{count} {reason}" for reason, count in self._stats.dropped.items())
         self._say(
             f"{self._name}: {ticks} ticks, {self._stats.overruns} of them late by a period or more"
@@ -218,12 +224,13 @@ class _Member:
             raise RunFailed(f"{self._name} ended because {self._ended_by}")
         return self._interrupt.exit_code if self._interrupt.requested() else 0
 
-    def _await_recorder(self, ticks: int) -> None:
-        """Waits for the recorder's word that it has every record, at most `LINGER_S`."""
+    def _await_recorder(self, ticks: int, t_ns: int) -> None:
+        """Waits for the recorder's word that it has every record, at most `LINGER_S`, while it is there."""
         clock = self._clock
         give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-        while clock.monotonic_ns() < give_up_ns:
+        while clock.monotonic_ns() < give_up_ns and topics.RECORDER not in self._gone:
             self._voice.answer()
+            self._watch(t_ns)
             for event in _events(self._recorder_events):
                 if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
                     return

@@ -15,15 +15,17 @@ class Watch:
     Args:
         bus: a connection to every site.
         session: the session's name.
+        sites: its sites; what others say is nobody's.
 
     Attributes:
         latest: per site its latest statistics.
         news: sentences that a person should read, not yet taken.
     """
 
-    def __init__(self, bus: Bus, session: str) -> None:
+    def __init__(self, bus: Bus, session: str, sites: Sequence[str]) -> None:
         self.latest: dict[str, LinkStats] = {}
         self.news: list[str] = []
+        self._sites = sites
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
 
@@ -34,7 +36,8 @@ class Watch:
                 stats = decode(message[1], LinkStats)
             except WireError:
                 continue  # the sites and the recorder count strangers
-            self.latest[stats.site] = stats
+            if stats.site in self._sites:
+                self.latest[stats.site] = stats
         while (message := self._events.poll()) is not None:
             try:
                 event = decode(message[1], Event)

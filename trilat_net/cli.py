@@ -65,6 +65,15 @@ ListenOption = Annotated[
 ConnectOption = Annotated[
     list[str] | None, typer.Option("--connect", metavar="EP", help="Endpoint to connect to; repeatable.")
 ]
+
+
+def _seconds(value: float | None) -> float | None:
+    """Refuses what is no time to wait."""
+    if value is not None and not 0.0 <= value <= 86_400.0:
+        raise UsageError(f"--join-timeout is a number of seconds from 0 to 86400, not {value:g}")
+    return value
+
+
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 
 
@@ -103,10 +112,10 @@ def demo(
     with Display(chosen, out) as display:
         outcome = run_demo(chosen, results, display)
     for problem in outcome.problems:
-        err.print(f"error: {escape(problem)}")
+        err.print(f"error: {escape(problem)}", soft_wrap=True)
     if outcome.interrupted:
         kept = f"; {outcome.log} holds what there was" if outcome.log.exists() else ""
-        err.print(f"interrupted{escape(kept)}")
+        err.print(f"interrupted{escape(kept)}", soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not outcome.log.exists():
         raise typer.Exit(1)
@@ -127,7 +136,10 @@ def site(
     listen: ListenOption = None,
     connect: ConnectOption = None,
     join_timeout: Annotated[
-        float, typer.Option("--join-timeout", metavar="S", help="How long to wait for the others, s.")
+        float,
+        typer.Option(
+            "--join-timeout", metavar="S", help="How long to wait for the others, s.", callback=_seconds
+        ),
     ] = 60.0,
     needs_recorder: Annotated[
         bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
@@ -174,7 +186,12 @@ def record(
     ] = None,
     join_timeout: Annotated[
         float | None,
-        typer.Option("--join-timeout", metavar="S", help="How long to wait for it to begin, s; default: on."),
+        typer.Option(
+            "--join-timeout",
+            metavar="S",
+            help="How long to wait for it to begin, s; default: for ever.",
+            callback=_seconds,
+        ),
     ] = None,
     force: ForceOption = False,
 ) -> None:
@@ -185,10 +202,11 @@ def record(
     from recorder.process import record_session
 
     path = output if output is not None else Path(f"{_session_name(session)}.mcap")
-    if path.exists():
-        if not force:
-            raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
-        path.unlink()
+    if path.exists() and (not force or path.is_dir()):
+        raise UsageError(f"{path}: exists; choose another name, or replace a file with --force")
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
+    path.unlink(missing_ok=True)
     code = record_session(_session_name(session), path, listen or [], connect, join_timeout, _say)
     raise typer.Exit(code)
 
@@ -244,6 +262,10 @@ def report(
     """Makes the figures, the page and the summary of a log."""
     from .conclusion import conclude, results_folder
 
+    try:
+        file.open("rb").close()  # before a folder is made for it
+    except OSError as error:
+        raise UsageError(f"{file}: cannot be read: {error.strerror}") from None
     results = results_folder(folder if folder is not None else file.with_suffix(""), "", force=force)
     _print_conclusion(conclude(file, results))
 

@@ -1,7 +1,7 @@
 """Runs over a network that scatters samples: early, late, out of order, twice, or never."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from trilat_net.scenario import load
 from trilat_net.sim import virtual
@@ -12,16 +12,27 @@ PEERS = {name: SCENARIO.peers(name) for name in SCENARIO.names}
 DUE = 20  # ticks after its stamp
 
 
-NONE: frozenset[tuple[str, int, int]] = frozenset()
+Sample = tuple[str, int, int]
+"""Receiver, index of the peer among its peers, tick of the sample."""
 
 
-def delivered(
-    delays: Mapping[tuple[str, int, int], int], lost: frozenset[tuple[str, int, int]] = NONE
-) -> bytes:
+def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
+    """Holds each sample back until those of the same link before it have come."""
+    held: dict[Sample, int] = {}
+    for receiver in SCENARIO.names:
+        for peer in (0, 1):
+            arrives = 0
+            for tick in range(120):
+                arrives = max(arrives, tick + delays.get((receiver, peer, tick), 1))
+                held[receiver, peer, tick] = arrives - tick
+    return held
+
+
+def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
     """A log of a run in which some samples were under way for other than one tick.
 
     Args:
-        delays: (receiver, index of the peer, tick of the sample) -> ticks under way.
+        delays: sample -> ticks under way.
         lost: samples that never arrive.
     """
     at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}

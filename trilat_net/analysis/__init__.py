@@ -1,1 +1,1 @@
-"""Figures, numbers and the page of a log. Only this package imports matplotlib, and only a report imports it."""
+"""Figures, numbers and the page of a log. Only this package imports matplotlib; only a report imports it."""

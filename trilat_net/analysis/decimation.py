@@ -43,8 +43,10 @@ def kept(values: Array, buckets: int) -> Ints:
     for column in range(columns):
         block = values[index, column]
         absent = np.isnan(block)
-        for extreme in (np.where(absent, np.inf, block).argmin(1), np.where(absent, -np.inf, block).argmax(1)):
-            keep.append(np.take_along_axis(index, extreme[:, np.newaxis], 1)[:, 0])
+        lowest = np.where(absent, np.inf, block).argmin(1)
+        highest = np.where(absent, -np.inf, block).argmax(1)
+        bucket = np.arange(len(index))
+        keep += [index[bucket, lowest], index[bucket, highest]]
     return np.unique(np.concatenate(keep))
 
 

@@ -4,6 +4,7 @@ Law: figures speak of the torque ON the arm, which is the negative of the record
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,7 +34,7 @@ def operator_torques(log: Log) -> Figure:
             for site in sites:
                 part = log[site]
                 torque = quantities.hand_torques(part)[:, joint]
-                style.draw(axes, part.tick, part.t_s, torque, **_line(log, site))
+                style.draw(axes, part.tick, part.t_s, torque, **style.line(log, site))
         row[0].set_ylabel("torque on the arm (N m)")
         style.time_axis(log, row)
         style.legend(figure, style.site_entries(log, sites))
@@ -49,13 +50,13 @@ def positions(log: Log) -> Figure:
             part = log[site]
             actual, desired = quantities.angles(part), quantities.references(part)
             for joint, axes in enumerate(row):
-                style.draw(axes, part.tick, part.t_s, actual[:, joint], **_line(log, site, 1.6))
+                style.draw(axes, part.tick, part.t_s, actual[:, joint], **style.line(log, site, 1.6))
                 style.draw(axes, part.tick, part.t_s, desired[:, joint], **_REFERENCE)
                 _note_absence(log, site, axes)
             row[0].set_ylabel(f"angle of {site} (rad)")
         _joint_titles(grid[0])
         style.time_axis(log, grid[-1])
-        actual_entries = [(f"{style.title(log, s)}, actual", _line(log, s, 1.6)) for s in log.sites]
+        actual_entries = [(f"{style.title(log, s)}, actual", style.line(log, s, 1.6)) for s in log.sites]
         style.legend(figure, [*actual_entries, ("desired", _REFERENCE)])
     return figure
 
@@ -68,11 +69,12 @@ def tracking_errors(log: Log) -> Figure:
     """
     with style.paper():
         figure = style.new_figure(3.6)
-        top, bottom = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
-        row = style.panels(top, 1, JOINTS, sharex=True, sharey=True)[0]
-        settling = style.panels(bottom, 1, 1)[0, 0]
+        panels = figure.subplot_mosaic([["1", "2"], ["all", "all"]])
+        row, settling = [panels["1"], panels["2"]], panels["all"]
+        row[1].sharey(row[0])
+        row[1].tick_params(labelleft=False)
         for site in log.sites:
-            part, line = log[site], _line(log, site)
+            part, line = log[site], style.line(log, site)
             e = quantities.errors(part)
             for joint, axes in enumerate(row):
                 style.draw(axes, part.tick, part.t_s, e[:, joint], **line)
@@ -100,15 +102,11 @@ def parameter_estimates(log: Log, sites: Sequence[str] | None = None) -> Figure:
     chosen = log.sites if sites is None else tuple(sites)
     with style.paper():
         figure = style.new_figure(3.6)
-        grid = style.panels(figure, 2, 3, sharex=True)
-        for index, axes in enumerate(grid.flat[:PARAMETERS]):
-            _estimate(log, chosen, index, axes)
-        grid.flat[PARAMETERS].set_axis_off()
-        style.time_axis(log, [*grid[1, :2], grid[0, 2]])
-        grid[0, 2].tick_params(labelbottom=True)
-        entries = [*style.site_entries(log, chosen), ("true value", _REFERENCE)]
-        handles = [axes for axes in entries]
-        style.legend(figure, handles)
+        panels = figure.subplot_mosaic([[*"112233"], [*"444555"]])
+        for index in range(PARAMETERS):
+            _estimate(log, chosen, index, panels[str(index + 1)])
+        style.time_axis(log, list(panels.values()))
+        style.legend(figure, [*style.site_entries(log, chosen), ("true value", _REFERENCE)])
     return figure
 
 
@@ -127,9 +125,9 @@ def hands_moved(log: Log, twin: Log | None) -> Figure:
         for site in log.sites:
             tick, t_s, moved = quantities.moved_by_hands(log, twin, site)
             for joint, axes in enumerate(row):
-                style.draw(axes, tick, t_s, moved[:, joint], **_line(log, site))
+                style.draw(axes, tick, t_s, moved[:, joint], **style.line(log, site))
         _joint_titles(row)
-        row[0].set_ylabel("moved by the hands (rad)")
+        row[0].set_ylabel("moved by hands (rad)")
         style.time_axis(log, row)
         style.legend(figure, style.site_entries(log, log.sites))
     return figure
@@ -140,22 +138,16 @@ def _estimate(log: Log, sites: Sequence[str], index: int, axes: Axes) -> None:
     truths = {site: float(quantities.true_parameters(log, site)[index]) for site in sites}
     for site in sites:
         part = log[site]
-        style.draw(
-            axes, part.tick, part.t_s, quantities.estimates(part)[:, index], **_line(log, site)
-        )
+        style.draw(axes, part.tick, part.t_s, quantities.estimates(part)[:, index], **style.line(log, site))
     if len(set(truths.values())) == 1:
         axes.axhline(truths[sites[0]], **_REFERENCE)
     else:
         for site, truth in truths.items():
             axes.axhline(truth, **{**_REFERENCE, "color": style.colour(log, site)})
-    axes.set_ylabel(rf"$\hat\theta_{index + 1}$ ({THETA_UNITS[index]})")
+    axes.set_ylabel(rf"estimate of $\theta_{index + 1}$ ({THETA_UNITS[index]})")
 
 
-_REFERENCE = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
-
-
-def _line(log: Log, site: str, width: float = 1.1) -> dict[str, object]:
-    return {"color": style.colour(log, site), "linestyle": style.dashes(log, site), "linewidth": width}
+_REFERENCE: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
 
 
 def _joint_titles(row: Sequence[Axes]) -> None:

@@ -4,7 +4,7 @@ Law: forward kinematics of `core.arm`; the reference pose stands behind every ar
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -61,7 +61,7 @@ def instants_s(log: Log, count: int = INSTANTS) -> list[float]:
             moved += np.interp(grid, part.t_s, np.cumsum(step))
     share = grid / end_s + (moved / moved[-1] if moved[-1] > 0.0 else 0.0)
     chosen = np.interp(np.linspace(0.0, share[-1], count), share, grid)
-    step_s = 10.0 ** np.floor(np.log10(end_s / 20.0))
+    step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
     inner = (float(np.round(t / step_s) * step_s) for t in chosen[1:-1])
     return sorted({0.0, *(round(t, 6) for t in inner if t < end_s), end_s})
 
@@ -130,13 +130,10 @@ def _arm(axes: Axes, drawn: Pose | None, colour: str) -> None:
     axes.plot(0.0, 0.0, linestyle="none", marker="s", markersize=4.5, color=style.REFERENCE)
 
 
-def _entries(log: Log) -> list[tuple[str, dict[str, object]]]:
-    sites = [
-        (text, {"color": line["color"], "linewidth": 2.0})
-        for text, line in style.site_entries(log, log.sites)
-    ]
+def _entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    sites = [(style.title(log, s), {"color": style.colour(log, s), "linewidth": 2.0}) for s in log.sites]
     base = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
     return [*sites, ("desired", _DESIRED), ("base", base)]
 
 
-_DESIRED: dict[str, object] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
+_DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}

@@ -33,7 +33,7 @@ def control_torques(part: SiteLog) -> Array:
 
 
 def hand_torques(part: SiteLog) -> Array:
-    """Returns the torque of the hands ON the arm, shape (K, 2), N m: the negative of what Eq. (8) subtracts."""
+    """Returns the torque of the hands ON the arm, shape (K, 2), N m: the negative of tau_x."""
     return 0.0 - part.tau_x.reshape(-1, JOINTS)  # 0 - 0 is 0, where -0 would print as such
 
 
@@ -62,7 +62,7 @@ def remaining_error(part: SiteLog) -> Array:
 
 
 def settle_s(part: SiteLog) -> float | None:
-    """Returns the last time at which an error exceeded `SETTLED_RAD`, s; 0 if none did, None if one still does."""
+    """Returns when an error last exceeded `SETTLED_RAD`, s; 0 if none did, None if one still does."""
     if not len(part):
         return None
     above = np.flatnonzero(remaining_error(part) > SETTLED_RAD)

@@ -35,7 +35,7 @@ DPI = 200
 BUCKETS = 700
 """Per panel: half a page is 700 pixels wide."""
 
-_RC = {
+_RC: Any = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture everywhere
     "font.size": 8.0,
@@ -95,6 +95,21 @@ def dashes(log: Log, site: str) -> Any:
     return DASHES[log.sites.index(site) // len(COLOURS) % len(DASHES)]
 
 
+def line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
+    """Returns how the line of a site is drawn.
+
+    Where sites share a panel, later ones are drawn thinner, so that lines on top of each other all show.
+
+    Args:
+        log: whose site.
+        site: which one.
+        width: of the line, pt; None where sites share a panel.
+    """
+    shared = 2.0 - 1.2 * log.sites.index(site) / (len(log.sites) - 1)
+    width = shared if width is None else width
+    return {"color": colour(log, site), "linestyle": dashes(log, site), "linewidth": width}
+
+
 def title(log: Log, site: str) -> str:
     """Returns what a legend calls a site."""
     return f"{site} ({log.scenario.sites[site].role})"
@@ -122,10 +137,13 @@ def time_axis(log: Log, row: Sequence[Axes]) -> None:
 
 
 def span_s(log: Log) -> float:
-    """Returns the time that figures show, s: up to the last record, or the scenario's duration without any."""
-    ends = [float(log[name].t_s[-1]) for name in log.sites if len(log[name])]
-    period_s = 1.0 / min(spec.rate_hz for spec in log.scenario.sites.values())
-    return max(max(ends), period_s) if ends else log.scenario.duration_s
+    """Returns the time that figures show, s: to the end of the last record's period."""
+    ends = [
+        float(log[name].t_s[-1]) + 1.0 / log.scenario.sites[name].rate_hz
+        for name in log.sites
+        if len(log[name])
+    ]
+    return max(ends, default=log.scenario.duration_s)
 
 
 def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
@@ -141,13 +159,14 @@ def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> Non
 
 def site_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
     """Returns the entries of a legend of sites."""
-    return [(title(log, s), {"color": colour(log, s), "linestyle": dashes(log, s)}) for s in sites]
+    return [(title(log, s), line(log, s)) for s in sites]
 
 
 def says(text: str) -> Figure:
     """Returns a figure that says why there is nothing to draw."""
-    figure = new_figure(1.0)
-    figure.text(0.5, 0.5, text, ha="center", va="center", color=REFERENCE)
+    with paper():
+        figure = new_figure(1.0)
+        figure.text(0.5, 0.5, text, ha="center", va="center", color=REFERENCE)
     return figure
 
 

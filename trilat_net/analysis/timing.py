@@ -3,6 +3,8 @@
 Law: in virtual time there is no clock, and a figure of one says so instead of drawing zeros.
 """
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,7 +16,6 @@ from . import quantities, style
 NO_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
-_PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 
 
 def has_clock(log: Log) -> bool:
@@ -63,7 +64,8 @@ def loop_timing(log: Log) -> Figure:
         for site, (late, busy) in zip(log.sites, grid, strict=True):
             _bars(log, site, late, log[site].late_us, edges)
             _bars(log, site, busy, log[site].busy_us, edges)
-            late.set_ylabel(f"ticks of {site} (count)")
+            late.set_ylabel("ticks (count)")
+        grid[0, 0].set_ylim(bottom=0.7)
         grid[-1, 0].set_xlabel("wake-up after the deadline (µs)")
         grid[-1, 1].set_xlabel("computing time of a tick (µs)")
         style.legend(figure, [("one period", _PERIOD)])
@@ -81,7 +83,7 @@ def sample_age(log: Log) -> Figure:
             axes.set_ylabel("age (ms)")
         grid[0, 0].set_ylim(0.0, _age_limit_ms(log))
         style.time_axis(log, grid[-1])
-        sent = [(f"from {text}", line) for text, line in style.site_entries(log, log.sites)]
+        sent = [(f"from {style.title(log, s)}", style.line(log, s, 1.8)) for s in log.sites]
         style.legend(figure, [*sent, ("delay as set", _PERIOD)])
     return figure
 
@@ -89,8 +91,7 @@ def sample_age(log: Log) -> Figure:
 def _ages(log: Log, site: str, row: style.Grid) -> None:
     part = log[site]
     for peer, age_ms, axes in zip(part.peers, quantities.ages_ms(log, site).T, row, strict=True):
-        line = {"color": style.colour(log, peer), "linestyle": style.dashes(log, peer)}
-        style.draw(axes, part.tick, part.t_s, age_ms, **line)
+        style.draw(axes, part.tick, part.t_s, age_ms, **style.line(log, peer, 1.8))
         axes.axhline(log.scenario.links[f"{peer}->{site}"].delay_ms, **_PERIOD)
         axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
         if not np.any(np.isfinite(age_ms)):
@@ -106,14 +107,13 @@ def _age_limit_ms(log: Log) -> float:
 def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(bottom=0.7)
     axes.stairs(histogram(times_us, edges), edges, baseline=0.5, fill=True, color=style.colour(log, site))
     axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **_PERIOD)
     if not len(times_us):
         style.note(axes, f"no times of {site}")
         return
-    p50, p99, p999, largest = (f"{value:.0f}" for value in np.percentile(times_us, _PERCENTILES))
-    axes.set_title(f"{site}: p50 {p50}, p99 {p99}, p99.9 {p999}, max {largest} µs", loc="left", pad=2.0)
+    p50, p99, largest = (f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0)))
+    axes.set_title(f"{site}: p50 {p50}, p99 {p99}, max {largest} µs", loc="left", pad=2.0)
 
 
-_PERIOD = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+_PERIOD: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}

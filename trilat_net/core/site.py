@@ -114,6 +114,10 @@ class Site:
         """Returns the tick of this site at which a peer's sample comes into use if it is there by then."""
         return int(release_tick(tick, self._links[peer], self.rate_hz))
 
+    def peer_rate_hz(self, peer: int) -> int:
+        """Returns the tick rate of a peer, Hz."""
+        return int(self._links[peer]["rate_hz"])
+
     def resume(self, before: Output, last: Output) -> None:
         """Puts the arm and its controller where `step(last.tick)` left them, from two records in a row.
 

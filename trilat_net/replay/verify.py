@@ -8,15 +8,22 @@ not be judged is counted.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
 
 from .. import collector
 from ..core.fingerprint import fingerprint
+from ..core.grid import NS_PER_S
 from ..core.site import Site
 from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
 from ..log.reader import Log, SiteLog
 from ..net.messages import State
 from ..scenario import Scenario
 from .difference import Difference, close, first_difference, identical, same_bits
+
+
+_LOOK_BACK = 100
+"""Records before a gap in which to look for the newest sample that had come."""
 
 
 @dataclass(slots=True)
@@ -114,9 +121,9 @@ class _Execution:
 
     While it is `assured`, the site's state follows from the records before. It is lost at a gap, and when a
     sample comes into use that the log lacks; two records in a row bring it back. What arrived inside a gap
-    is not known: samples between the one in use and the next one listed are taken to have come
-    (`assumed`), and as long as one of them is in use a difference counts as unjudged. So it does when the
-    sample in use is one that arrived but whose own record is missing (`lacking`).
+    is not known: samples that no record lists are taken to have come in it (`assumed`), and as long as one
+    of them is in use a difference counts as unjudged. So it does when the sample in use is one that
+    arrived but whose own record is missing (`lacking`).
     """
 
     def __init__(
@@ -136,7 +143,7 @@ class _Execution:
         self._verdict = verdict
         self._same = same_bits if verdict.whole_run else close
         self._assured = True
-        self._assumed = [range(0)] * len(self._peers)
+        self._assumed: list[set[int]] = [set() for _ in self._peers]
         self._lacking: list[set[int]] = [set() for _ in self._peers]
 
     def run(self) -> None:
@@ -233,19 +240,55 @@ class _Execution:
             if used >= 0 and sample is None:
                 return False
             in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
-            listed = self._next_listed(j, n)
-            self._assumed[j] = range(used + 1, listed)
-            found = (self._by_tick[j].get(tick) for tick in range(used + 1, listed))
-            waiting += [Arrival(j, s.tick, s.q, s.qd) for s in found if s is not None]
+            certain, self._assumed[j] = self._came_before(n, j, used)
+            for tick in sorted(certain | self._assumed[j]):
+                if (came := self._by_tick[j].get(tick)) is not None:
+                    waiting.append(Arrival(j, tick, came.q, came.qd))
+                else:
+                    self._lacking[j].add(tick)
         self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
         self._site.resume(before, last)
         self._assured = True
         return True
 
+    def _came_before(self, n: int, peer: int, used: int) -> tuple[set[int], set[int]]:
+        """Returns which samples newer than the one in use had come before record n: (certainly, probably).
+
+        Certain are those that a record before n lists. Probable are those that no record lists at all
+        and that are older than record n, or than the first sample that came after it.
+        """
+        t_ns = self._log.states[n].t_ns
+        by_time = -(-t_ns * self._site.peer_rate_hz(peer) // NS_PER_S) - 1
+        first_listed = self._first_listed[peer]
+        newest = max(by_time, self._next_listed(peer, n) - 1)
+        before = (
+            tick
+            for state in self._log.states[max(0, n - _LOOK_BACK) : n]
+            for j, tick, _ in state.rx
+            if j == peer
+        )
+        highest = max(before, default=-1)
+        certain: set[int] = set()
+        probable: set[int] = set()
+        for tick in range(used + 1, min(max(newest, highest), self._ends[peer]) + 1):
+            listed = first_listed.get(tick)
+            if listed is None and tick <= newest:
+                probable.add(tick)
+            elif listed is not None and listed < n:
+                certain.add(tick)
+        return certain, probable
+
+    @cached_property
+    def _first_listed(self) -> list[dict[int, int]]:
+        """Per peer and sample, the first record (by its place) that lists it."""
+        listed: list[dict[int, int]] = [{} for _ in self._peers]
+        for m, state in enumerate(self._log.states):
+            for peer, tick, _ in state.rx:
+                if 0 <= peer < len(listed):
+                    listed[peer].setdefault(tick, m)
+        return listed
+
     def _next_listed(self, peer: int, n: int) -> int:
         """Returns the tick of the first sample of a peer that record n or a later one lists."""
-        for state in self._log.states[n:]:
-            for j, tick, _ in state.rx:
-                if j == peer:
-                    return tick
-        return self._ends[peer] + 1
+        later = (tick for state in islice(self._log.states, n, None) for j, tick, _ in state.rx if j == peer)
+        return next(later, self._ends[peer] + 1)

@@ -208,9 +208,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     def text(self) -> str:
         """The canonical TOML text."""
         tables: dict[str, Any] = msgspec.to_builtins(self)
-        first = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
-        tables = {key: value for key, value in first.items() if value} | tables
-        return _NUMBERS.sub(_one_line, tomli_w.dumps(tables, multiline_strings=True))
+        words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
+        words = {key: value for key, value in words.items() if value}
+        numbers = _NUMBERS.sub(_one_line, tomli_w.dumps(tables))
+        return tomli_w.dumps(words, multiline_strings=True) + numbers
 
     @cached_property
     def sha256(self) -> str:

@@ -212,7 +212,7 @@ def _resolve(tables: Table) -> Table:
     for group, kind in (("arm", Arm), ("control", Control), ("limits", Limits), ("link", Link)):
         _known(tables.get(group, {}), _fields(kind), group)
     sites = _resolve_sites(tables)
-    resolved = {key: tables[key] for key in _TOP if key in tables and key != "rate_hz"}
+    resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
     return {
         "duration_s": 20.0,
         "seed": 1,
@@ -222,6 +222,13 @@ def _resolve(tables: Table) -> Table:
         "dominance": _resolve_dominance(tables, list(sites)),
         "links": _resolve_links(tables, list(sites)),
     }
+
+
+def _unix_lines(value: Any) -> Any:
+    """Returns text with one kind of line ends, which is what TOML keeps; other values as they are."""
+    if isinstance(value, list):
+        return [_unix_lines(entry) for entry in value]
+    return value.replace("\r\n", "\n").replace("\r", "\n") if isinstance(value, str) else value
 
 
 def _resolve_sites(tables: Table) -> Table:

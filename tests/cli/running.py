@@ -1,0 +1,58 @@
+"""`trilat`, run in this process through its own `main`, and what its errors must look like."""
+
+import contextlib
+import io
+import os
+import sys
+from pathlib import Path
+from unittest import mock
+
+from trilat_net.cli import main
+
+COMMAND = [sys.executable, "-m", "trilat_net"]
+"""The same as a process of its own."""
+
+PLAIN = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "100"}
+
+
+class Done:
+    """How a command ended, and what it printed."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    def __repr__(self) -> str:
+        return f"exit code {self.code}\n--- out\n{self.out}\n--- err\n{self.err}"
+
+    def succeeds(self) -> str:
+        """It ended well and complained of nothing; returns what it printed."""
+        assert self.code == 0, self
+        assert self.err == "", self
+        return self.out
+
+    def refuses(self, *facts: str, code: int = 2) -> None:
+        """It said in one line what is wrong, with these facts, and no more."""
+        assert self.code == code, self
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self
+        assert lines[0].startswith("error: "), self
+        for fact in facts:
+            assert fact in self.err, self
+
+
+def trilat(*arguments: str | Path, cwd: Path) -> Done:
+    """Runs a command in a folder to its end."""
+    out, err = io.StringIO(), io.StringIO()
+    code: object = None
+    with (
+        contextlib.chdir(cwd),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch.object(sys, "argv", ["trilat", *map(str, arguments)]),
+        mock.patch.dict(os.environ, PLAIN),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    return Done(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())

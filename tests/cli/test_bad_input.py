@@ -1,0 +1,118 @@
+"""Bad input is one line on stderr and exit code 2: what is wrong, where, and what would be right."""
+
+from pathlib import Path
+
+import pytest
+
+from .running import trilat
+
+OVERRIDES = {
+    "control.Kq=5": ("control.Kq", "Kp"),
+    "sites.m3.rate_hz=100": ("m3",),
+    "rate_hz=0": ("rate_hz",),
+    "link.delay_ms=-1": ("delay_ms",),
+    "links.m1->x.delay_ms=1": ("m1->x",),
+    "control.Kp=nan": ("Kp", "finite"),
+    "control.Kp=inf": ("Kp", "finite"),
+    "control.Kp=[1,2,3]": ("Kp",),
+    "control.Kp=-1": ("Kp",),
+    'control.Kp="text"': ("Kp",),
+    "dominance.m1.m2=0.7": ("dominance.m1", "sum"),
+    "scheme='third_order'": ("scheme", "second_order"),
+    "duration_s=0": ("duration_s",),
+    "arm.m1_kg=0": ("m1_kg",),
+    "limits.tau_limit_nm=0": ("tau_limit_nm",),
+    "no_equals_sign": ("no_equals_sign", "="),
+    "=5": (),
+    "": (),
+    "control.Kp=": ("control.Kp",),
+}
+
+
+@pytest.mark.parametrize("override", OVERRIDES)
+def test_an_override_that_cannot_be_right_is_named(override: str, tmp_path: Path) -> None:
+    done = trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path)
+    done.refuses(*OVERRIDES[override])
+
+
+FILES = {
+    "nothing": (b"", ("is missing",)),
+    "no TOML": (b"[[[", ("TOML",)),
+    "no text": (b"\xff\xfe\x00", ("UTF-8",)),
+    "one site": (b'name="x"\n[sites.a]\n[dominance]\na={}\n', ("sites", "two")),
+    "unknown key": (b'name="x"\nduratoin_s=1\n[sites]\n[dominance]\n', ("duratoin_s", "duration_s")),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_file_that_is_no_scenario_is_named(kind: str, tmp_path: Path) -> None:
+    content, facts = FILES[kind]
+    (tmp_path / "bad.toml").write_bytes(content)
+    trilat("scenario", "check", "bad.toml", cwd=tmp_path).refuses("bad.toml", *facts)
+
+
+COMMANDS = {
+    "a scenario that is not shipped": (["sim", "papre"], ["papre", "paper"]),
+    "a scenario file that is not there": (["sim", "./none.toml"], ["none.toml", "No such file"]),
+    "a directory as a scenario": (["sim", "./"], ["directory"]),
+    "an unknown site": (["site", "m9", "--scenario", "paper"], ["m9", "m1"]),
+    "a session's name that is no key": (
+        ["site", "m1", "--scenario", "paper", "--session", "a/*"],
+        ["session", "a/*"],
+    ),
+    "no session's name": (["record", "--session", ""], ["session"]),
+    "a malformed endpoint": (["site", "m1", "--scenario", "paper", "--listen", "nonsense"], ["nonsense"]),
+    "an endpoint of an unknown kind": (
+        ["record", "--session", "x", "--connect", "pigeon/1:2"],
+        ["pigeon/1:2"],
+    ),
+    "an endless duration": (["sim", "paper", "--duration", "inf"], ["duration_s"]),
+    "no duration": (["sim", "paper", "--duration", "nan"], ["duration_s"]),
+    "a negative duration": (["sim", "paper", "--duration", "-1"], ["duration_s"]),
+    "a negative seed": (["sim", "paper", "--seed", "-1"], ["seed"]),
+    "an output that cannot be made": (["sim", "paper", "-o", "no/where.mcap"], ["no/where.mcap"]),
+    "a directory as output": (["sim", "paper", "-o", ".", "--force"], ["."]),
+    "a recording that cannot be made": (
+        ["record", "--session", "x", "-o", "no/where.mcap", "--join-timeout", "1"],
+        ["no/where.mcap"],
+    ),
+    "a recording onto a directory": (["record", "--session", "x", "-o", ".", "--force"], ["."]),
+    "an endless wait": (["site", "m1", "--scenario", "paper", "--join-timeout", "inf"], ["join-timeout"]),
+    "a wait that is no number": (
+        ["site", "m1", "--scenario", "paper", "--join-timeout", "nan"],
+        ["join-timeout"],
+    ),
+    "a negative wait": (["record", "--session", "x", "--join-timeout", "-1"], ["join-timeout"]),
+    "a log that is not there": (["verify", "none.mcap"], ["none.mcap", "No such file"]),
+    "a directory as a log": (["verify", "."], ["directory"]),
+    "a report of nothing": (["report", "none.mcap"], ["none.mcap", "No such file"]),
+    "a report of a directory": (["report", "."], ["directory"]),
+}
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> None:
+    arguments, facts = COMMANDS[kind]
+    trilat(*arguments, cwd=tmp_path).refuses(*facts)
+    assert list(tmp_path.iterdir()) == []  # and nothing is left behind
+
+
+@pytest.mark.parametrize(
+    "arguments", [["fly"], ["sim"], ["sim", "paper", "--fast"], ["sim", "paper", "--seed", "x"], ["scenario"]]
+)
+def test_usage_errors_exit_with_2_without_a_traceback(arguments: list[str], tmp_path: Path) -> None:
+    done = trilat(*arguments, cwd=tmp_path)
+    assert done.code == 2, done
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("command", [["demo", "two_sites", "--duration", "1"]])
+def test_a_demo_keeps_what_is_in_its_folder(command: list[str], tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("precious")
+    trilat(*command, "--out", tmp_path, cwd=tmp_path).refuses("holds something", "--force")
+    assert [path.name for path in tmp_path.iterdir()] == ["precious"]
+
+
+def test_a_demo_into_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    trilat("demo", "two_sites", "--out", "file", cwd=tmp_path).refuses("file", "Not a directory")

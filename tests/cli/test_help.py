@@ -1,0 +1,63 @@
+import re
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from trilat_net.cli import app
+
+COMMANDS = [
+    ["demo"],
+    ["site"],
+    ["record"],
+    ["sim"],
+    ["verify"],
+    ["report"],
+    ["scenario", "list"],
+    ["scenario", "show"],
+    ["scenario", "check"],
+    ["scenario", "new"],
+]
+
+
+def printed(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments), env={"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_every_command_has_help_with_an_example(command: list[str], option: str) -> None:
+    text = printed(*command, option)
+    assert f"Example: trilat {' '.join(command)}" in text
+
+
+def test_these_are_all_the_commands() -> None:
+    root = typer.main.get_command(app)
+    named = {
+        (*path, name)
+        for path, group in (((), root), (("scenario",), root.commands["scenario"]))
+        for name in group.commands
+        if name != "scenario"
+    }
+    assert named == {tuple(command) for command in COMMANDS}
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "show", "check")]
+)
+def test_every_command_that_takes_a_scenario_takes_overrides(command: list[str]) -> None:
+    assert "--set" in printed(*command, "--help")
+
+
+def test_the_main_help_names_what_to_begin_with() -> None:
+    assert "trilat demo paper" in printed("--help")
+
+
+def test_every_option_is_explained() -> None:
+    for command in COMMANDS:
+        for line in printed(*command, "--help").splitlines():
+            option = re.match(r"[│| ]*(--[a-z-]+)", line)
+            if option and "--install" not in line and "--show" not in line:
+                assert re.search(r"[a-z]{3,}[ :,]", line.split(option[1], 1)[1], re.IGNORECASE), line

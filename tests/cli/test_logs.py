@@ -1,0 +1,169 @@
+"""`sim`, `verify` and `report`: files that are the same, files that were changed, files that are torn."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from trilat_net.log.reader import open_log
+
+from .running import trilat
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def changed(log: bytes, find: bytes, replace: bytes, *, attachment: bool = False) -> bytes:
+    """A log in which one payload, or its scenario, has been edited; otherwise whole and well-formed."""
+    reader = make_reader(io.BytesIO(log))
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.ZSTD)
+    writer.start()
+    summary = reader.get_summary()
+    for record in reader.iter_metadata():
+        writer.add_metadata(record.name, record.metadata)
+    for record in reader.iter_attachments():
+        data = record.data.replace(find, replace, 1) if attachment else record.data
+        assert not attachment or data != record.data
+        writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, data)
+    schemas = {s.id: writer.register_schema(s.name, s.encoding, s.data) for s in summary.schemas.values()}
+    channels = {
+        c.id: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+        for c in summary.channels.values()
+    }
+    edited = attachment
+    for _, channel, message in reader.iter_messages(log_time_order=False):
+        data = message.data
+        if not edited and find in data:
+            data, edited = data.replace(find, replace, 1), True
+        writer.add_message(
+            channels[channel.id], message.log_time, data, message.publish_time, message.sequence
+        )
+    assert edited
+    writer.finish()
+    return stream.getvalue()
+
+
+def test_two_runs_of_one_scenario_and_seed_are_the_same_file(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        trilat("sim", "two_sites", "--duration", "1", "-o", name, cwd=tmp_path).succeeds()
+    trilat("sim", "two_sites", "--duration", "1", "-o", "c.mcap", "--seed", "2", cwd=tmp_path).succeeds()
+    assert sha256(tmp_path / "a.mcap") == sha256(tmp_path / "b.mcap") != sha256(tmp_path / "c.mcap")
+    log = open_log(tmp_path / "a.mcap")
+    assert (log.complete, log.driver, len(log["m"])) == (True, "virtual", 1000)
+
+
+def test_a_log_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
+    path = tmp_path / "two_sites.mcap"  # the name that it has by default
+    path.write_bytes(b"precious")
+    trilat("sim", "two_sites", "--duration", "0.1", cwd=tmp_path).refuses("two_sites.mcap", "--force")
+    assert path.read_bytes() == b"precious"
+    trilat("sim", "two_sites", "--duration", "0.1", "--force", cwd=tmp_path).succeeds()
+    assert open_log(path).complete
+
+
+def test_a_run_that_diverges_says_so_and_exits_with_1(tmp_path: Path) -> None:
+    done = trilat("sim", "paper", "--set", "limits.qd_limit_rad_s=0.5", "-o", "d.mcap", cwd=tmp_path)
+    done.refuses("diverged", "qd_limit_rad_s", code=1)
+    log = open_log(tmp_path / "d.mcap")
+    assert log.complete
+    assert "diverged" in {event.kind for event in log.events}
+    assert any(log[name].states[-1].mode == "diverged" for name in log.sites)
+    trilat("verify", "d.mcap", cwd=tmp_path).succeeds()
+
+
+def test_verify_says_that_every_record_is_identical(log_file: Path) -> None:
+    text = trilat("verify", log_file, cwd=log_file.parent).succeeds()
+    assert "1500/1500 records identical" in text
+
+
+def test_verify_compares_with_virtual_time_too(log_file: Path) -> None:
+    text = trilat("verify", log_file, "--virtual", cwd=log_file.parent).succeeds()
+    assert text.count("1500/1500 records identical") == 3
+    assert "0 late samples" in text
+
+
+def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: bytes) -> None:
+    log = open_log(log_file)
+    record = log["m2"].payloads[300]
+    place = record.index(b"\xa3tau\x92\xcb") + 6 + 7  # the last bit of the first torque
+    spoilt = record[:place] + bytes([record[place] ^ 1]) + record[place + 1 :]
+    log_file.write_bytes(changed(short_log, record, spoilt))
+    done = trilat("verify", log_file, cwd=log_file.parent)
+    assert done.code == 1, done
+    assert "1499/1500 records identical" in done.err
+    for fact in ("m2", "300", "tau"):
+        assert fact in done.err
+    assert "Traceback" not in done.err
+
+
+def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: bytes) -> None:
+    log_file.write_bytes(changed(short_log, b"Kd = [3.0, 3.0]", b"Kd = [3.5, 3.0]", attachment=True))
+    done = trilat("verify", log_file, cwd=log_file.parent)
+    assert done.code == 1, done
+    assert "tau" in done.err
+    assert "scenario" in done.err
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\x89MCAP0\r\n", b"\x00" * 10_000])
+@pytest.mark.parametrize("command", ["verify", "report"])
+def test_a_file_that_is_no_log_is_bad_input(command: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(content)
+    trilat(command, "bad.mcap", cwd=tmp_path).refuses("bad.mcap")
+
+
+def test_a_log_of_another_program_is_bad_input(tmp_path: Path) -> None:
+    with (tmp_path / "other.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    trilat("verify", "other.mcap", cwd=tmp_path).refuses("no log of trilat-net")
+
+
+def test_a_torn_log_is_verified_as_far_as_it_is_whole_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "torn.mcap"
+    trilat("sim", "paper", "--duration", "2", "-o", path, cwd=tmp_path).succeeds()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    records = sum(len(open_log(path)[name]) for name in ("m1", "m2", "s"))
+    assert 0 < records < 6000
+    text = trilat("verify", path, cwd=tmp_path).succeeds()
+    assert "the file was not finished" in text
+    assert f"{records}/{records} records identical" in text
+
+
+def test_a_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path, short_log: bytes) -> None:
+    log_file.write_bytes(short_log[: len(short_log) * 2 // 3])  # inside its only chunk
+    done = trilat("verify", log_file, cwd=log_file.parent)
+    done_text = done.out + done.err
+    assert done.code == 1, done
+    assert "not finished" in done_text
+    assert "no records to execute" in done.err
+
+
+def test_a_report_has_a_page_a_summary_and_figures(log_file: Path) -> None:
+    folder = log_file.parent / "report"
+    text = trilat("report", log_file, "-o", folder, cwd=log_file.parent).succeeds()
+    assert "1500/1500 records identical" in text
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html")
+    assert 'src="http' not in page  # it works offline
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    figures = list(folder.glob("*.png"))
+    assert len(figures) >= 4
+    assert all(figure.read_bytes().startswith(b"\x89PNG") for figure in figures)
+    for path in ("report.html", "summary.json", figures[0].name):
+        assert path in text
+
+
+def test_a_report_goes_beside_its_log_and_keeps_what_is_there(log_file: Path) -> None:
+    trilat("report", log_file, cwd=log_file.parent).succeeds()
+    assert (log_file.with_suffix("") / "report.html").exists()
+    trilat("report", log_file, cwd=log_file.parent).refuses("holds something", "--force")
+    trilat("report", log_file, "--force", cwd=log_file.parent).succeeds()
+    assert log_file.exists()

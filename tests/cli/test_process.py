@@ -1,0 +1,92 @@
+"""What the command is as a process: pipes, Ctrl-C, what it imports."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.net.waiting import until
+
+from .running import COMMAND, PLAIN, trilat
+
+
+@pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["scenario", "list"], ["sim", "--help"]])
+def test_a_reader_that_had_enough_is_no_error(command: list[str], tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, *command], cwd=tmp_path, env=PLAIN, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    _, err = process.communicate(timeout=60)
+    assert err == b""
+
+
+def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "sim", "paper", "--duration", "2000", "-o", "long.mcap"],
+        cwd=tmp_path,
+        env=PLAIN,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    path = tmp_path / "long.mcap"
+    until(lambda: path.exists() and path.stat().st_size > 100_000, timeout_s=60)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+
+
+BLOCKED = """
+import sys
+for name in {blocked!r}:
+    sys.modules[name] = None
+import trilat_net, trilat_net.experiment, trilat_net.conclusion, trilat_net.cli
+from typer.testing import CliRunner
+for arguments in {commands!r}:
+    result = CliRunner().invoke(trilat_net.cli.app, arguments)
+    assert result.exit_code == 0, (arguments, result.output, result.exception)
+assert trilat_net.simulate("two_sites", set={{"duration_s": 0.1}})["m"].q.shape == (100, 2)
+assert not [name for name in sys.modules if name == "zenoh" or name.startswith(("sites", "recorder"))]
+"""
+
+
+def test_virtual_time_and_files_need_neither_posix_nor_zenoh(tmp_path: Path) -> None:
+    program = BLOCKED.format(
+        blocked=["fcntl", "resource", "pwd", "grp", "zenoh", "termios"],
+        commands=[
+            ["scenario", "list"],
+            ["scenario", "show", "paper"],
+            ["scenario", "check", "paper"],
+            ["scenario", "new", "mine.toml"],
+            ["sim", "two_sites", "--duration", "0.2", "-o", "run.mcap"],
+            ["verify", "run.mcap", "--virtual"],
+            ["report", "run.mcap"],
+        ],
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=PLAIN, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
+    program = (
+        "import sys, trilat_net.cli\n"
+        "heavy = {'numba', 'numpy', 'zenoh', 'mcap', 'matplotlib', 'msgspec'} & set(sys.modules)\n"
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_text_with_square_brackets_is_printed_as_it_is(tmp_path: Path) -> None:
+    done = trilat("sim", "[bold]x[/bold].toml", cwd=tmp_path)
+    done.refuses("[bold]x[/bold].toml")
+    done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "[/red].mcap", cwd=tmp_path)
+    assert done.code == 2, done  # "[" + "/red].mcap": a folder that is not there
+    done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "[red].mcap", cwd=tmp_path)
+    assert "[red].mcap" in done.succeeds()

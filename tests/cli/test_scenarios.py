@@ -1,0 +1,64 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from trilat_net.scenario import load, shipped
+
+from .running import trilat
+
+SHIPPED = {"paper", "paper_rods", "free", "asymmetric", "two_sites"}
+
+
+def test_list_names_every_shipped_scenario(tmp_path: Path) -> None:
+    text = trilat("scenario", "list", cwd=tmp_path).succeeds()
+    assert set(shipped()) >= SHIPPED
+    for name in shipped():
+        assert name in text
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED))
+def test_what_show_prints_is_the_same_scenario(name: str, tmp_path: Path) -> None:
+    text = trilat("scenario", "show", name, cwd=tmp_path).succeeds()
+    copy = tmp_path / "copy.toml"
+    copy.write_text(text)
+    assert load(copy).sha256 == load(name).sha256
+    assert f"sha256 {load(name).sha256[:16]}" in trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
+
+
+def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
+    text = trilat(
+        *("scenario", "show", "paper", "--set", "control.Kd=5", "--set", "links.m1->s.delay_ms=7"),
+        *("--duration", "3", "--seed", "9"),
+        cwd=tmp_path,
+    ).succeeds()
+    tables = tomllib.loads(text)
+    assert all(site["control"]["Kd"] == [5.0, 5.0] for site in tables["sites"].values())
+    assert tables["links"]["m1->s"]["delay_ms"] == 7.0
+    assert tables["links"]["s->m1"]["delay_ms"] == 200.0
+    assert (tables["duration_s"], tables["seed"]) == (3.0, 9)
+
+
+def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
+    text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
+    assert "m1 0.42" in text
+    assert "20000 ticks of m1" in text
+    assert "m2->s 310 ms" in text
+    assert "assumed: " in text
+
+
+def test_new_writes_a_commented_template_that_is_valid(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    trilat("scenario", "new", path, cwd=tmp_path).succeeds()
+    text = path.read_text()
+    assert text.count("#") > 20
+    trilat("scenario", "check", "mine.toml", cwd=tmp_path).succeeds()
+
+
+def test_new_keeps_what_exists_unless_forced(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("precious")
+    trilat("scenario", "new", path, cwd=tmp_path).refuses("mine.toml", "exists", "--force")
+    assert path.read_text() == "precious"
+    trilat("scenario", "new", path, "--force", cwd=tmp_path).succeeds()
+    assert path.read_text() != "precious"

@@ -1,0 +1,196 @@
+"""Real processes of a session, started, watched and ended by a test."""
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.cli.running import COMMAND, PLAIN
+from tests.net.waiting import until
+from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.log.reader import Log, open_log
+from trilat_net.net.endpoints import free_endpoints
+
+BEGUN = "the session begins"
+PATIENCE_S = 60.0
+
+
+class Process:
+    """One process, with what it prints in a file."""
+
+    def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
+        self.name = name
+        self._printed = folder / f"{name}.printed"
+        with self._printed.open("wb") as sink:
+            self._process = subprocess.Popen(
+                [*COMMAND, *arguments],
+                cwd=folder,
+                env=PLAIN,
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self.pid = self._process.pid
+
+    def text(self) -> str:
+        """All that it has printed."""
+        return self._printed.read_text(encoding="utf-8", errors="replace")
+
+    def prints(self, sentence: str) -> None:
+        """Returns once it has printed a sentence."""
+        until(lambda: sentence in self.text() or self.ended(), PATIENCE_S)
+        assert sentence in self.text(), self
+
+    def ended(self) -> bool:
+        return self._process.poll() is not None
+
+    def signal(self, number: int) -> None:
+        if not self.ended():
+            self._process.send_signal(number)
+
+    def code(self, timeout_s: float = PATIENCE_S) -> int:
+        """Its exit code, once it has ended by itself."""
+        until(self.ended, timeout_s)
+        assert "Traceback" not in self.text(), self
+        return int(self._process.returncode)
+
+    def children(self) -> dict[int, str]:
+        """Its child processes: their command lines by their ids."""
+        children = {}
+        for pid in Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split():
+            with contextlib.suppress(OSError):
+                line = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+                if "trilat_net" in line:
+                    children[int(pid)] = line
+        return children
+
+    def end(self) -> None:
+        """Ends it, whatever it is doing."""
+        for number in (signal.SIGCONT, signal.SIGINT, signal.SIGKILL):
+            self.signal(number)
+            with contextlib.suppress(AssertionError):
+                until(self.ended, 0.0 if number == signal.SIGCONT else 20.0)
+                return
+
+    def __repr__(self) -> str:
+        return f"{self.name}: exit code {self._process.poll()}, printed\n{self.text()}"
+
+
+def gone(pid: int) -> bool:
+    """True where no process has that id."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+class Stage:
+    """A folder and the processes that a test has started in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._started: list[Process] = []
+
+    def start(self, name: str, *arguments: str) -> Process:
+        process = Process(name, arguments, self.folder)
+        self._started.append(process)
+        return process
+
+    def clear(self) -> None:
+        for process in self._started:
+            process.end()
+
+
+class Session:
+    """The processes of one session on explicit endpoints.
+
+    Args:
+        stage: where they run.
+        scenario: a shipped one.
+        sites: its sites.
+        options: what every site is given besides, as in `--set KEY=VALUE`.
+    """
+
+    def __init__(self, stage: Stage, scenario: str, sites: Sequence[str], *options: str) -> None:
+        self._stage, self._scenario, self._options = stage, scenario, options
+        self.sites = tuple(sites)
+        self.endpoints = free_endpoints(len(sites))
+        self.log = stage.folder / "run.mcap"
+        self.processes: dict[str, Process] = {}
+
+    def site(self, name: str, *more: str, called: str = "", listen: str = "") -> Process:
+        """Starts a site."""
+        index = self.sites.index(name)
+        process = self._stage.start(
+            called or name,
+            *("site", name, "--scenario", self._scenario, "--session", "t", *self._options),
+            *("--listen", listen or self.endpoints[index], *connections(self.endpoints[:index])),
+            *more,
+        )
+        self.processes[called or name] = process
+        return process
+
+    def recorder(self, *more: str) -> Process:
+        """Starts the recorder."""
+        process = self._stage.start(
+            "recorder",
+            *("record", "--session", "t", "-o", str(self.log), *connections(self.endpoints), *more),
+        )
+        self.processes["recorder"] = process
+        return process
+
+    def all(self, *order: str) -> None:
+        """Starts every member, in an order."""
+        for name in order or ("recorder", *self.sites):
+            if name == "recorder":
+                self.recorder()
+            else:
+                self.site(name, "--needs-recorder")
+
+    def begun(self) -> None:
+        """Returns once every member is in the session."""
+        for process in self.processes.values():
+            process.prints(BEGUN)
+
+    def codes(self) -> dict[str, int]:
+        """How every member ended."""
+        return {name: process.code() for name, process in self.processes.items()}
+
+
+def connections(endpoints: Sequence[str]) -> list[str]:
+    return [word for endpoint in endpoints for word in ("--connect", endpoint)]
+
+
+def whole(path: Path) -> Log:
+    """The log of a session that ended in order: every record of every tick is there."""
+    log = open_log(path)
+    assert log.complete
+    for name in log.sites:
+        assert [state.tick for state in log[name].states] == list(range(log.scenario.ticks(name)))
+    assert all("missing 0, duplicate 0" in log.accounts[f"/{name}"] for name in log.sites)
+    return log
+
+
+def executed_again(log: Log) -> None:
+    """Every record is what its inputs give."""
+    verdict = verify(log)
+    assert verdict.whole_run
+    assert verdict.first is None
+    assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
+
+
+def equal_to_virtual_time(log: Log) -> None:
+    """Fed with its arrivals: always and everywhere. Plain: until a sample was late, if one was."""
+    twins = compare_with_virtual(log)
+    records = sum(len(log[name]) for name in log.sites)
+    assert twins.fed.first is None
+    assert twins.fed.identical == twins.fed.records == records
+    if twins.late:
+        assert twins.plain.first is None or twins.plain.first.tick >= twins.late[0].due_tick
+    else:
+        assert twins.plain.first is None
+        assert twins.plain.identical == twins.plain.records == records

@@ -1,0 +1,82 @@
+"""The demo ends in order whatever happens: it says what, its children are gone, its log is valid."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.net.waiting import until
+from trilat_net.experiment import verify
+from trilat_net.log.reader import open_log
+
+from .processes import Process, Stage, gone
+
+
+def demo(stage: Stage, duration: str = "20") -> Process:
+    return stage.start(
+        "demo", "demo", "two_sites", "--duration", duration, "--out", str(stage.folder / "out")
+    )
+
+
+def child(demo: Process, words: str) -> int:
+    """The id of the demo's child with these words in its command line."""
+    return until(lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30)
+
+
+def recording(stage: Stage) -> Path:
+    """The demo's log, once records are in it."""
+    log = stage.folder / "out" / "run.mcap"
+    until(lambda: log.exists() and log.stat().st_size > 20_000, 60)
+    return log
+
+
+def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Stage) -> None:
+    running = demo(stage)
+    log_file = recording(stage)
+    children = running.children()
+    assert len(children) == 3
+    os.kill(child(running, "site s "), signal.SIGKILL)
+    assert running.code() == 1
+    assert "error: s was killed by SIGKILL" in running.text()
+    assert all(gone(pid) for pid in children)
+    log = open_log(log_file)
+    assert log.complete
+    verdict = verify(log)
+    assert verdict.passed
+    assert verdict.identical > 0
+    assert [event.about for event in log.events if event.kind == "lost"] == ["s"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_run_ends_all_and_finishes_the_file(number: int, stage: Stage) -> None:
+    running = demo(stage)
+    log_file = recording(stage)
+    children = running.children()
+    running.signal(number)
+    assert running.code() == 128 + number
+    assert all(gone(pid) for pid in children)
+    log = open_log(log_file)
+    assert log.complete
+    assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
+    assert verify(log).passed
+    assert "run.mcap holds what there was" in running.text()
+
+
+@pytest.mark.parametrize("first_child", ["site m ", "record "])
+def test_ctrl_c_before_the_session_begins_ends_all_and_leaves_no_log(first_child: str, stage: Stage) -> None:
+    running = demo(stage)
+    child(running, first_child)
+    children = running.children()
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    assert all(gone(pid) for pid in children)
+    assert not (stage.folder / "out" / "run.mcap").exists()
+
+
+def test_ctrl_c_before_any_child_is_started_is_130(stage: Stage) -> None:
+    running = demo(stage)
+    running.prints("s live: ")
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    assert running.ended()

@@ -1,0 +1,207 @@
+"""Live sessions: real processes and Zenoh on loopback, equal to virtual time bit for bit."""
+
+import signal
+
+import pytest
+
+from tests.net.waiting import until
+from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.log.reader import open_log
+from trilat_net.net import topics
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.zenoh_bus import ZenohBus
+
+from .processes import BEGUN, Session, Stage, equal_to_virtual_time, executed_again, whole
+
+PAPER = ("m1", "m2", "s")
+
+
+def well(*members: str) -> dict[str, int]:
+    return dict.fromkeys(members, 0)
+
+
+def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "5")
+    session.all()
+    assert session.codes() == well("recorder", *PAPER)
+    log = whole(session.log)
+    assert sum(len(log[name]) for name in PAPER) == 15_000
+    executed_again(log)
+    equal_to_virtual_time(log)
+    for name in PAPER:
+        assert f"{name}: 5000 of 5000 records, 0 missing" in session.processes["recorder"].text()
+        kinds = [event.kind for event in log.events if event.member == name]
+        assert kinds.count("ready") + kinds.count("epoch") >= 1
+        assert kinds[-1] == "end"
+        assert "lost" not in kinds
+
+
+def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> None:
+    """With the `digital` scheme, so that it is seen live too; and a second m1 is refused meanwhile."""
+    session = Session(stage, "paper", PAPER, "--duration", "4", "--set", 'scheme="digital"')
+    session.all()
+    session.begun()
+    second = session.site("m1", called="second m1", listen=session.endpoints[0][:-1] + "0")
+    junk = [b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000]
+    clock = SystemClock()
+    bus = ZenohBus([], session.endpoints)
+    try:
+        bus.announce(topics.key("t", "m1", topics.ALIVE) + "/no-number")
+        publishers = [
+            bus.publisher(topics.key("t", member, channel))
+            for member in (*PAPER, "recorder", "nobody")
+            for channel in (topics.STATE, topics.EVENT, topics.LINK)
+        ]
+
+        def shouted() -> bool:
+            for payload in junk:
+                for publish in publishers:
+                    publish(payload)
+            return session.processes["s"].ended()
+
+        until(shouted, clock=clock)
+    finally:
+        bus.close()
+    assert second.code() == 2
+    session.processes.pop("second m1")
+    assert session.codes() == well("recorder", *PAPER)
+    log = whole(session.log)
+    executed_again(log)
+    equal_to_virtual_time(log)
+    for name in PAPER:
+        dropped = log.link_stats(name)[-1].dropped
+        assert dropped["malformed"] > 0
+        assert dropped["oversized"] > 0
+    assert int(log.accounts["dropped: malformed"]) > 0
+    assert int(log.accounts["dropped: oversized"]) > 0
+
+
+def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "4", "--set", "link.delay_ms=2000")
+    session.all()
+    session.begun()
+    clock = SystemClock()
+    clock.sleep_until(clock.monotonic_ns() + 1_500_000_000)  # some ticks into the run
+    session.processes["m2"].signal(signal.SIGSTOP)
+    clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
+    session.processes["m2"].signal(signal.SIGCONT)
+    assert session.codes() == well("recorder", *PAPER)
+    log = whole(session.log)
+    assert max(log["m2"].late_us) > 800_000
+    executed_again(log)
+    twins = compare_with_virtual(log)
+    assert twins.late == []
+    assert twins.plain.first is None
+    assert twins.plain.identical == twins.fed.identical == 12_000
+
+
+@pytest.mark.parametrize("order", [("recorder", "s", "m"), ("s", "m", "recorder")], ids=" ".join)
+def test_any_start_order_begins_one_session(order: tuple[str, ...], stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
+    for before, name in enumerate(order):
+        session.all(name)
+        if before < 2:
+            session.processes[name].prints("waiting for")
+    assert session.codes() == well("recorder", "m", "s")
+    log = whole(session.log)
+    executed_again(log)
+    started = [event for event in log.events if event.kind == "start"]
+    assert [event.member for event in started] == ["m"]
+    assert set(started[0].boots) == {"recorder", "m", "s"}
+
+
+def test_separate_terminals_without_endpoints_and_two_sessions_that_do_not_meet(stage: Stage) -> None:
+    seed = SystemClock().monotonic_ns()  # names of this test's own, hence ports of its own
+    names = [f"terminals-{seed}", f"others-{seed}"]
+    members = []
+    for name in names:
+        scenario = ("--scenario", "two_sites", "--session", name, "--duration", "1")
+        members += [
+            stage.start(f"{name} s", "site", "s", *scenario, "--needs-recorder"),
+            stage.start(f"{name} recorder", "record", "--session", name),
+            stage.start(f"{name} m", "site", "m", *scenario),
+        ]
+    for member in members:
+        assert member.code() == 0, member
+    for name in names:
+        log = whole(stage.folder / f"{name}.mcap")
+        assert log.session["session"] == name
+        executed_again(log)
+        equal_to_virtual_time(log)
+        assert "lost" not in {event.kind for event in log.events}
+
+
+def test_a_recorder_that_is_interrupted_finishes_its_file_and_the_sites_go_on(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "2")
+    session.all()
+    session.begun()
+    recorder = session.processes["recorder"]
+    until(lambda: session.log.exists() and session.log.stat().st_size > 20_000)
+    recorder.signal(signal.SIGINT)
+    assert recorder.code() == 130
+    log = open_log(session.log)
+    assert log.complete
+    assert 0 < len(log["m"]) < 2000
+    assert verify(log).passed
+    assert session.codes() == {"recorder": 130, "m": 0, "s": 0}
+    assert "m: 2000 ticks" in session.processes["m"].text()
+
+
+def test_a_site_that_leaves_its_limits_ends_the_session_and_says_so(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10")
+    session.all()
+    assert session.codes() == {"recorder": 0, **dict.fromkeys(PAPER, 1)}
+    for name in PAPER:
+        assert "diverged at t = " in session.processes[name].text()
+    log = open_log(session.log)
+    assert log.complete
+    assert verify(log).passed
+    diverged = {event.member for event in log.events if event.kind == "diverged"}
+    assert diverged
+    for name in diverged:
+        assert log[name].states[-1].mode == "diverged"
+
+
+def test_a_peer_that_never_comes_is_named(stage: Stage) -> None:
+    alone = Session(stage, "paper", PAPER).site("m2", "--join-timeout", "1")
+    assert alone.code() == 2
+    (error,) = (line for line in alone.text().splitlines() if line.startswith("error: "))
+    assert "m1, s never came" in error
+    assert BEGUN not in alone.text()
+
+
+def test_a_session_that_never_begins_leaves_no_file(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER)
+    recorder = session.recorder("--join-timeout", "1")
+    assert recorder.code() == 2
+    assert "it met nobody" in recorder.text()
+    assert not session.log.exists()
+
+
+def test_a_busy_port_is_named(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"))
+    holder = ZenohBus(session.endpoints[:1])
+    try:
+        site = session.site("m")
+        assert site.code() == 2
+    finally:
+        holder.close()
+    assert f"{session.endpoints[0]}: the port is in use" in site.text()
+
+
+def test_another_scenario_is_refused_with_both_hashes(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"))
+    leader = session.site("m", "--join-timeout", "5")
+    other = session.site("s", "--set", "control.Kd=5")
+    assert (other.code(), leader.code()) == (2, 2)
+    (error,) = (line for line in other.text().splitlines() if line.startswith("error: "))
+    hashes = {stage_hash(overrides) for overrides in ((), ("control.Kd=5",))}
+    assert len(hashes) == 2
+    assert all(name in error for name in hashes)
+    assert "s never came" in leader.text()
+
+
+def stage_hash(overrides: tuple[str, ...]) -> str:
+    from trilat_net.scenario import load
+
+    return load("two_sites", overrides).sha256[:16]

@@ -1,0 +1,183 @@
+"""What the page draws, as data: tables of thinned columns, and charts that name columns of them.
+
+Law: a spike that is in the log is on the page (`decimation`); numbers travel as base64 of little-endian
+int32 and float32, a third of their length as text.
+"""
+
+import base64
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arm import JOINTS, PARAMETERS, Array
+from ..log.reader import Ints, Log
+from . import poses, quantities, style, timing
+from .decimation import thin
+from .motion import THETA_UNITS
+
+BUDGET = 48_000
+"""Buckets of all columns together: what keeps a page near a megabyte, however many sites there are."""
+LIMIT = "limit"
+"""Colour of references, true values and limits."""
+
+Json = dict[str, Any]
+
+
+class Charts:
+    """The charts of a log.
+
+    Args:
+        log: the log.
+        twin: the same experiment with nobody at the arms, or None.
+    """
+
+    def __init__(self, log: Log, twin: Log | None) -> None:
+        self._log = log
+        self._twin = twin
+        self._tables: list[Json] = []
+        columns_per_site = 9 * JOINTS + PARAMETERS + len(log.sites)
+        self._buckets = max(100, min(1200, BUDGET // (columns_per_site * len(log.sites))))
+
+    def data(self) -> Json:
+        """Returns tables and charts, ready for JSON."""
+        charts = [*self._motion(), *self._timing()]
+        return {
+            "end_s": style.span_s(self._log),
+            "colours": {"light": list(style.COLOURS), "dark": list(style.DARK_COLOURS)},
+            "tables": self._tables,
+            "charts": charts,
+            "arms": self._arms(),
+        }
+
+    def _table(self, site: str, tick: Ints, t_s: Array, values: Array) -> int:
+        """Stores the columns of a site, thinned together, and returns the number of the table."""
+        trace = thin(tick, t_s, values, self._buckets)
+        self._tables.append(
+            {
+                "rate_hz": self._log.scenario.sites[site].rate_hz,
+                "tick": _packed(trace.tick.astype("<i4")),
+                "columns": [_packed(column.astype("<f4")) for column in trace.values.T],
+            }
+        )
+        return len(self._tables) - 1
+
+    def _tables_of(self, sites: list[str], quantity: Any) -> dict[str, int]:
+        parts = {site: self._log[site] for site in sites}
+        return {s: self._table(s, part.tick, part.t_s, quantity(part)) for s, part in parts.items()}
+
+    def _series(self, site: str, table: int, column: int, label: str = "") -> Json:
+        return {
+            "label": label or site,
+            "colour": self._log.sites.index(site),
+            "table": table,
+            "column": column,
+        }
+
+    def _chart(self, section: str, title: str, unit: str, series: list[Json], **options: Any) -> Json:
+        return {"section": section, "title": title, "unit": unit, "series": series, **options}
+
+    def _per_joint(self, section: str, title: str, unit: str, tables: dict[str, int]) -> Iterator[Json]:
+        for joint in range(JOINTS):
+            series = [self._series(site, table, joint) for site, table in tables.items()]
+            yield self._chart(section, f"{title}, joint {joint + 1}", unit, series)
+
+    def _motion(self) -> Iterator[Json]:
+        log, sites = self._log, list(self._log.sites)
+        hands = quantities.sites_with_hands(log)
+        if hands:
+            tables = self._tables_of(hands, quantities.hand_torques)
+            yield from self._per_joint("torques", "torque of the hands on the arm", "N m", tables)
+        yield from self._positions()
+        tables = self._tables_of(sites, quantities.errors)
+        yield from self._per_joint("errors", "tracking error", "rad", tables)
+        yield from self._estimates()
+        if self._twin is not None:
+            moved = {s: quantities.moved_by_hands(log, self._twin, s) for s in sites}
+            tables = {s: self._table(s, *columns) for s, columns in moved.items()}
+            yield from self._per_joint("moved", "moved by the hands", "rad", tables)
+        tables = self._tables_of(sites, quantities.control_torques)
+        yield from self._per_joint("control", "control torque", "N m", tables)
+
+    def _positions(self) -> Iterator[Json]:
+        for site in self._log.sites:
+            part = self._log[site]
+            both = np.stack([quantities.angles(part), quantities.references(part)], axis=2)
+            for joint in range(JOINTS):
+                table = self._table(site, part.tick, part.t_s, both[:, joint])
+                desired = {"label": "desired", "colour": LIMIT, "dash": True, "table": table, "column": 1}
+                series = [self._series(site, table, 0), desired]
+                yield self._chart("positions", f"{site}, joint {joint + 1}", "rad", series, site=site)
+
+    def _estimates(self) -> Iterator[Json]:
+        log = self._log
+        tables = self._tables_of(list(log.sites), quantities.estimates)
+        for index in range(PARAMETERS):
+            series = [self._series(site, table, index) for site, table in tables.items()]
+            truths = {site: float(quantities.true_parameters(log, site)[index]) for site in log.sites}
+            same = len(set(truths.values())) == 1
+            lines = [
+                {"value": truth, "colour": LIMIT if same else log.sites.index(site)}
+                for site, truth in list(truths.items())[: 1 if same else None]
+            ]
+            title = f"estimate of θ{'₁₂₃₄₅'[index]}"
+            yield self._chart("estimates", title, THETA_UNITS[index], series, lines=lines)
+
+    def _timing(self) -> Iterator[Json]:
+        log = self._log
+        for site in log.sites:
+            part = log[site]
+            table = self._table(site, part.tick, part.t_s, quantities.ages_ms(log, site))
+            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(part.peers)]
+            delays = {log.scenario.links[f"{peer}->{site}"].delay_ms for peer in part.peers}
+            lines = [{"value": delay, "colour": LIMIT} for delay in sorted(delays)]
+            yield self._chart(
+                "ages", f"age of the samples that {site} uses", "ms", series, lines=lines, zero=True
+            )
+        if timing.has_clock(log):
+            tables = self._tables_of(list(log.sites), lambda part: part.late_us[:, np.newaxis] * 1e-3)
+            series = [self._series(site, table, 0) for site, table in tables.items()]
+            yield self._chart("timing", "wake-up after the deadline", "ms", series, zero=True)
+            yield from self._histograms()
+
+    def _histograms(self) -> Iterator[Json]:
+        log = self._log
+        edges = timing.bin_edges(log)
+        titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
+        for field, title in titles.items():
+            counts = {site: timing.histogram(getattr(log[site], field), edges) for site in log.sites}
+            series = [
+                {"label": site, "colour": log.sites.index(site), "counts": count.tolist()}
+                for site, count in counts.items()
+            ]
+            periods = {1e6 / log.scenario.sites[site].rate_hz for site in log.sites}
+            yield self._chart(
+                "timing", f"{title}, histogram", "µs", series, edges=edges.tolist(), periods=sorted(periods)
+            )
+
+    def _arms(self) -> list[Json]:
+        """Returns what draws an arm at any time: its links and where its angles stand among the tables."""
+        found = []
+        for index, site in enumerate(self._log.sites):
+            part, arm = self._log[site], self._log.scenario.sites[site].arm
+            values = np.hstack([quantities.angles(part), quantities.references(part)])
+            found.append(
+                {
+                    "site": site,
+                    "colour": index,
+                    "links_m": [arm.l1_m, arm.l2_m],
+                    "table": self._table(site, part.tick, part.t_s, values),
+                }
+            )
+        return found
+
+
+def bounds_m(log: Log) -> tuple[float, float, float, float]:
+    """Returns left, right, bottom and top of a box around all that the arms did, m."""
+    drawn = [poses.pose(log, site, t) for site in log.sites for t in np.linspace(0.0, style.span_s(log), 60)]
+    return poses.bounds_m(drawn)
+
+
+def _packed(column: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(column).tobytes()).decode()

@@ -1,0 +1,133 @@
+"""Writes what a person reads of a log: one page, the figures, and the numbers for programs.
+
+Law: the page is one file that asks nothing of any network; a browser opens it from the disk in ten years.
+"""
+
+import json
+from collections.abc import Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from ..log.reader import Log
+from . import charts, motion, strip, style, tables, timing
+from .figures import write_figures
+from .summary import Facts, summarise
+from .tables import VerdictLine
+
+__all__ = ["VerdictLine", "report_html", "write_report"]
+
+_ASSETS = resources.files("trilat_net.analysis") / "assets"
+
+_SECTIONS = {
+    "torques": ("What the hands did", "The torque of the operators' hands on the arms; Fig. 3 of the paper."),
+    "positions": ("Positions", "Actual and desired joint angles; Fig. 4 of the paper."),
+    "errors": ("Tracking errors", "e = q − q_des, Eq. (9); Fig. 5 of the paper."),
+    "estimates": (
+        "Parameter estimates",
+        "Dashed: the true value, Eq. (24). Fig. 6 of the paper shows one site.",
+    ),
+    "moved": ("How far the hands moved the arms", "The log minus the same run with nobody at the arms."),
+    "control": ("Control torques", "τ of Eq. (13), what the controllers ask of the joints."),
+    "ages": (
+        "Age of the samples in use",
+        "Now minus the stamp of the sample in use. Dashed: the delay as set.",
+    ),
+    "timing": ("The loops", "How late each loop woke up, and how long its ticks took."),
+}
+
+
+def write_report(
+    log: Log, folder: Path, *, twin: Log | None = None, verdicts: Sequence[VerdictLine] = ()
+) -> list[Path]:
+    """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
+
+    Args:
+        log: the log.
+        folder: where to; made if it does not exist.
+        twin: the same experiment with nobody at the arms, or None.
+        verdicts: what was checked and how it came out.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    facts = summarise(log, twin)
+    checks = [verdict._asdict() for verdict in verdicts]
+    page, numbers = folder / "report.html", folder / "summary.json"
+    page.write_text(report_html(log, twin, verdicts, facts), encoding="utf-8")
+    numbers.write_text(_json({**facts, "checks": checks}, indent=2) + "\n", encoding="utf-8")
+    return [page, numbers, *write_figures(log, folder, twin)]
+
+
+def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], facts: Facts) -> str:
+    """Returns the page of a log.
+
+    Args:
+        log: the log.
+        twin: the same experiment with nobody at the arms, or None.
+        verdicts: what was checked and how it came out.
+        facts: as from `summarise`.
+    """
+    scenario = log.scenario
+    bounds = charts.bounds_m(log)
+    data = {**charts.Charts(log, twin).data(), "bounds_m": bounds}
+    return Template(_asset("report.html")).substitute(
+        name=escape(scenario.name),
+        title=escape(scenario.title or scenario.name),
+        about=tables.about_html(scenario),
+        verdicts=tables.verdicts_html(verdicts),
+        facts=tables.facts_html(log, facts),
+        sites=tables.sites_html(log, facts),
+        loops=tables.loops_html(log, facts),
+        links=tables.links_html(log, facts),
+        strip=strip.arms_svg(log, bounds),
+        sections=_sections(log, data["charts"]),
+        assumed=tables.assumed_html(scenario),
+        again=tables.again_html(log),
+        versions=tables.versions_html(log),
+        licence=escape(_asset("uPlot-LICENSE")),
+        # what ends a script element early cannot stand in JSON with this escape, which means the same
+        data=_json(data).replace("<", "\\u003c"),
+        css=_asset("report.css"),
+        site_css=_site_css(log),
+        js=_asset("report.js"),
+        uplot_css=_asset("uPlot.min.css"),
+        uplot_js=_asset("uPlot.iife.min.js"),
+    )
+
+
+def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
+    """Returns a heading, a sentence and room for charts per section, or why there are none."""
+    filled = {chart["section"] for chart in drawn}
+    absent = {"torques": motion.NO_HANDS, "timing": timing.no_clock_text(log)}
+    html = ""
+    for key, (heading, sentence) in _SECTIONS.items():
+        if key in filled:
+            body = f'<p class="note">{escape(sentence)}</p><div class="charts" data-section="{key}"></div>'
+        elif key in absent:
+            body = f'<p class="note">{escape(absent[key])}.</p>'
+        else:
+            continue
+        html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
+    return html
+
+
+def _site_css(log: Log) -> str:
+    """Returns the colours of the sites for the page's pictures and tables."""
+    light, dark = (
+        "".join(
+            f".site-{n} {{ stroke: {palette[n % len(palette)]}; }} "
+            f".fill-{n} {{ background: {palette[n % len(palette)]}; fill: {palette[n % len(palette)]}; }}\n"
+            for n in range(len(log.sites))
+        )
+        for palette in (style.COLOURS, style.DARK_COLOURS)
+    )
+    return f"{light}@media screen and (prefers-color-scheme: dark) {{\n{dark}}}"
+
+
+def _json(value: Any, indent: int | None = None) -> str:
+    return json.dumps(value, allow_nan=False, ensure_ascii=False, indent=indent)
+
+
+def _asset(name: str) -> str:
+    return (_ASSETS / name).read_text(encoding="utf-8")
