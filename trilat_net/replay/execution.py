@@ -1,0 +1,219 @@
+"""One site, executed from its records.
+
+Law (L3): two records in a row, and what waits in the links, suffice to resume; what cannot be known is
+counted, and is never a difference.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from itertools import islice
+
+from ..core.grid import NS_PER_S
+from ..core.site import Site
+from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
+from ..log.reader import SiteLog
+from ..net.messages import State
+from ..scenario import Scenario
+from .difference import Difference, close, first_difference, identical, same_bits
+from .verdict import Verdict
+
+_LOOK_BACK = 100
+"""Records before a gap in which to look for the newest sample that had come."""
+
+
+def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
+    """Returns a record as `Site.step` returned it."""
+    mode = Mode.RUN if state.mode == "run" else Mode.DIVERGED
+    used = [state.used.get(peer, -1) for peer in peers]
+    return Output(
+        state.tick,
+        state.t_ns,
+        mode,
+        state.q,
+        state.qd,
+        state.q_des,
+        state.qd_des,
+        state.tau,
+        state.tau_x,
+        state.theta_hat,
+        used,
+        state.rx_crc,
+    )
+
+
+class Execution:
+    """One site, executed from its records.
+
+    While it is `assured`, the site's state follows from the records before. It is lost at a gap, and when a
+    sample comes into use that the log lacks; two records in a row bring it back. What arrived inside a gap
+    is not known: samples that no record lists are taken to have come in it (`assumed`), and as long as one
+    of them is in use a difference counts as unjudged. So it does when the sample in use is one that
+    arrived but whose own record is missing (`lacking`).
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        site_log: SiteLog,
+        by_tick: Mapping[str, Mapping[int, State]],
+        ends: Mapping[str, int],
+        verdict: Verdict,
+    ) -> None:
+        self._site = Site(scenario.setup(site_log.name))
+        self._log = site_log
+        self._peers = site_log.peers
+        self._by_tick = [by_tick[peer] for peer in site_log.peers]
+        self._ends = [ends[peer] for peer in site_log.peers]
+        self._own_end = ends[site_log.name]
+        self._verdict = verdict
+        self._same = same_bits if verdict.whole_run else close
+        self._assured = True
+        self._assumed: list[set[int]] = [set() for _ in self._peers]
+        self._lacking: list[set[int]] = [set() for _ in self._peers]
+
+    def run(self) -> None:
+        """Executes every record."""
+        verdict, states = self._verdict, self._log.states
+        expected = 0
+        for n, state in enumerate(states):
+            verdict.records += 1
+            if state.tick == expected - 1:
+                verdict.differ(Difference(state.site, state.tick, "tick", state.tick, expected))
+                continue
+            if state.tick != expected:
+                verdict.gaps.append((self._log.name, expected, state.tick - 1))
+                self._assured = False
+            expected = state.tick + 1
+            if not self._assured and not self._resume(n):
+                verdict.unjudged += 1
+                continue
+            self._judge(n, state)
+        if expected <= self._own_end:
+            verdict.gaps.append((self._log.name, expected, self._own_end))
+
+    def _judge(self, n: int, state: State) -> None:
+        """Steps one tick and compares."""
+        verdict = self._verdict
+        states = self._log.states
+        if not verdict.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
+            before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
+            self._site.resume(before, last)
+        arrivals, missing = self._arrivals(state)
+        if missing is not None and missing.field != "":
+            verdict.differ(missing)
+            self._site.step(Tick(state.tick, arrivals))
+            return
+        output = self._site.step(Tick(state.tick, arrivals))
+        if missing is not None:  # the log lacks a sample that came in: its CRC cannot be checked
+            output = output._replace(rx_crc=state.rx_crc)
+        if state.boot != states[0].boot:
+            verdict.differ(Difference(self._log.name, state.tick, "boot", state.boot, states[0].boot))
+        elif state.site != self._log.name:
+            verdict.differ(Difference(self._log.name, state.tick, "site", state.site, self._log.name))
+        elif identical(state, output, self._peers):
+            verdict.identical += 1
+        elif difference := first_difference(state, output, self._peers, self._same):
+            self._book(state, output, difference)
+        else:
+            verdict.identical += 1
+
+    def _book(self, state: State, output: Output, difference: Difference) -> None:
+        in_doubt = any(
+            output.used[j] in self._assumed[j]
+            or state.used.get(peer, -1) in self._assumed[j]
+            or state.used.get(peer, -1) in self._lacking[j]
+            for j, peer in enumerate(self._peers)
+        )
+        if in_doubt:
+            self._verdict.unjudged += 1
+            self._assured = False
+        else:
+            self._verdict.differ(difference)
+
+    def _arrivals(self, state: State) -> tuple[list[Arrival], Difference | None]:
+        """Returns what a record says came in, with the samples of its peers' records.
+
+        A sample that no record of the log can be is a difference; one whose record is merely missing is
+        told by a difference without a field.
+        """
+        arrivals: list[Arrival] = []
+        lacking = None
+        for peer, tick, latency_us in state.rx:
+            if not 0 <= peer < len(self._peers):
+                return arrivals, Difference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
+            sample = self._by_tick[peer].get(tick)
+            if sample is not None:
+                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
+            elif 0 <= tick <= self._ends[peer]:
+                self._lacking[peer].add(tick)
+                lacking = Difference(state.site, state.tick, "", tick, None)
+            else:
+                valid = f"a tick from 0 to {self._ends[peer]}"
+                return arrivals, Difference(state.site, state.tick, f"rx[{self._peers[peer]}]", tick, valid)
+        return arrivals[:MAX_ARRIVALS], lacking
+
+    def _resume(self, n: int) -> bool:
+        """Brings the site to where record n finds it, if the two records before it stand in a row."""
+        states = self._log.states
+        if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
+            return False
+        before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
+        in_use: list[Arrival | None] = []
+        waiting: list[Arrival] = []
+        for j, used in enumerate(last.used):
+            sample = self._by_tick[j].get(used)
+            if used >= 0 and sample is None:
+                return False
+            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
+            certain, self._assumed[j] = self._came_before(n, j, used)
+            for tick in sorted(certain | self._assumed[j]):
+                if (came := self._by_tick[j].get(tick)) is not None:
+                    waiting.append(Arrival(j, tick, came.q, came.qd))
+                else:
+                    self._lacking[j].add(tick)
+        self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
+        self._site.resume(before, last)
+        self._assured = True
+        return True
+
+    def _came_before(self, n: int, peer: int, used: int) -> tuple[set[int], set[int]]:
+        """Returns which samples newer than the one in use had come before record n: (certainly, probably).
+
+        Certain are those that a record before n lists. Probable are those that no record lists at all
+        and that are older than record n, or than the first sample that came after it.
+        """
+        t_ns = self._log.states[n].t_ns
+        by_time = -(-t_ns * self._site.peer_rate_hz(peer) // NS_PER_S) - 1
+        first_listed = self._first_listed[peer]
+        newest = max(by_time, self._next_listed(peer, n) - 1)
+        before = (
+            tick
+            for state in self._log.states[max(0, n - _LOOK_BACK) : n]
+            for j, tick, _ in state.rx
+            if j == peer
+        )
+        highest = max(before, default=-1)
+        certain: set[int] = set()
+        probable: set[int] = set()
+        for tick in range(used + 1, min(max(newest, highest), self._ends[peer]) + 1):
+            listed = first_listed.get(tick)
+            if listed is None and tick <= newest:
+                probable.add(tick)
+            elif listed is not None and listed < n:
+                certain.add(tick)
+        return certain, probable
+
+    @cached_property
+    def _first_listed(self) -> list[dict[int, int]]:
+        """Per peer and sample, the first record (by its place) that lists it."""
+        listed: list[dict[int, int]] = [{} for _ in self._peers]
+        for m, state in enumerate(self._log.states):
+            for peer, tick, _ in state.rx:
+                if 0 <= peer < len(listed):
+                    listed[peer].setdefault(tick, m)
+        return listed
+
+    def _next_listed(self, peer: int, n: int) -> int:
+        """Returns the tick of the first sample of a peer that record n or a later one lists."""
+        later = (tick for state in islice(self._log.states, n, None) for j, tick, _ in state.rx if j == peer)
+        return next(later, self._ends[peer] + 1)
