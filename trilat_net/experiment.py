@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from . import collector
 from .core.tick import Output
 from .errors import UsageError
 from .log.reader import Log, open_log
@@ -92,12 +93,13 @@ def compare_with_virtual(log: Log) -> Twins:
     """Runs a log's scenario again in virtual time, with its arrivals and without, and compares."""
     scenario = log.scenario
     peers = {name: scenario.peers(name) for name in scenario.names}
-    recorded = RecordedNetwork(schedule(log), peers)
-    return Twins(
-        compare(log, _outputs(scenario, recorded), arrivals=True),
-        compare(log, _outputs(scenario, None), arrivals=False),
-        late_samples(log),
-    )
+    with collector.paused():
+        recorded = RecordedNetwork(schedule(log), peers)
+        return Twins(
+            compare(log, _outputs(scenario, recorded), arrivals=True),
+            compare(log, _outputs(scenario, None), arrivals=False),
+            late_samples(log),
+        )
 
 
 def _outputs(scenario: Scenario, network: Network | None) -> Iterator[tuple[str, Output]]:

@@ -48,5 +48,5 @@ def _picture(drawn: Pose | None, index: int, bounds_m: tuple[float, float, float
 
 
 def _points(xy: Array) -> str:
-    """Returns points for SVG, whose y grows downwards, in mm."""
+    """Returns points for SVG, whose y grows downwards, m."""
     return " ".join(f"{x:.3f},{-y:.3f}" for x, y in xy)

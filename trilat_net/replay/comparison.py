@@ -10,7 +10,7 @@ from typing import NamedTuple
 from ..core.site import Site
 from ..core.tick import Output
 from ..log.reader import Log
-from .difference import Difference, first_difference, same_bits
+from .difference import Difference, first_difference, identical, same_bits
 
 
 class Comparison(NamedTuple):
@@ -60,7 +60,7 @@ def compare(log: Log, executed: Iterable[tuple[str, Output]], *, arrivals: bool)
         arrivals: whether arrivals must be the same too, or only what was computed from them.
     """
     by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
-    records = identical = 0
+    records = agreeing = 0
     first: Difference | None = None
     for site, output in executed:
         state = by_tick[site].get(output.tick)
@@ -68,12 +68,14 @@ def compare(log: Log, executed: Iterable[tuple[str, Output]], *, arrivals: bool)
             continue
         records += 1
         computed = output if arrivals else output._replace(rx_crc=state.rx_crc)
-        difference = first_difference(state, computed, log[site].peers, same_bits)
-        if difference is None:
-            identical += 1
-        elif first is None or difference.tick < first.tick:
+        peers = log[site].peers
+        if identical(state, computed, peers):
+            agreeing += 1
+            continue
+        difference = first_difference(state, computed, peers, same_bits)
+        if first is None or (difference is not None and difference.tick < first.tick):
             first = difference
-    return Comparison(records, identical, first)
+    return Comparison(records, agreeing, first)
 
 
 def late_samples(log: Log) -> list[LateSample]:

@@ -95,7 +95,7 @@
       const values = lines.map((line) => line.value);
       let low = Math.min(min ?? 0, ...values, ...(chart.zero ? [0] : []));
       let high = Math.max(max ?? 1, ...values);
-      const pad = 0.06 * (high - low) || 0.1 * Math.abs(high) || 0.1;
+      const pad = Math.max(0.06 * (high - low), (chart.margin || 0) * high) || 0.1 * Math.abs(high) || 0.1;
       return [chart.zero ? low : low - pad, high + pad];
     };
     const shared = order.length > 1 && !order.some((series) => series.dash);
@@ -203,11 +203,14 @@
     return made;
   };
   const drawn = page.arms.map((arm) => {
-    const svg = element(row, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
+    const cell = document.createElement("div");
+    const name = document.createElement("span");
+    name.textContent = arm.site;
+    cell.append(name);
+    row.append(cell);
+    const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
       "aria-label": arm.site });
     element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
-    const label = element(svg, "text", { x: left + 0.06, y: -top + 0.2 });
-    label.textContent = arm.site;
     const desired = element(svg, "polyline", { class: "desired" });
     const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
     const joints = [0, 1].map(() => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));

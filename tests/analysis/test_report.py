@@ -1,0 +1,146 @@
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import msgspec
+import numpy as np
+import pytest
+
+from trilat_net.analysis import quantities
+from trilat_net.analysis.report import VerdictLine, write_report
+
+from . import logs
+
+VERDICTS = [VerdictLine("records", "all <b>there</b>", True), VerdictLine("executed again", "differs", False)]
+
+
+class Page(HTMLParser):
+    """What a browser would make of the page: elements with attributes, and text by element."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.elements = []
+        self.texts = {}
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        tag = self.elements[-1][0] if self.elements else ""
+        self.texts.setdefault(tag, []).append(data)
+
+    def scripts(self):
+        return [attrs for tag, attrs in self.elements if tag == "script"]
+
+
+def made(log, folder, twin=None):
+    paths = write_report(log, folder / "new", twin=twin, verdicts=VERDICTS)
+    html = paths[0].read_text(encoding="utf-8")
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)[1]
+    return paths, html, json.loads(data)
+
+
+def column(table, n):
+    return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
+
+
+@pytest.mark.parametrize("name", ["two_sites", "paper", "four"])
+def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
+    paths, html, data = made(logs.virtual(name), tmp_path, logs.twin(name))
+    assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
+    assert all(path.suffix == ".png" for path in paths[2:])
+    assert sorted(paths) == sorted((tmp_path / "new").iterdir())
+    facts = json.loads(paths[1].read_text())
+    assert facts["checks"] == [verdict._asdict() for verdict in VERDICTS]
+    assert len(html) < 1_500_000
+    sections = {attrs.get("data-section") for _, attrs in Page(html).elements} - {None}
+    assert {chart["section"] for chart in data["charts"]} == sections
+
+
+def test_the_page_asks_nothing_of_any_network(tmp_path):
+    _, html, _ = made(logs.timed(logs.virtual("four")), tmp_path)
+    page = Page(html)
+    for tag, attrs in page.elements:
+        assert tag not in ("link", "img", "iframe", "object", "base", "form")
+        assert not {"src", "href", "srcset", "action", "xlink:href"} & set(attrs)
+    assert not re.search(r"url\s*\(|@import|fetch\(|XMLHttpRequest|WebSocket|import\(", html)
+    addresses = set(re.findall(r"https?://[^\s)\"']*", html))
+    # one in the licence comment of the library, one that names what SVG is
+    assert addresses <= {"https://github.com/leeoniya/uPlot", "http://www.w3.org/2000/svg"}
+    policy = next(
+        a["content"] for t, a in page.elements if "Content-Security-Policy" in a.get("http-equiv", "")
+    )
+    assert policy.startswith("default-src 'none'")
+
+
+def test_texts_of_a_scenario_stay_texts(tmp_path):
+    log = logs.virtual("four")
+    _, html, _ = made(log, tmp_path)
+    page = Page(html)
+    assert len(page.scripts()) == 3  # data, library, page
+    assert not [tag for tag, _ in page.elements if tag == "i"]
+    assert "alert(1)" in "".join(page.texts["h1"])
+    assert "<script>alert" not in html
+    assert "&lt;script&gt;alert(1)" in html
+    assert "all &lt;b&gt;there&lt;/b&gt;" in html
+
+
+def test_verdicts_show_what_passed_and_what_failed(tmp_path):
+    _, html, _ = made(logs.virtual("paper"), tmp_path)
+    items = [attrs["class"] for tag, attrs in Page(html).elements if tag == "li" and "class" in attrs]
+    assert items == ["passed", "failed"]
+
+
+def test_the_page_says_how_to_do_it_again(tmp_path):
+    _, html, _ = made(logs.virtual("four"), tmp_path)
+    assert "trilat verify FILE" in html
+    assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
+    assert "dominance" in html
+
+
+def test_a_spike_of_one_tick_is_on_the_page(tmp_path):
+    def spike(state):
+        return (
+            msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
+        )
+
+    log = logs.rewritten(logs.virtual("paper"), change=spike)
+    _, _, data = made(log, tmp_path)
+    chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
+    series = chart["series"][0]
+    table = data["tables"][series["table"]]
+    values = column(table, series["column"])
+    ticks = np.frombuffer(base64.b64decode(table["tick"]), "<i4")
+    assert values.max() == 9.5
+    assert ticks[values.argmax()] == 123
+
+
+def test_the_page_holds_the_log(tmp_path):
+    log = logs.virtual("two_sites")
+    _, _, data = made(log, tmp_path)
+    chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
+    for site, series in zip(log.sites, chart["series"], strict=True):
+        values = column(data["tables"][series["table"]], series["column"])
+        assert values == pytest.approx(quantities.errors(log[site])[:, 1], rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("records", [0, 1, 2])
+def test_short_logs_have_a_report(records, tmp_path):
+    log = logs.rewritten(logs.virtual("paper"), keep=lambda s: s.tick < records, finished=False)
+    paths, html, _ = made(log, tmp_path, logs.twin("paper"))
+    assert "the file was not finished" in html
+    assert len(paths) == 10
+
+
+@pytest.mark.parametrize("silent", ["m1", "m2", "s"])
+def test_a_site_without_records_has_a_report(silent, tmp_path):
+    log = logs.rewritten(logs.timed(logs.virtual("paper")), keep=lambda s: s.site != silent, driver="live")
+    paths, _, _ = made(log, tmp_path, logs.twin("paper"))
+    assert len(paths) == 10
+
+
+def test_a_run_that_diverged_has_a_report(tmp_path):
+    _, html, _ = made(logs.diverged(), tmp_path)
+    assert "<tr><th>diverged</th><td>yes</td></tr>" in html
