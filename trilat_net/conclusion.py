@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .analysis.report import VerdictLine, write_report
+from .analysis.tables import VerdictLine
 from .errors import UsageError
 from .experiment import compare_with_virtual, twin_without_hands
 from .log.reader import Log, open_log
@@ -40,22 +40,23 @@ class Conclusion(NamedTuple):
         return all(line.passed for line in self.lines)
 
 
-def conclude(file: Path, folder: Path) -> Conclusion:
+def conclude(log: Log, folder: Path) -> Conclusion:
     """Verifies a log, compares it with virtual time, and writes figures, page and summary.
 
     Args:
-        file: the log.
+        log: the log, from a file.
         folder: where the results go; exists.
 
     Raises:
-        LogError: the log cannot be read.
+        LogError: a record cannot be read.
     """
-    log = open_log(file)
+    from .analysis.report import write_report  # Matplotlib takes a second, and `verify` needs none of it
+
     lines = list(_checks(log, virtual=True))
     twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
     made = write_report(log, folder, twin=twin, verdicts=lines)
-    paths = [*([] if file in made else [file]), *made]
-    return Conclusion(_COLUMNS, [_row(log, site) for site in log.sites], lines, paths)
+    rows = [_row(log, site) for site in log.sites]
+    return Conclusion(_COLUMNS, rows, lines, [Path(log.source), *made])
 
 
 def check_lines(file: Path, *, virtual: bool) -> list[VerdictLine]:

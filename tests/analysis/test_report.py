@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from trilat_net.analysis import quantities
-from trilat_net.analysis.report import VerdictLine, write_report
+from trilat_net.analysis.report import VerdictLine, report_html, write_report
+from trilat_net.analysis.summary import summarise
 
 from . import logs
 
@@ -35,11 +36,19 @@ class Page(HTMLParser):
         return [attrs for tag, attrs in self.elements if tag == "script"]
 
 
-def made(log, folder, twin=None):
-    paths = write_report(log, folder / "new", twin=twin, verdicts=VERDICTS)
-    html = paths[0].read_text(encoding="utf-8")
+def read(html):
+    """The page, and the data that its charts are drawn from."""
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)[1]
-    return paths, html, json.loads(data)
+    return html, json.loads(data)
+
+
+def page(log, twin=None):
+    return read(report_html(log, twin, VERDICTS, summarise(log, twin)))
+
+
+def written(log, folder, twin=None):
+    paths = write_report(log, folder / "new", twin=twin, verdicts=VERDICTS)
+    return paths, *read(paths[0].read_text(encoding="utf-8"))
 
 
 def column(table, n):
@@ -48,7 +57,7 @@ def column(table, n):
 
 @pytest.mark.parametrize("name", ["two_sites", "paper", "four"])
 def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
-    paths, html, data = made(logs.virtual(name), tmp_path, logs.twin(name))
+    paths, html, data = written(logs.virtual(name), tmp_path, logs.twin(name))
     assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
     assert all(path.suffix == ".png" for path in paths[2:])
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
@@ -59,10 +68,10 @@ def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
     assert {chart["section"] for chart in data["charts"]} == sections
 
 
-def test_the_page_asks_nothing_of_any_network(tmp_path):
-    _, html, _ = made(logs.timed(logs.virtual("four")), tmp_path)
-    page = Page(html)
-    for tag, attrs in page.elements:
+def test_the_page_asks_nothing_of_any_network():
+    html, _ = page(logs.timed(logs.virtual("four")))
+    seen = Page(html)
+    for tag, attrs in seen.elements:
         assert tag not in ("link", "img", "iframe", "object", "base", "form")
         assert not {"src", "href", "srcset", "action", "xlink:href"} & set(attrs)
     assert not re.search(r"url\s*\(|@import|fetch\(|XMLHttpRequest|WebSocket|import\(", html)
@@ -70,44 +79,44 @@ def test_the_page_asks_nothing_of_any_network(tmp_path):
     # one in the licence comment of the library, one that names what SVG is
     assert addresses <= {"https://github.com/leeoniya/uPlot", "http://www.w3.org/2000/svg"}
     policy = next(
-        a["content"] for t, a in page.elements if "Content-Security-Policy" in a.get("http-equiv", "")
+        a["content"] for t, a in seen.elements if "Content-Security-Policy" in a.get("http-equiv", "")
     )
     assert policy.startswith("default-src 'none'")
 
 
-def test_texts_of_a_scenario_stay_texts(tmp_path):
+def test_texts_of_a_scenario_stay_texts():
     log = logs.virtual("four")
-    _, html, _ = made(log, tmp_path)
-    page = Page(html)
-    assert len(page.scripts()) == 3  # data, library, page
-    assert not [tag for tag, _ in page.elements if tag == "i"]
-    assert "alert(1)" in "".join(page.texts["h1"])
+    html, _ = page(log)
+    seen = Page(html)
+    assert len(seen.scripts()) == 3  # data, library, page
+    assert not [tag for tag, _ in seen.elements if tag == "i"]
+    assert "alert(1)" in "".join(seen.texts["h1"])
     assert "<script>alert" not in html
     assert "&lt;script&gt;alert(1)" in html
     assert "all &lt;b&gt;there&lt;/b&gt;" in html
 
 
-def test_verdicts_show_what_passed_and_what_failed(tmp_path):
-    _, html, _ = made(logs.virtual("paper"), tmp_path)
+def test_verdicts_show_what_passed_and_what_failed():
+    html, _ = page(logs.virtual("paper"))
     items = [attrs["class"] for tag, attrs in Page(html).elements if tag == "li" and "class" in attrs]
     assert items == ["passed", "failed"]
 
 
-def test_the_page_says_how_to_do_it_again(tmp_path):
-    _, html, _ = made(logs.virtual("four"), tmp_path)
+def test_the_page_says_how_to_do_it_again():
+    html, _ = page(logs.virtual("four"))
     assert "trilat verify FILE" in html
     assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
     assert "dominance" in html
 
 
-def test_a_spike_of_one_tick_is_on_the_page(tmp_path):
+def test_a_spike_of_one_tick_is_on_the_page():
     def spike(state):
         return (
             msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
         )
 
     log = logs.rewritten(logs.virtual("paper"), change=spike)
-    _, _, data = made(log, tmp_path)
+    _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
     series = chart["series"][0]
     table = data["tables"][series["table"]]
@@ -117,9 +126,9 @@ def test_a_spike_of_one_tick_is_on_the_page(tmp_path):
     assert ticks[values.argmax()] == 123
 
 
-def test_the_page_holds_the_log(tmp_path):
+def test_the_page_holds_the_log():
     log = logs.virtual("two_sites")
-    _, _, data = made(log, tmp_path)
+    _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
         values = column(data["tables"][series["table"]], series["column"])
@@ -129,7 +138,7 @@ def test_the_page_holds_the_log(tmp_path):
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_a_report(records, tmp_path):
     log = logs.rewritten(logs.virtual("paper"), keep=lambda s: s.tick < records, finished=False)
-    paths, html, _ = made(log, tmp_path, logs.twin("paper"))
+    paths, html, _ = written(log, tmp_path, logs.twin("paper"))
     assert "the file was not finished" in html
     assert len(paths) == 10
 
@@ -137,10 +146,10 @@ def test_short_logs_have_a_report(records, tmp_path):
 @pytest.mark.parametrize("silent", ["m1", "m2", "s"])
 def test_a_site_without_records_has_a_report(silent, tmp_path):
     log = logs.rewritten(logs.timed(logs.virtual("paper")), keep=lambda s: s.site != silent, driver="live")
-    paths, _, _ = made(log, tmp_path, logs.twin("paper"))
+    paths, _, _ = written(log, tmp_path, logs.twin("paper"))
     assert len(paths) == 10
 
 
-def test_a_run_that_diverged_has_a_report(tmp_path):
-    _, html, _ = made(logs.diverged(), tmp_path)
+def test_a_run_that_diverged_has_a_report():
+    html, _ = page(logs.diverged())
     assert "<tr><th>diverged</th><td>yes</td></tr>" in html

@@ -118,7 +118,7 @@ class Session:
     def __init__(self, stage: Stage, scenario: str, sites: Sequence[str], *options: str) -> None:
         self._stage, self._scenario, self._options = stage, scenario, options
         self.sites = tuple(sites)
-        self.endpoints = free_endpoints(len(sites))
+        *self.endpoints, self.recorder_endpoint = free_endpoints(len(sites) + 1)
         self.log = stage.folder / "run.mcap"
         self.processes: dict[str, Process] = {}
 
@@ -138,7 +138,8 @@ class Session:
         """Starts the recorder."""
         process = self._stage.start(
             "recorder",
-            *("record", "--session", "t", "-o", str(self.log), *connections(self.endpoints), *more),
+            *("record", "--session", "t", "-o", str(self.log), "--listen", self.recorder_endpoint),
+            *(*connections(self.endpoints), *more),
         )
         self.processes["recorder"] = process
         return process

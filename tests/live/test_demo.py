@@ -13,7 +13,7 @@ from trilat_net.log.reader import open_log
 from .processes import Process, Stage, gone
 
 
-def demo(stage: Stage, duration: str = "20") -> Process:
+def demo(stage: Stage, duration: str = "6") -> Process:
     return stage.start(
         "demo", "demo", "two_sites", "--duration", duration, "--out", str(stage.folder / "out")
     )
@@ -48,13 +48,12 @@ def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Sta
     assert [event.about for event in log.events if event.kind == "lost"] == ["s"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_the_run_ends_all_and_finishes_the_file(number: int, stage: Stage) -> None:
+def test_ctrl_c_during_the_run_ends_all_and_finishes_the_file(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
     children = running.children()
-    running.signal(number)
-    assert running.code() == 128 + number
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
     assert all(gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
@@ -63,13 +62,17 @@ def test_a_signal_during_the_run_ends_all_and_finishes_the_file(number: int, sta
     assert "run.mcap holds what there was" in running.text()
 
 
-@pytest.mark.parametrize("first_child", ["site m ", "record "])
-def test_ctrl_c_before_the_session_begins_ends_all_and_leaves_no_log(first_child: str, stage: Stage) -> None:
+@pytest.mark.parametrize(
+    ("number", "when"), [(signal.SIGINT, "site m "), (signal.SIGTERM, "record ")], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
+    number: int, when: str, stage: Stage
+) -> None:
     running = demo(stage)
-    child(running, first_child)
+    child(running, when)  # that child has been started just now
     children = running.children()
-    running.signal(signal.SIGINT)
-    assert running.code() == 130
+    running.signal(number)
+    assert running.code() == 128 + number
     assert all(gone(pid) for pid in children)
     assert not (stage.folder / "out" / "run.mcap").exists()
 

@@ -133,7 +133,7 @@ class Charts:
             delays = {log.scenario.links[f"{peer}->{site}"].delay_ms for peer in part.peers}
             lines = [{"value": delay, "colour": LIMIT} for delay in sorted(delays)]
             yield self._chart(
-                "ages", f"age of the samples that {site} uses", "ms", series, lines=lines, zero=True
+                "ages", f"age of the samples that {site} uses", "ms", series, lines=lines, margin=0.025
             )
         if timing.has_clock(log):
             tables = self._tables_of(list(log.sites), lambda part: part.late_us[:, np.newaxis] * 1e-3)
