@@ -104,6 +104,7 @@ def demo(
     from sites.display import Display
 
     from .conclusion import conclude, results_folder
+    from .experiment import open_log
 
     chosen = _load(scenario, overrides, duration, seed)
     results = results_folder(folder, chosen.name, force=force)
@@ -120,7 +121,7 @@ def demo(
     if not outcome.log.exists():
         raise typer.Exit(1)
     out.print("checking the log and drawing ...")
-    conclusion = conclude(outcome.log, results)
+    conclusion = conclude(open_log(outcome.log), results)
     _print_conclusion(conclusion)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(1)
@@ -261,13 +262,11 @@ def report(
 ) -> None:
     """Makes the figures, the page and the summary of a log."""
     from .conclusion import conclude, results_folder
+    from .experiment import open_log
 
-    try:
-        file.open("rb").close()  # before a folder is made for it
-    except OSError as error:
-        raise UsageError(f"{file}: cannot be read: {error.strerror}") from None
+    log = open_log(file)  # before a folder is made for it
     results = results_folder(folder if folder is not None else file.with_suffix(""), "", force=force)
-    _print_conclusion(conclude(file, results))
+    _print_conclusion(conclude(log, results))
 
 
 @scenario_app.command("list", epilog="Example: trilat scenario list")
