@@ -74,18 +74,12 @@ def tracking_errors(log: Log) -> Figure:
         row[1].sharey(row[0])
         row[1].tick_params(labelleft=False)
         for site in log.sites:
-            part, line = log[site], style.line(log, site)
-            e = quantities.errors(part)
+            part, e = log[site], quantities.errors(log[site])
             for joint, axes in enumerate(row):
-                style.draw(axes, part.tick, part.t_s, e[:, joint], **line)
-            remaining = quantities.remaining_error(part)
-            positive = np.where(remaining > 0.0, remaining, np.nan)
-            style.draw(settling, part.tick, part.t_s, positive, **line)
+                style.draw(axes, part.tick, part.t_s, e[:, joint], **style.line(log, site))
         _joint_titles(row)
         row[0].set_ylabel("tracking error (rad)")
-        settling.set_yscale("log")
-        settling.axhline(quantities.SETTLED_RAD, **_REFERENCE)
-        settling.set_ylabel("largest error\nstill to come (rad)")
+        _settling(log, settling)
         style.time_axis(log, [*row, settling])
         limit = (f"settled: {quantities.SETTLED_RAD:g} rad", _REFERENCE)
         style.legend(figure, [*style.site_entries(log, log.sites), limit])
@@ -131,6 +125,18 @@ def hands_moved(log: Log, twin: Log | None) -> Figure:
         style.time_axis(log, row)
         style.legend(figure, style.site_entries(log, log.sites))
     return figure
+
+
+def _settling(log: Log, axes: Axes) -> None:
+    """Draws the largest error still to come of every site, on a logarithmic axis that holds the limit."""
+    low = high = quantities.SETTLED_RAD
+    for site in log.sites:
+        part, remaining = log[site], quantities.remaining_error(log[site])
+        positive = np.where(remaining > 0.0, remaining, np.nan)
+        style.draw(axes, part.tick, part.t_s, positive, **style.line(log, site))
+        low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
+    axes.axhline(quantities.SETTLED_RAD, **_REFERENCE)
+    axes.set(yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel="largest error\nstill to come (rad)")
 
 
 def _estimate(log: Log, sites: Sequence[str], index: int, axes: Axes) -> None:
