@@ -184,8 +184,9 @@ class _Member:
             clock.sleep_until(now_ns + POLL_NS)
         return None
 
-    def _slack(self, _k: int, t_ns: int) -> None:
-        """Ten times a second: answers questions, and says who is gone or back."""
+    def _slack(self, k: int, t_ns: int) -> None:
+        """Ten times a second: answers questions, and says who is gone."""
+        self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
         self._voice.answer()
         self._watch(t_ns)
         for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):

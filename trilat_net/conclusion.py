@@ -15,7 +15,7 @@ from .errors import UsageError
 from .experiment import compare_with_virtual, twin_without_hands
 from .log.reader import Log, open_log
 from .replay.comparison import Comparison
-from .replay.verify import Verdict, verify
+from .replay.verify import Verdict, last_ticks, verify
 from .scenario import Scenario
 
 
@@ -182,7 +182,7 @@ def _row(log: Log, site: str) -> tuple[str, ...]:
     part = log[site]
     if not len(part):
         return (site, "0", *("",) * (len(_COLUMNS) - 2))
-    missing = int(part.tick[-1]) + 1 - len(part)
+    missing = max(last_ticks(log)[site], int(part.tick[-1])) + 1 - len(part)
     late = np.percentile(part.late_us, (50, 99, 100))
     busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
     numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")

@@ -13,7 +13,7 @@ from trilat_net.log.reader import open_log
 from .processes import Process, Stage, gone
 
 
-def demo(stage: Stage, duration: str = "6") -> Process:
+def demo(stage: Stage, duration: str = "5") -> Process:
     return stage.start(
         "demo", "demo", "two_sites", "--duration", duration, "--out", str(stage.folder / "out")
     )
@@ -83,3 +83,15 @@ def test_ctrl_c_before_any_child_is_started_is_130(stage: Stage) -> None:
     running.signal(signal.SIGINT)
     assert running.code() == 130
     assert running.ended()
+
+
+def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Stage) -> None:
+    running = demo(stage, duration="0.5")
+    running.prints("checking the log and drawing")
+    children = running.children()
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    assert not children
+    log = open_log(stage.folder / "out" / "run.mcap")
+    assert log.complete
+    assert verify(log).identical == 1000

@@ -31,27 +31,26 @@ class Session:
     path: Path
     relay: Relay = field(default_factory=Relay)
     network: LocalNetwork = field(default_factory=LocalNetwork)
-    members: dict[str, _Member] = field(default_factory=dict)
     interrupts: dict[str, Interrupt] = field(default_factory=dict)
     clocks: dict[str, RelayClock] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
         """Adds a site."""
-        options = Options(SESSION, [], [], 10.0, needs_recorder)
         self.interrupts[name] = Interrupt()
+        self.clocks[name] = self.relay.add(
+            name, lambda clock: self.live(name, clock, needs_recorder=needs_recorder), at_ns
+        )
 
-        def run(clock: RelayClock) -> int:
-            bus = self.network.join()
-            try:
-                self.members[name] = _Member(
-                    self.scenario, name, options, bus, clock, self.interrupts[name], self.said.append
-                )
-                return self.members[name].live()
-            finally:
-                bus.close()
-
-        self.clocks[name] = self.relay.add(name, run, at_ns)
+    def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
+        """A site's life, from its connection to its exit code."""
+        options = Options(SESSION, [], [], 10.0, needs_recorder)
+        interrupt = self.interrupts.get(name, Interrupt())
+        bus = self.network.join()
+        try:
+            return _Member(self.scenario, name, options, bus, clock, interrupt, self.said.append).live()
+        finally:
+            bus.close()
 
     def recorder(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Adds the recorder."""

@@ -1,5 +1,6 @@
 """The live loop: an absolute grid, lateness that enters no formula, and the numbers of virtual time."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from sites.intake import Intake
 from sites.loop import Ports, run_loop
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Mode
+from trilat_net.errors import SessionError
 from trilat_net.experiment import compare_with_virtual, verify
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -240,3 +242,22 @@ def test_a_site_that_is_asked_to_end_ends_in_order_and_its_exit_code_says_so(tmp
     assert [e.ticks for e in log.events if e.kind == "end" and e.member == "s"] == [ticks]
     assert log.complete
     assert verify(log).passed
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
+    session = session_of(load("two_sites", {"duration_s": 2.0}), tmp_path)
+    refused: list[str] = []
+
+    def come_late(_bus: Bus, clock: RelayClock) -> None:
+        member = Session(session.scenario, tmp_path / "other.mcap", session.relay, session.network)
+        with pytest.raises(SessionError) as caught:
+            member.live("m", clock)
+        refused.append(str(caught.value))
+
+    session.stranger(come_late, at_ns=3_000_000_000)
+    assert session.run().complete
+    assert len(refused) == 1
+    told = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
+    assert told, refused
+    assert 1000 < int(told[2]) < 2000

@@ -20,7 +20,7 @@ from ..core.arm import Array
 from ..core.grid import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
-from ..net.messages import Event, LinkStats, State
+from ..net.messages import STATE_VECTORS, Event, LinkStats, State
 from ..net.wire import decode
 from ..scenario import Scenario, parse
 from .chunks import Walk
@@ -67,7 +67,8 @@ class SiteLog:
         return len(self.states)
 
     def _vectors(self, field: str) -> Array:
-        vectors: Array = np.array([getattr(state, field) for state in self.states], dtype=np.float64)
+        rows = [getattr(state, field) for state in self.states]
+        vectors: Array = np.array(rows, dtype=np.float64).reshape(-1, STATE_VECTORS[field])
         return vectors
 
     def _numbers(self, field: str) -> Ints:
@@ -137,7 +138,8 @@ class SiteLog:
     def used(self) -> dict[str, Ints]:
         """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
         return {
-            peer: np.array([state.used[peer] for state in self.states], dtype=np.int64) for peer in self.peers
+            peer: np.array([state.used.get(peer, -1) for state in self.states], dtype=np.int64)
+            for peer in self.peers
         }
 
     def age_s(self, peer: str, rate_hz: int) -> Array:

@@ -281,5 +281,5 @@
   darkQuery.addEventListener("change", build);
   addEventListener("beforeprint", () => { printing = true; build(); });
   addEventListener("afterprint", () => { printing = false; build(); });
-  window.trilat = { plots: () => timePlots, show };
+  window.trilat = { plots: () => timePlots, show }; // for the console
 })();
