@@ -127,9 +127,9 @@ class Recording:
         lines = []
         for site, account in self._writer.accounts.items():
             made = self._ends.get(site)
-            of = f" of {made}" if made is not None else ", it never said how many it made"
+            of = f" of {made} records" if made is not None else " records of a number that it never said"
             lines.append(
-                f"recorder: {site}: {account.received}{of} records, {account.missing} missing, "
+                f"recorder: {site}: {account.received}{of}, {account.missing} missing, "
                 f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
             )
         if self._overflowed:

@@ -48,6 +48,7 @@ class _Child:
 
     def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         self.name = name
+        self._asked = False
         self.printed = folder / f"{name}.txt"
         with self.printed.open("wb") as sink:
             self._process = subprocess.Popen(
@@ -65,12 +66,13 @@ class _Child:
     def end(self, number: int) -> None:
         """Asks the process to end, or kills it."""
         if self.code() is None:
+            self._asked = True
             self._process.send_signal(number)
 
     def problem(self) -> str | None:
         """Says how the process failed, or None where it did not."""
         code = self.code()
-        if code in (0, None):
+        if code in (0, None) or (self._asked and code == 128 + signal.SIGINT):
             return None
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
@@ -89,9 +91,10 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     Returns:
         How it ended. The log is valid in every case in which a session began.
     """
-    warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once, not in every child
     outcome = Outcome(folder / "run.mcap")
     with Interrupt() as interrupt:
+        with interrupt.raising():
+            warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once for all children
         endpoints = free_endpoints(len(scenario.names))
         session = f"{scenario.name}-demo"
         children, recorder = _start(scenario, folder, session, endpoints)

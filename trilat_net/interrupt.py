@@ -4,6 +4,8 @@ Law: a signal ends nothing by itself; whoever loops looks, and ends in order.
 """
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -18,6 +20,7 @@ class Interrupt:
     def __init__(self) -> None:
         self.number = 0
         self._before: dict[int, Any] = {}
+        self._raises = False
 
     def __enter__(self) -> "Interrupt":
         for name in (signal.SIGINT, signal.SIGTERM):
@@ -32,6 +35,22 @@ class Interrupt:
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number
+        if self._raises:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Lets a signal break off the block at once: for long work that looks at nothing.
+
+        Python passes over what is raised inside a `__del__`; then the block is left at its end.
+        """
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+        if self.requested():
+            raise KeyboardInterrupt
 
     def requested(self) -> bool:
         """True once a signal has come."""

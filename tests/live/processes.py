@@ -157,9 +157,18 @@ class Session:
         for process in self.processes.values():
             process.prints(BEGUN)
 
+    def recording(self) -> None:
+        """Returns once records are in the log."""
+        recorded(self.log)
+
     def codes(self) -> dict[str, int]:
         """How every member ended."""
         return {name: process.code() for name, process in self.processes.items()}
+
+
+def recorded(log: Path) -> None:
+    """Returns once records are in a log."""
+    until(lambda: log.exists() and log.stat().st_size > 20_000, PATIENCE_S)
 
 
 def connections(endpoints: Sequence[str]) -> list[str]:

@@ -10,10 +10,10 @@ from tests.net.waiting import until
 from trilat_net.experiment import verify
 from trilat_net.log.reader import open_log
 
-from .processes import Process, Stage, gone
+from .processes import Process, Stage, gone, recorded
 
 
-def demo(stage: Stage, duration: str = "5") -> Process:
+def demo(stage: Stage, duration: str = "3") -> Process:
     return stage.start(
         "demo", "demo", "two_sites", "--duration", duration, "--out", str(stage.folder / "out")
     )
@@ -27,7 +27,7 @@ def child(demo: Process, words: str) -> int:
 def recording(stage: Stage) -> Path:
     """The demo's log, once records are in it."""
     log = stage.folder / "out" / "run.mcap"
-    until(lambda: log.exists() and log.stat().st_size > 20_000, 60)
+    recorded(log)
     return log
 
 
@@ -38,7 +38,8 @@ def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Sta
     assert len(children) == 3
     os.kill(child(running, "site s "), signal.SIGKILL)
     assert running.code() == 1
-    assert "error: s was killed by SIGKILL" in running.text()
+    errors = [line for line in running.text().splitlines() if line.startswith("error: ")]
+    assert errors == ["error: s was killed by SIGKILL"]
     assert all(gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete

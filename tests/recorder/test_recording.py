@@ -269,6 +269,7 @@ def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> No
     desk.clock.sleep_until(desk.clock.monotonic_ns() + SETTLE_NS + 1)
     assert desk.over()
     assert desk.recording.problem() == "s disappeared after 20 records"
+    assert "20 records of a number that it never said" in desk.recording.summary()[1]
     log = desk.log()
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
 
