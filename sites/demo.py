@@ -12,6 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from trilat_net.core.jit import is_cached
 from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
@@ -93,8 +94,10 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     """
     outcome = Outcome(folder / "run.mcap")
     with Interrupt() as interrupt:
-        with interrupt.raising():
-            warm_up(scenario, scenario.names[0])  # fills the cache of compiled code once for all children
+        if not is_cached():
+            display.say("compiling, once for this machine ...")
+            with interrupt.raising():
+                warm_up(scenario, scenario.names[0])  # once for all children
         endpoints = free_endpoints(len(scenario.names))
         session = f"{scenario.name}-demo"
         children, recorder = _start(scenario, folder, session, endpoints)

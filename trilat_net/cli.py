@@ -4,6 +4,7 @@ Law: a command parses, builds, calls one function of the library and prints. It 
 failed run or comparison, 2 on bad input, 128 + n when signal n ended it; an error is one sentence.
 """
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -352,6 +353,13 @@ def _print_conclusion(conclusion: "Conclusion") -> None:
 
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
+    try:
+        _run()
+    finally:
+        gc.freeze()  # the end of the process need not look through every record again
+
+
+def _run() -> None:
     try:
         app()
     except TrilatError as error:

@@ -4,7 +4,10 @@ Law: nothing is claimed that was not executed again just now.
 """
 
 import itertools
+import multiprocessing
+import signal
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,11 +55,28 @@ def conclude(log: Log, folder: Path) -> Conclusion:
     """
     from .analysis.report import write_report  # Matplotlib takes a second, and `verify` needs none of it
 
-    lines = list(_checks(log, virtual=True))
-    twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
-    made = write_report(log, folder, twin=twin, verdicts=lines)
+    lines: list[VerdictLine] = []
+    with _worker() as pool:  # two cores: the log is executed while its figures are drawn
+        checking = pool.submit(_check_file, log.source)
+        twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
+
+        def verdicts() -> Iterator[VerdictLine]:
+            lines.extend(checking.result())
+            yield from lines
+
+        made = write_report(log, folder, twin=twin, verdicts=verdicts())
     rows = [_row(log, site) for site in log.sites]
     return Conclusion(_COLUMNS, rows, lines, [Path(log.source), *made])
+
+
+def _worker() -> ProcessPoolExecutor:
+    """Returns one process beside this one, which leaves Ctrl-C to this one."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+
+
+def _check_file(source: str) -> list[VerdictLine]:
+    return list(_checks(open_log(source), virtual=True))
 
 
 def check_lines(file: Path, *, virtual: bool) -> list[VerdictLine]:

@@ -4,7 +4,7 @@ Law: the page is one file that asks nothing of any network; a browser opens it f
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -40,9 +40,11 @@ _SECTIONS = {
 
 
 def write_report(
-    log: Log, folder: Path, *, twin: Log | None = None, verdicts: Sequence[VerdictLine] = ()
+    log: Log, folder: Path, *, twin: Log | None = None, verdicts: Iterable[VerdictLine] = ()
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
+
+    Figures are drawn first: verdicts may still be in the making.
 
     Args:
         log: the log.
@@ -52,11 +54,13 @@ def write_report(
     """
     folder.mkdir(parents=True, exist_ok=True)
     facts = summarise(log, twin)
-    checks = [verdict._asdict() for verdict in verdicts]
+    figures = write_figures(log, folder, twin)
+    lines = list(verdicts)
+    checks = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    page.write_text(report_html(log, twin, verdicts, facts), encoding="utf-8")
+    page.write_text(report_html(log, twin, lines, facts), encoding="utf-8")
     numbers.write_text(_json({**facts, "checks": checks}, indent=2) + "\n", encoding="utf-8")
-    return [page, numbers, *write_figures(log, folder, twin)]
+    return [page, numbers, *figures]
 
 
 def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], facts: Facts) -> str:

@@ -50,6 +50,11 @@ _config: Any = numba.config  # made at import from the environment; its stubs na
 _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 
 
+def is_cached() -> bool:
+    """True where compiled leaves of this very core lie in the cache."""
+    return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
+
+
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
     if _CACHE is None:

@@ -20,7 +20,7 @@ from .clock import Clock
 from .messages import Event, Info
 from .wire import decode, encode
 
-AHEAD_NS = 700_000_000
+AHEAD_NS = 500_000_000
 """How far ahead an epoch is announced."""
 DECIDE_NS = 150_000_000
 """How long before the epoch every answer must be in."""
