@@ -118,9 +118,9 @@ class Recording:
                 self._take(arrived)
             except WireError as error:
                 self.dropped[error.reason] += 1
-        self._overflowed = tap.overflowed
+        self._overflowed = sum(tap.overflowed.values())
         counts = {f"dropped: {reason}": str(count) for reason, count in self.dropped.items() if count}
-        self._writer.finish(self._ends, {**counts, "overflowed": str(tap.overflowed)})
+        self._writer.finish(self._ends, tap.overflowed, counts)
 
     def summary(self) -> list[str]:
         """Returns what was recorded, a line per site, for people."""

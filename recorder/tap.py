@@ -3,7 +3,7 @@
 Law (L6): the queue is bounded; what overflows is counted, and shown.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -11,6 +11,8 @@ from trilat_net.net.clock import Clock
 
 CAPACITY = 200_000
 """Messages that wait at most: a minute of three sites at 1 kHz."""
+KEYS = 1_000
+"""Keys whose losses are counted apart."""
 
 
 class Arrived(NamedTuple):
@@ -28,18 +30,18 @@ class Tap:
         clock: what stamps.
 
     Attributes:
-        overflowed: messages lost because the queue was full.
+        overflowed: messages lost because the queue was full, by key.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._queue: deque[Arrived] = deque()
-        self.overflowed = 0
+        self.overflowed: Counter[str] = Counter()
 
     def take(self, key: str, payload: bytes) -> None:
         """Takes one message; called by the bus."""
         if len(self._queue) >= CAPACITY:
-            self.overflowed += 1
+            self.overflowed[key if len(self.overflowed) < KEYS else "others"] += 1
             return
         self._queue.append(Arrived(key, payload, self._clock.monotonic_ns()))
 

@@ -75,7 +75,7 @@ def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str
     with Interrupt() as interrupt:
         bus = ZenohBus(options.listen, options.connect)
         try:
-            return _Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
+            return Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
         finally:
             bus.close()
 
@@ -93,7 +93,7 @@ def warm_up(scenario: Scenario, name: str) -> None:
         encode_state(name, 0, site.peers, output, arrivals, 0, 0)
 
 
-class _Member:
+class Member:
     """A site's life in a session."""
 
     def __init__(

@@ -267,7 +267,10 @@ def report(
 
     log = open_log(file)  # before a folder is made for it
     results = results_folder(folder if folder is not None else file.with_suffix(""), "", force=force)
-    _print_conclusion(conclude(log, results))
+    conclusion = conclude(log, results)
+    _print_conclusion(conclusion)
+    if not conclusion.agreed:
+        raise typer.Exit(1)
 
 
 @scenario_app.command("list", epilog="Example: trilat scenario list")

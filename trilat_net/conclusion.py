@@ -42,6 +42,11 @@ class Conclusion(NamedTuple):
         """True where every check passed."""
         return all(line.passed for line in self.lines)
 
+    @property
+    def agreed(self) -> bool:
+        """True where every execution agreed with the log, complete or not."""
+        return all(line.passed for line in self.lines if line.label != _RECORDS)
+
 
 def conclude(log: Log, folder: Path) -> Conclusion:
     """Verifies a log, compares it with virtual time, and writes figures, page and summary.

@@ -181,7 +181,7 @@ def whole(path: Path) -> Log:
     assert log.complete
     for name in log.sites:
         assert [state.tick for state in log[name].states] == list(range(log.scenario.ticks(name)))
-    assert all("missing 0, duplicate 0" in log.accounts[f"/{name}"] for name in log.sites)
+    assert all("missing 0, duplicate 0" in log.account(name) for name in log.sites)
     return log
 
 

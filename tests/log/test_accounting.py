@@ -57,5 +57,5 @@ def test_an_account_reads_as_one_line() -> None:
         account.take(tick)
     account.expect(10)
     assert account.as_text() == (
-        "received 4, missing 6, duplicate 1, reordered 1, largest gap 4, gaps 2-2 4-4 6-9"
+        "received 4, missing 6, duplicate 1, reordered 1, largest gap 4 (2-2 4-4 6-9)"
     )

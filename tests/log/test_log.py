@@ -113,8 +113,9 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
     (attachment,) = reader.iter_attachments()
     assert (attachment.name, attachment.data.decode()) == ("scenario.toml", scenario.text)
     for site in scenario.names:
-        text = metadata["trilat.accounts"][f"/{site}"]
-        assert text == "received 120, missing 0, duplicate 0, reordered 0, largest gap 0"
+        text = metadata["trilat.accounts"][f"/trilat/paper/{site}/state"]
+        assert text == "received 120, missing 0, duplicate 0, reordered 0, largest gap 0, overflowed 0"
+        assert metadata["trilat.accounts"][f"/trilat/paper/{site}/link"] == "received 2, overflowed 0"
 
 
 def test_session_and_scenario_stand_before_the_first_message() -> None:
@@ -135,13 +136,15 @@ def test_a_live_log_counts_from_its_epoch() -> None:
     assert not writer.knows("trilat/lab/stranger/state")
     for k in (0, 2, 2):
         writer.add_state("m1", key, b"\x80", k * 1_000_000, 10**18 + 5, k)
-    writer.finish({"m1": 4, "m2": 0, "s": 0}, {"dropped": "1"})
+    writer.finish({"m1": 4, "m2": 0, "s": 0}, {key: 7, "elsewhere": 2}, {"dropped": "1"})
     reader = make_reader(io.BytesIO(stream.getvalue()))
     assert [m.publish_time - 10**18 for _, _, m in reader.iter_messages()] == [0, 2_000_000]
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     assert metadata["trilat.session"]["mood"] == "calm"
     assert metadata["trilat.accounts"]["dropped"] == "1"
-    assert metadata["trilat.accounts"]["/m1"].startswith("received 2, missing 2, duplicate 1")
+    assert metadata["trilat.accounts"]["overflowed elsewhere"] == "2"
+    text = metadata["trilat.accounts"][f"/{key}"]
+    assert text == "received 2, missing 2, duplicate 1, reordered 0, largest gap 1 (1-1 3-3), overflowed 7"
 
 
 def test_the_reader_gives_arrays_with_time() -> None:

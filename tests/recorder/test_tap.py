@@ -34,11 +34,11 @@ def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> N
     tap = Tap(ManualClock())
     for n in range(8):
         tap.take("a", bytes([n]))
-    assert tap.overflowed == 3
+    assert tap.overflowed == {"a": 3}
     assert [message.payload for message in tap.drain()] == [bytes([n]) for n in range(5)]
     tap.take("a", b"again")
     assert [message.payload for message in tap.drain()] == [b"again"]
-    assert tap.overflowed == 3
+    assert tap.overflowed == {"a": 3}
 
 
 def test_a_minute_of_three_sites_at_1_khz_waits_without_loss() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgpack
 
 from recorder.recorder import Recorder
-from sites.process import Options, _Member
+from sites.process import Member, Options
 from trilat_net.interrupt import Interrupt
 from trilat_net.log.reader import Log, open_log
 from trilat_net.net.bus import Bus, LocalNetwork
@@ -48,7 +48,7 @@ class Session:
         interrupt = self.interrupts.get(name, Interrupt())
         bus = self.network.join()
         try:
-            return _Member(self.scenario, name, options, bus, clock, interrupt, self.said.append).live()
+            return Member(self.scenario, name, options, bus, clock, interrupt, self.said.append).live()
         finally:
             bus.close()
 

@@ -72,7 +72,7 @@ class Account:
         gaps = " ".join(f"{first}-{last}" for first, last in self.gaps[:20])
         return (
             f"received {self.received}, missing {self.missing}, duplicate {self.duplicate}, "
-            f"reordered {self.reordered}, largest gap {self.largest_gap}" + (f", gaps {gaps}" if gaps else "")
+            f"reordered {self.reordered}, largest gap {self.largest_gap}" + (f" ({gaps})" if gaps else "")
         )
 
 

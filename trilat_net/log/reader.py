@@ -201,6 +201,10 @@ class Log:
         except WireError as error:
             raise LogError(f"{self.source}: a message on {topic} cannot be read: {error}") from None
 
+    def account(self, site: str) -> str:
+        """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
+        return self.accounts.get(self._topic(site, topics.STATE), "")
+
     @property
     def sites(self) -> tuple[str, ...]:
         """Names of the sites, in scenario order."""

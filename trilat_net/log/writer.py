@@ -71,6 +71,8 @@ class LogWriter:
         )
         self._writer.add_attachment(0, 0, SCENARIO, "application/toml", scenario.text.encode())
         self._channels = self._register(scenario, session)
+        self._session = session
+        self._written = dict.fromkeys(self._channels, 0)
         stream.flush()
 
     def _register(self, scenario: Scenario, session: str) -> dict[str, int]:
@@ -117,6 +119,7 @@ class LogWriter:
             )
         except OSError as error:
             raise _refused(error) from None
+        self._written[key] += 1
 
     def add_state(self, site: str, key: str, payload: bytes, t_ns: int, log_time_ns: int, tick: int) -> bool:
         """Writes the record of one tick and books it; False, and nothing written, where it is a duplicate."""
@@ -133,18 +136,29 @@ class LogWriter:
         except OSError as error:
             raise _refused(error) from None
 
-    def finish(self, ticks: Mapping[str, int], counts: Mapping[str, str] | None = None) -> None:
-        """Writes the accounts, the index and the end mark. The stream stays open.
+    def finish(
+        self,
+        ticks: Mapping[str, int],
+        overflowed: Mapping[str, int] | None = None,
+        counts: Mapping[str, str] | None = None,
+    ) -> None:
+        """Writes the accounts of every channel, the index and the end mark. The stream stays open.
 
         Args:
             ticks: per site, how many ticks it said that it made.
+            overflowed: per key, messages that were lost before they could be written.
             counts: what else was counted, by name.
         """
+        lost = dict(overflowed or {})
         for site, count in ticks.items():
             self.accounts[site].expect(count)
-        accounts = {f"/{site}": account.as_text() for site, account in self.accounts.items()}
+        texts = {key: f"received {count}" for key, count in self._written.items()}
+        for site, account in self.accounts.items():
+            texts[topics.key(self._session, site, topics.STATE)] = account.as_text()
+        accounts = {f"/{key}": f"{text}, overflowed {lost.pop(key, 0)}" for key, text in texts.items()}
+        others = {"overflowed elsewhere": str(sum(lost.values()))} if lost else {}
         try:
-            self._writer.add_metadata(ACCOUNTS, {**accounts, **(counts or {})})
+            self._writer.add_metadata(ACCOUNTS, {**accounts, **others, **(counts or {})})
             self._writer.finish()
             self._stream.flush()
         except OSError as error:

@@ -135,6 +135,10 @@ def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> Non
     """
     for key, value in _pairs(overrides):
         *folders, last = key.split(".")
+        sites = tables.get("sites")
+        if len(folders) > 1 and folders[0] == "sites" and isinstance(sites, dict) and folders[1] not in sites:
+            hint = _nearest(folders[1], list(sites)) or f"; its sites are {', '.join(sites)}"
+            raise ScenarioError(f"no such site{hint}", path=key)
         table = tables
         for depth, folder in enumerate(folders):
             entry = table.setdefault(folder, {})
