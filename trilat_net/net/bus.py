@@ -8,10 +8,13 @@ overflows is lost oldest first, and the receiver sees it by the ticks. Only the 
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 RING = 16_384
 """Messages that a ring holds: sixteen seconds of one peer at 1 kHz."""
+
+
+T = TypeVar("T")
 
 
 class Inbox(Protocol):
@@ -83,46 +86,31 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
     return bool(chunks) and pattern[0] in ("*", chunks[0]) and _match(pattern[1:], chunks[1:])
 
 
-class _Ring:
-    def __init__(self, capacity: int) -> None:
-        self._entries: deque[tuple[str, bytes]] = deque(maxlen=capacity)
+class _Ring(Generic[T]):
+    """A bounded ring of anything; what overflows is lost oldest first."""
 
-    def put(self, key: str, payload: bytes) -> None:
-        self._entries.append((key, payload))
+    def __init__(self, capacity: int = RING) -> None:
+        self._entries: deque[T] = deque(maxlen=capacity)
 
-    def poll(self) -> tuple[str, bytes] | None:
-        return self._entries.popleft() if self._entries else None
+    def put(self, entry: T) -> None:
+        """Adds an entry."""
+        self._entries.append(entry)
 
-
-class _PresenceRing:
-    def __init__(self, capacity: int) -> None:
-        self._entries: deque[tuple[str, bool]] = deque(maxlen=capacity)
-
-    def put(self, key: str, alive: bool) -> None:
-        self._entries.append((key, alive))
-
-    def poll(self) -> tuple[str, bool] | None:
+    def poll(self) -> T | None:
+        """Returns the oldest entry, or None."""
         return self._entries.popleft() if self._entries else None
 
 
 class _LocalQuestion:
-    def __init__(self, key: str, replies: _Ring) -> None:
+    """A question inside one process."""
+
+    def __init__(self, key: str, replies: _Ring[tuple[str, bytes]]) -> None:
         self._key = key
         self._replies = replies
 
     def answer(self, payload: bytes) -> None:
-        self._replies.put(self._key, payload)
-
-
-class _QuestionRing:
-    def __init__(self) -> None:
-        self._entries: deque[Question] = deque(maxlen=RING)
-
-    def put(self, question: Question) -> None:
-        self._entries.append(question)
-
-    def poll(self) -> Question | None:
-        return self._entries.popleft() if self._entries else None
+        """See `Question`."""
+        self._replies.put((self._key, payload))
 
 
 class LocalNetwork:
@@ -144,8 +132,8 @@ class LocalBus:
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
-        self._answering: list[tuple[str, _QuestionRing]] = []
-        self._watching: list[tuple[str, _PresenceRing]] = []
+        self._answering: list[tuple[str, _Ring[Question]]] = []
+        self._watching: list[tuple[str, _Ring[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
     def publisher(self, key: str) -> Callable[[bytes], None]:
@@ -161,8 +149,8 @@ class LocalBus:
 
     def inbox(self, key: str, capacity: int = RING) -> Inbox:
         """See `Bus`."""
-        ring = _Ring(capacity)
-        self._sinks.append((key, ring.put))
+        ring = _Ring[tuple[str, bytes]](capacity)
+        self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
@@ -171,13 +159,13 @@ class LocalBus:
 
     def questions(self, key: str) -> Questions:
         """See `Bus`."""
-        ring = _QuestionRing()
+        ring = _Ring[Question]()
         self._answering.append((key, ring))
         return ring
 
     def ask(self, key: str) -> Inbox:
         """See `Bus`."""
-        replies = _Ring(RING)
+        replies = _Ring[tuple[str, bytes]]()
         for member in self._network.members:
             for answered, ring in member._answering:
                 if member is not self and matches(key, answered):
@@ -191,11 +179,11 @@ class LocalBus:
 
     def presence(self, key: str) -> Presence:
         """See `Bus`."""
-        ring = _PresenceRing(RING)
+        ring = _Ring[tuple[str, bool]]()
         for member in self._network.members:
             for token in member._tokens:
                 if member is not self and matches(key, token):
-                    ring.put(token, True)
+                    ring.put((token, True))
         self._watching.append((key, ring))
         return ring
 
@@ -210,4 +198,4 @@ class LocalBus:
         for member in self._network.members:
             for expression, ring in member._watching:
                 if member is not self and matches(expression, token):
-                    ring.put(token, alive)
+                    ring.put((token, alive))

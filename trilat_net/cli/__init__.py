@@ -1,0 +1,65 @@
+"""The `trilat` command: the composition root, without logic of its own.
+
+Law: a command parses, builds, calls one function of the library and prints. It exits 0 on success, 1 on a
+failed run or comparison, 2 on bad input, 128 + n when signal n ended it; an error is one sentence.
+"""
+
+import gc
+import os
+import sys
+from typing import Any
+
+import typer
+from rich.markup import escape
+from typer.core import TyperGroup
+
+from ..errors import TrilatError
+from . import logs, scenarios, sessions
+from .options import err
+
+
+class _Commands(TyperGroup):
+    """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs a command."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            err.print("interrupted")
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
+    epilog="Begin with: trilat demo paper",
+)
+app.add_typer(sessions.app)
+app.add_typer(logs.app)
+app.add_typer(scenarios.app, name="scenario")
+
+
+def main() -> None:
+    """Runs `trilat`; errors become one sentence and an exit code."""
+    try:
+        _run()
+    finally:
+        gc.freeze()  # the end of the process need not look through every record again
+
+
+def _run() -> None:
+    try:
+        app()
+    except TrilatError as error:
+        err.print(f"error: {escape(str(error))}", soft_wrap=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of a pipe had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)

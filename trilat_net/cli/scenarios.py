@@ -1,0 +1,71 @@
+"""Commands about scenarios: list, show, check, new."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from .options import (
+    DurationOption,
+    ForceOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    chosen_scenario,
+    out,
+)
+
+app = typer.Typer(no_args_is_help=True, help="The shipped scenarios and your own.")
+
+
+@app.command("list", epilog="Example: trilat scenario list")
+def scenario_list() -> None:
+    """Lists the shipped scenarios."""
+    from ..scenario import load, shipped
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("name", "sites", "s", "what it is"):
+        table.add_column(column)
+    for name in shipped():
+        chosen = load(name)
+        table.add_row(name, str(len(chosen.names)), f"{chosen.duration_s:g}", escape(chosen.title))
+    out.print(table)
+
+
+@app.command("show", epilog="Example: trilat scenario show paper --set control.Kd=5")
+def scenario_show(
+    name: ScenarioArgument,
+    duration: DurationOption = None,
+    seed: SeedOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Prints the resolved text of a scenario: every value of every site and link."""
+    sys.stdout.write(chosen_scenario(name, overrides, duration, seed).text)
+
+
+@app.command("check", epilog="Example: trilat scenario check mine.toml")
+def scenario_check(
+    file: ScenarioArgument,
+    overrides: SetOption = None,
+) -> None:
+    """Says whether a scenario is valid, and what follows from it."""
+    from ..conclusion import scenario_facts
+
+    for line in scenario_facts(chosen_scenario(file, overrides, None, None)):
+        out.print(escape(line), soft_wrap=True)
+
+
+@app.command("new", epilog="Example: trilat scenario new mine.toml")
+def scenario_new(
+    file: Annotated[Path, typer.Argument(help="The file to make.")], force: ForceOption = False
+) -> None:
+    """Writes a commented template, with the unit of every key."""
+    from ..experiment import new_file
+    from ..scenario import template_text
+
+    with new_file(file, force) as stream:
+        stream.write(template_text().encode())
+    out.print(f"{escape(str(file))}: a template; check it with: trilat scenario check {escape(str(file))}")

@@ -1,0 +1,163 @@
+"""Commands that take part in a live session: demo, site, record."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from ..errors import UsageError
+from .options import (
+    ConnectOption,
+    DurationOption,
+    ForceOption,
+    ListenOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    chosen_scenario,
+    err,
+    finite_seconds,
+    out,
+)
+from .show import show_conclusion
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: trilat demo paper --duration 10 --set control.Kd=5")
+def demo(
+    scenario: ScenarioArgument = "paper",
+    duration: DurationOption = None,
+    folder: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where results go; default runs/NAME-N.")
+    ] = None,
+    seed: SeedOption = None,
+    overrides: SetOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Runs a scenario live: every site and a recorder as processes over Zenoh, then verifies and reports."""
+    from sites.demo import run_demo
+    from sites.display import Display
+
+    from ..conclusion import conclude, results_folder
+    from ..experiment import open_log
+
+    chosen = chosen_scenario(scenario, overrides, duration, seed)
+    results = results_folder(folder, chosen.name, force=force)
+    out.print(f"{escape(chosen.title or chosen.name)}")
+    out.print(f"{chosen.duration_s:g} s live: {', '.join(chosen.names)} and a recorder; Ctrl-C ends it")
+    with Display(chosen, out) as display:
+        outcome = run_demo(chosen, results, display)
+    for problem in outcome.problems:
+        err.print(f"error: {escape(problem)}", soft_wrap=True)
+    if outcome.interrupted:
+        kept = f"; {outcome.log} holds what there was" if outcome.log.exists() else ""
+        err.print(f"interrupted{escape(kept)}", soft_wrap=True)
+        raise typer.Exit(128 + outcome.interrupted)
+    if not outcome.log.exists():
+        raise typer.Exit(1)
+    out.print("checking the log and drawing ...")
+    conclusion = conclude(open_log(outcome.log), results)
+    show_conclusion(conclusion)
+    if outcome.problems or not conclusion.passed:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: trilat site m1 --scenario paper")
+def site(
+    name: Annotated[str, typer.Argument(help="Which site of the scenario this is.")],
+    scenario: Annotated[str, typer.Option("--scenario", "-s", help="Shipped name or path.")],
+    session: Annotated[
+        str | None, typer.Option("--session", metavar="ID", help="Default: the scenario's name.")
+    ] = None,
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    join_timeout: Annotated[
+        float,
+        typer.Option(
+            "--join-timeout", metavar="S", help="How long to wait for the others, s.", callback=finite_seconds
+        ),
+    ] = 60.0,
+    needs_recorder: Annotated[
+        bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
+    ] = False,
+    cpu: Annotated[int | None, typer.Option("--cpu", help="Stay on this processor.")] = None,
+    duration: DurationOption = None,
+    seed: SeedOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Runs one site as one process: for separate terminals or machines.
+
+    Without endpoints, sites of a session find each other on this machine: each listens at a loopback port
+    that follows from session and site, and connects to the sites before it in the scenario.
+    """
+    from sites.process import Options, run_site
+
+    from ..net.endpoints import default_endpoints
+    from ..scenario import site_named
+
+    chosen = chosen_scenario(scenario, overrides, duration, seed)
+    site_named(chosen, name)
+    identity = _session_name(session or chosen.name)
+    places = default_endpoints(identity, chosen.names)
+    before = chosen.names[: chosen.names.index(name)]
+    options = Options(
+        session=identity,
+        listen=listen if listen is not None else [places[name]],
+        connect=connect if connect is not None else [places[peer] for peer in before],
+        join_timeout_s=join_timeout,
+        needs_recorder=needs_recorder,
+        cpu=cpu,
+    )
+    code = run_site(chosen, name, options, _say)
+    raise typer.Exit(code)
+
+
+@app.command(epilog="Example: trilat record --session paper -o run.mcap")
+def record(
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session to record.")],
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
+    ] = None,
+    join_timeout: Annotated[
+        float | None,
+        typer.Option(
+            "--join-timeout",
+            metavar="S",
+            help="How long to wait for it to begin, s; default: for ever.",
+            callback=finite_seconds,
+        ),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Records one session, from its epoch to its end or to Ctrl-C.
+
+    Without endpoints it asks the first site, at its loopback port, who the others are.
+    """
+    from recorder.process import record_session
+
+    path = output if output is not None else Path(f"{_session_name(session)}.mcap")
+    if path.exists() and (not force or path.is_dir()):
+        raise UsageError(f"{path}: exists; choose another name, or replace a file with --force")
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
+    path.unlink(missing_ok=True)
+    code = record_session(_session_name(session), path, listen or [], connect, join_timeout, _say)
+    raise typer.Exit(code)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _session_name(name: str) -> str:
+    """Refuses what cannot stand in a key."""
+    if not name or not all(c.isalnum() or c in "_-." for c in name):
+        raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
+    return name

@@ -1,0 +1,26 @@
+"""Prints a conclusion: the table, what was checked, the files."""
+
+from typing import TYPE_CHECKING
+
+from rich.markup import escape
+from rich.table import Table
+
+from .options import out
+
+if TYPE_CHECKING:
+    from ..conclusion import Conclusion
+
+
+def show_conclusion(conclusion: "Conclusion") -> None:
+    """Prints what there is to say of a log."""
+    table = Table(box=None, pad_edge=False)
+    for column in conclusion.columns:
+        table.add_column(column, justify="left" if column == "site" else "right")
+    for row in conclusion.rows:
+        table.add_row(*row)
+    out.print(table)
+    for line in conclusion.lines:
+        mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
+        out.print(f"{mark} {escape(line.label)}: {escape(line.text)}", soft_wrap=True)
+    for path in conclusion.paths:
+        out.print(f"  {escape(str(path))}", soft_wrap=True)

@@ -1,0 +1,86 @@
+"""From resolved tables to types; what does not fit becomes an error with the key's path."""
+
+import re
+from typing import Any, get_args
+
+import msgspec
+
+from ..core.arm import positive_definite
+from ..errors import ScenarioError
+from .model import Control, Link, Pulse, Scenario, SiteSpec
+from .resolution import Table
+
+_CHOICES = {
+    key: get_args(kind.__annotations__[key])
+    for kind, key in ((Scenario, "scheme"), (SiteSpec, "role"), (Control, "law"), (Pulse, "kind"))
+}
+
+
+def convert(resolved: Table) -> Scenario:
+    """Turns resolved tables into types; wrong types and ranges become errors with the key's path."""
+    try:
+        scenario = msgspec.convert(resolved, Scenario)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at ")
+        dotted = _dotted(resolved, path.strip("`"))
+        raise ScenarioError(_plain(problem, dotted), path=dotted) from None
+    for name, site in scenario.sites.items():
+        if not positive_definite(site.arm.theta):
+            raise ScenarioError(
+                "its inertia matrix is singular in some pose: give the links mass away from their joints",
+                path=f"sites.{name}.arm",
+            )
+        for n, pulse in enumerate(site.hands):
+            if pulse.end_s <= pulse.start_s:
+                raise ScenarioError(
+                    f"must be later than start_s = {pulse.start_s:g}, is {pulse.end_s:g}",
+                    path=f"sites.{name}.hands[{n}].end_s",
+                )
+    return scenario
+
+
+def _plain(problem: str, path: str) -> str:
+    """Puts a validation message into the words of a scenario's author."""
+    if problem.startswith("Invalid enum value"):
+        choices = _CHOICES[path.rpartition(".")[2]]
+        return f"is {problem.split()[-1]}, must be {' or '.join(map(repr, choices))}"
+    if problem.startswith("Object missing required field"):
+        return f"{problem.split()[-1].strip('`')} is missing"
+    words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
+    for old, new in words:
+        problem = problem.replace(old, new)
+    return problem
+
+
+def _dotted(resolved: Table, path: str) -> str:
+    """Turns `$.sites[...].control.Kp[0]` into the dotted path of the first value that it can mean."""
+    parts = re.findall(r"\.?([^.\[\]]+|\[[^\]]*\])", path.removeprefix("$"))
+    return _search(resolved, [p for p in parts if p], "") or path.removeprefix("$.")
+
+
+def _search(value: Any, parts: list[str], path: str) -> str:
+    """Follows the parts; where one is `[...]` (any key), takes the entry whose value breaks the rule."""
+    if not parts:
+        return path
+    head, rest = parts[0], parts[1:]
+    if head == "[...]":
+        found = ""
+        for key in value:
+            found = _search(value[key], rest, f"{path}.{key}")
+            if found and not _valid_entry(path, value[key]):
+                return found
+        return found
+    if head.startswith("["):
+        return _search(value[int(head[1:-1])], rest, f"{path}{head}")
+    if isinstance(value, dict) and head in value:
+        return _search(value[head], rest, f"{path}.{head}" if path else head)
+    return f"{path}.{head}" if path else head
+
+
+def _valid_entry(folder: str, entry: Any) -> bool:
+    kind: Any = {"sites": SiteSpec, "links": Link}.get(folder)
+    try:
+        msgspec.convert(entry, kind)
+    except msgspec.ValidationError:
+        return False
+    return True
