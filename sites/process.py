@@ -31,6 +31,7 @@ from .loop import Ports, run_loop
 
 LINGER_S = 5
 POLL_NS = 5_000_000
+LAST_WORD_NS = 100_000_000
 _WARM_TICKS = 200
 
 
@@ -120,6 +121,7 @@ class Member:
         self._peer_events = [bus.inbox(topics.key(session, p, topics.EVENT), 256) for p in self._site.peers]
         self._ended_by = ""
         self._gone: set[str] = set()
+        self._ended: set[str] = set()
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         warm_up(scenario, name)
         self._voice = Voice(
@@ -189,19 +191,27 @@ class Member:
         self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
         self._voice.answer()
         self._watch(t_ns)
+
+    def _hear(self) -> None:
+        """Takes what the peers say of their own end."""
         for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):
             for event in _events(inbox):
-                if event.kind == "diverged" and event.boot == self._epoch.boots[peer]:
+                if event.boot != self._epoch.boots[peer]:
+                    continue
+                if event.kind == "diverged":
                     self._ended_by = event.text
+                elif event.kind == "end":
+                    self._ended.add(peer)
 
     def _watch(self, t_ns: int) -> None:
-        """Notes which members are gone, and says so."""
+        """Notes which members are gone, and says so of those that have not said their end."""
+        self._hear()
         while (change := self._presence.poll()) is not None:
             where = topics.address(change[0])
             if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
                 continue
             (self._gone.discard if change[1] else self._gone.add)(where.member)
-            if not change[1]:
+            if not change[1] and where.member not in self._ended:
                 self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
 
     def _leave(self, output: Output | None) -> int:
@@ -229,9 +239,12 @@ class Member:
         """Waits for the recorder's word that it has every record, at most `LINGER_S`, while it is there."""
         clock = self._clock
         give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-        while clock.monotonic_ns() < give_up_ns and topics.RECORDER not in self._gone:
+        while clock.monotonic_ns() < give_up_ns:
             self._voice.answer()
             self._watch(t_ns)
+            if topics.RECORDER in self._gone:  # its last word may still be under way
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_WORD_NS)
+                self._gone.discard(topics.RECORDER)
             for event in _events(self._recorder_events):
                 if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
                     return

@@ -4,7 +4,7 @@ Law: no logic that is not the joining of parts: scenario, virtual time, log, exe
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -64,15 +64,23 @@ def new_file(path: Path, force: bool) -> BinaryIO:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def record_virtual(scenario: Scenario, path: Path, *, force: bool = False) -> bool:
+def record_virtual(
+    scenario: Scenario, path: Path, *, force: bool = False, stopped: Callable[[], bool] = lambda: False
+) -> bool:
     """Runs a scenario in virtual time into a file; False where the run diverged.
+
+    Args:
+        scenario: the experiment.
+        path: the file.
+        force: whether it may replace one.
+        stopped: True once the run was asked to end.
 
     Raises:
         UsageError: the file exists, or cannot be made.
         LogError: the disk refused.
     """
     with new_file(path, force) as stream:
-        return virtual.record(scenario, stream)
+        return virtual.record(scenario, stream, stopped=stopped)
 
 
 class Twins(NamedTuple):

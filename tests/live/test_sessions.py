@@ -38,7 +38,7 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(stage: Stage) ->
 
 def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> None:
     """With the `digital` scheme and a leader that comes last; and a second m1 is refused meanwhile."""
-    session = Session(stage, "paper", PAPER, "--duration", "4", "--set", 'scheme="digital"')
+    session = Session(stage, "paper", PAPER, "--duration", "8", "--set", 'scheme="digital"')
     session.all("recorder", "s", "m2", "m1")
     session.begun()
     (elsewhere,) = free_endpoints(1)

@@ -14,20 +14,27 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from ..errors import TrilatError
+from ..interrupt import Interrupt
 from . import logs, scenarios, sessions
 from .options import err
 
 
 class _Commands(TyperGroup):
-    """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1."""
+    """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1.
+
+    The framework's way is an exception, which Python drops where it is raised inside a `__del__`;
+    `Interrupt` remembers the signal all the same.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Runs a command."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            err.print("interrupted")
-            raise typer.Exit(130) from None
+        with Interrupt() as interrupt:
+            try:
+                with interrupt.raising():
+                    return super().invoke(ctx)
+            except KeyboardInterrupt:
+                err.print("interrupted")
+                raise typer.Exit(interrupt.exit_code or 130) from None
 
 
 app = typer.Typer(

@@ -6,6 +6,7 @@ from typing import Annotated, NoReturn
 import typer
 from rich.markup import escape
 
+from ..interrupt import Interrupt
 from .options import (
     DurationOption,
     ForceOption,
@@ -38,7 +39,11 @@ def sim(
 
     chosen = chosen_scenario(scenario, overrides, duration, seed)
     path = output if output is not None else Path(f"{chosen.name}.mcap")
-    within = record_virtual(chosen, path, force=force)
+    with Interrupt() as interrupt:
+        within = record_virtual(chosen, path, force=force, stopped=interrupt.requested)
+    if interrupt.requested():
+        err.print(f"interrupted; {escape(str(path))} holds what there was", soft_wrap=True)
+        raise typer.Exit(interrupt.exit_code)
     out.print(f"{escape(str(path))}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
     if not within:
         _fail(f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there")

@@ -6,7 +6,7 @@ runs of one scenario and seed are the same file, SHA-256 and all.
 
 import bisect
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import BinaryIO, NamedTuple
 
 from .. import collector
@@ -97,13 +97,19 @@ class _Member:
         self._writer.add(self._keys[topics.EVENT], encode(event), t_ns, t_ns, self.ticks - 1)
 
 
-def record(scenario: Scenario, stream: BinaryIO, network: Network | None = None) -> bool:
+def record(
+    scenario: Scenario,
+    stream: BinaryIO,
+    network: Network | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> bool:
     """Runs a scenario in virtual time and writes its log.
 
     Args:
         scenario: the experiment.
         stream: where the log goes; stays open.
         network: what joins the sites.
+        stopped: True once the run was asked to end; then the file is finished with what there is.
 
     Returns:
         True where the run stayed within its limits, False where it diverged.
@@ -123,7 +129,9 @@ def record(scenario: Scenario, stream: BinaryIO, network: Network | None = None)
                 members[site.name].write(arrivals, output)
                 within &= output.mode is Mode.RUN
                 t_ns = output.t_ns
-    finally:  # Ctrl-C too leaves a file that is finished
+                if stopped():
+                    break
+    finally:  # whatever ends the run leaves a file that is finished
         for name, member in members.items():
             member.say("end", f"{name} made {member.ticks} ticks", t_ns)
         writer.finish({name: member.ticks for name, member in members.items()})
