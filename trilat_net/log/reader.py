@@ -82,7 +82,7 @@ class SiteLog:
     @cached_property
     def t_s(self) -> Array:
         """Nominal time since the epoch, shape (K,), s."""
-        return self._numbers("t_ns").astype(np.float64) * 1e-9
+        return self._numbers("t_ns") / NS_PER_S
 
     @cached_property
     def q(self) -> Array:
@@ -151,7 +151,7 @@ class SiteLog:
         """
         used = self.used[peer]
         age = self._numbers("t_ns") - used * NS_PER_S // rate_hz
-        seconds: Array = np.where(used >= 0, age * 1e-9, np.nan)
+        seconds: Array = np.where(used >= 0, age / NS_PER_S, np.nan)
         return seconds
 
 
