@@ -11,7 +11,8 @@ from pathlib import Path
 import msgspec
 
 from trilat_net.core.fingerprint import fingerprint
-from trilat_net.errors import SessionError, UsageError
+from trilat_net.errors import SessionError
+from trilat_net.log.writer import new_file
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
@@ -110,11 +111,7 @@ class Recorder:
             for info in self._joining.met.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )
-        try:
-            stream = self._path.open("xb")
-        except OSError as error:
-            raise UsageError(f"{self._path}: cannot be written: {error.strerror}") from None
-        with stream:
+        with new_file(self._path) as stream:
             recording = Recording(stream, scenario, self._session, epoch, self._voice)
             self._say(f"recorder: the session begins, writing {self._path}")
             try:

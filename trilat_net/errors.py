@@ -55,6 +55,12 @@ class LogError(TrilatError):
     exit_code = 2
 
 
+class LogRefused(LogError):
+    """The machine's: a log that could not be written on, as on a full disk."""
+
+    exit_code = 1
+
+
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
     """A run or a comparison that ended badly: diverged, a site died, records that differ."""
 

@@ -6,12 +6,12 @@ Law: no logic that is not the joining of parts: scenario, virtual time, log, exe
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 from . import collector
 from .core.tick import Output
-from .errors import UsageError
 from .log.reader import Log, open_log
+from .log.writer import new_file
 from .replay.comparison import Comparison, LateSample, compare, late_samples, schedule
 from .replay.verify import Verdict, verify
 from .scenario import Scenario, load
@@ -50,20 +50,6 @@ def simulate(
     return open_log(stream)
 
 
-def new_file(path: Path, force: bool) -> BinaryIO:
-    """Opens a file for writing that must not exist yet, unless it may be replaced.
-
-    Raises:
-        UsageError: it exists, or cannot be made.
-    """
-    try:
-        return path.open("wb" if force else "xb")
-    except FileExistsError:
-        raise UsageError(f"{path}: exists; choose another name, or replace it with --force") from None
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
-
-
 def record_virtual(
     scenario: Scenario, path: Path, *, force: bool = False, stopped: Callable[[], bool] = lambda: False
 ) -> bool:
@@ -79,7 +65,7 @@ def record_virtual(
         UsageError: the file exists, or cannot be made.
         LogError: the disk refused.
     """
-    with new_file(path, force) as stream:
+    with new_file(path, force=force) as stream:
         return virtual.record(scenario, stream, stopped=stopped)
 
 

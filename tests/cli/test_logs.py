@@ -167,3 +167,9 @@ def test_a_report_goes_beside_its_log_and_keeps_what_is_there(log_file: Path) ->
     trilat("report", log_file, cwd=log_file.parent).refuses("holds something", "--force")
     trilat("report", log_file, "--force", cwd=log_file.parent).succeeds()
     assert log_file.exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_ends_a_run_in_one_line(tmp_path: Path) -> None:
+    done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path)
+    done.refuses("No space left on device", "what was flushed before is intact", code=1)

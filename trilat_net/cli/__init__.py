@@ -70,3 +70,6 @@ def _run() -> None:
     except BrokenPipeError:  # the reader of a pipe had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:  # a full disk, a folder that vanished: the machine's, and told in one line
+        err.print(f"error: {escape(f'{error.filename}: ' if error.filename else '')}{error.strerror}")
+        sys.exit(1)

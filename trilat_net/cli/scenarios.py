@@ -66,6 +66,6 @@ def scenario_new(
     from ..experiment import new_file
     from ..scenario import template_text
 
-    with new_file(file, force) as stream:
+    with new_file(file, force=force) as stream:
         stream.write(template_text().encode())
     out.print(f"{escape(str(file))}: a template; check it with: trilat scenario check {escape(str(file))}")

@@ -5,13 +5,15 @@ first message, payloads are byte for byte what was published, and the accounts s
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from ..errors import LogError
+from ..errors import LogRefused, UsageError
 from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
@@ -23,6 +25,33 @@ SCHEMAS: dict[str, type[msgspec.Struct]] = {topics.STATE: State, topics.LINK: Li
 
 _CHUNK_BYTES = 1 << 20
 _LAST_NS = (1 << 64) - 1  # of the file's time stamps; a stranger's may be anything
+
+
+@contextmanager
+def new_file(path: Path, *, force: bool = False) -> Iterator[BinaryIO]:
+    """Opens a file for writing that must not exist yet, unless it may be replaced; closes it at the end.
+
+    Args:
+        path: which file.
+        force: whether it may replace one.
+
+    Raises:
+        UsageError: it exists, or cannot be made.
+        LogRefused: the disk refused what was still to be written.
+    """
+    try:
+        stream = path.open("wb" if force else "xb")
+    except FileExistsError:
+        raise UsageError(f"{path}: exists; choose another name, or replace it with --force") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    try:
+        yield stream
+    finally:
+        try:
+            stream.close()
+        except OSError as error:  # what a full disk refused is refused once more on closing
+            raise _refused(error) from None
 
 
 class LogWriter:
@@ -107,7 +136,7 @@ class LogWriter:
             tick: its sequence number.
 
         Raises:
-            LogError: the disk refused.
+            LogRefused: the disk refused.
         """
         try:
             self._writer.add_message(
@@ -165,5 +194,5 @@ class LogWriter:
             raise _refused(error) from None
 
 
-def _refused(error: OSError) -> LogError:
-    return LogError(f"the log cannot be written: {error.strerror}; what was flushed before is intact")
+def _refused(error: OSError) -> LogRefused:
+    return LogRefused(f"the log cannot be written: {error.strerror}; what was flushed before is intact")
