@@ -78,7 +78,8 @@ class _Child:
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
         lines = self.printed.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return f"{self.name} ended with code {code}: {lines[-1].removeprefix('error: ') if lines else 'it said nothing'}"
+        last = lines[-1].removeprefix("error: ") if lines else "it said nothing"
+        return f"{self.name} ended with code {code}: {last}"
 
 
 def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:

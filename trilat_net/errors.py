@@ -55,7 +55,7 @@ class LogError(TrilatError):
     exit_code = 2
 
 
-class LogRefused(LogError):
+class LogRefused(LogError):  # noqa: N818 - it names an outcome
     """The machine's: a log that could not be written on, as on a full disk."""
 
     exit_code = 1

@@ -374,6 +374,6 @@ def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) 
 
 def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(b"precious")
-    with pytest.raises(UsageError, match=r"run\.mcap: cannot be written: File exists"):
+    with pytest.raises(UsageError, match=r"run\.mcap: exists; choose another name"):
         recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
