@@ -112,10 +112,8 @@ def results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
     """
     chosen = folder if folder is not None else _next_free(Path("runs"), name)
     try:
-        if chosen.exists() and any(chosen.iterdir()):
-            if not force:
-                raise UsageError(f"{chosen}: holds something; choose another folder, or use --force")
-            (chosen / "run.mcap").unlink(missing_ok=True)
+        if not force and chosen.exists() and any(chosen.iterdir()):
+            raise UsageError(f"{chosen}: holds something; choose another folder, or use --force")
         chosen.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{chosen}: cannot be made or read: {error.strerror}") from None

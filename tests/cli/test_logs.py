@@ -173,3 +173,11 @@ def test_a_report_goes_beside_its_log_and_keeps_what_is_there(log_file: Path) ->
 def test_a_full_disk_ends_a_run_in_one_line(tmp_path: Path) -> None:
     done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path)
     done.refuses("No space left on device", "what was flushed before is intact", code=1)
+
+
+def test_a_report_into_the_folder_of_its_log_keeps_the_log(log_file: Path) -> None:
+    before = log_file.read_bytes()
+    done = trilat("report", log_file, "-o", log_file.parent, "--force", cwd=log_file.parent)
+    assert done.code == 0, done
+    assert log_file.read_bytes() == before
+    assert (log_file.parent / "report.html").exists()
