@@ -132,21 +132,30 @@ def scenario_facts(scenario: Scenario) -> list[str]:
         if beta is None
         else ", ".join(f"{name} {weight:.4g}" for name, weight in zip(scenario.names, beta, strict=True))
     )
-    delays = ", ".join(f"{name} {link.delay_ms:g} ms" for name, link in scenario.links.items())
     return [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
         f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
         + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
-        f"delays: {delays}",
+        *_link_facts(scenario),
         f"beta, the left null vector of Upsilon: {weights}",
         *(f"assumed: {text}" for text in scenario.assumed),
     ]
 
 
+def _link_facts(scenario: Scenario) -> Iterator[str]:
+    """Yields what the links do: in one line where all do the same."""
+    words = {name: link.describe() for name, link in scenario.links.items()}
+    if len(set(words.values())) == 1:
+        yield f"every link: {next(iter(words.values()))}"
+        return
+    for name, text in words.items():
+        yield f"link {name}: {text}"
+
+
 def _checks(log: Log, *, virtual: bool) -> Iterator[VerdictLine]:
     yield _records_line(log)
     yield _verify_line(verify(log))
-    if log.session.get("scenario_sha256") != log.scenario.sha256:
+    if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield VerdictLine("scenario", "is not the one whose hash the log names: it was changed", False)
     if virtual:
         twins = compare_with_virtual(log)

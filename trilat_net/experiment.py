@@ -89,15 +89,18 @@ def compare_with_virtual(log: Log) -> Twins:
     peers = {name: scenario.peers(name) for name in scenario.names}
     with collector.paused():
         recorded = RecordedNetwork(schedule(log), peers)
+        ordered = {name: log.commands(name) for name in scenario.names}
         return Twins(
-            compare(log, _outputs(scenario, recorded), arrivals=True),
-            compare(log, _outputs(scenario, None), arrivals=False),
+            compare(log, _outputs(scenario, recorded, ordered), arrivals=True),
+            compare(log, _outputs(scenario, None, ordered), arrivals=False),
             late_samples(log),
         )
 
 
-def _outputs(scenario: Scenario, network: Network | None) -> Iterator[tuple[str, Output]]:
-    return ((site.name, output) for site, _, output in virtual.run(scenario, network))
+def _outputs(
+    scenario: Scenario, network: Network | None, commands: virtual.Commands
+) -> Iterator[tuple[str, Output]]:
+    return ((site.name, output) for site, _, output in virtual.run(scenario, network, commands))
 
 
 def twin_without_hands(log: Log) -> Log:

@@ -130,7 +130,7 @@ class Charts:
             part = log[site]
             table = self._table(site, part.tick, part.t_s, quantities.ages_ms(log, site))
             series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(part.peers)]
-            delays = {log.scenario.links[f"{peer}->{site}"].delay_ms for peer in part.peers}
+            delays = {log.scenario.links[f"{peer}->{site}"].moments().mean_ms for peer in part.peers}
             lines = [{"value": delay, "colour": LIMIT} for delay in sorted(delays)]
             yield self._chart(
                 "ages", f"age of the samples that {site} uses", "ms", series, lines=lines, margin=0.025

@@ -51,7 +51,7 @@ def _scenario(log: Log) -> Facts:
         "seed": scenario.seed,
         "scheme": scenario.scheme,
         "sites": list(scenario.names),
-        "delay_ms": {name: link.delay_ms for name, link in scenario.links.items()},
+        "delay_ms": {name: link.moments().mean_ms for name, link in scenario.links.items()},
         "dominance": scenario.dominance,
         "assumed": list(scenario.assumed),
     }
@@ -107,7 +107,7 @@ def _links(log: Log, name: str) -> dict[str, Facts]:
     for peer, age_ms in zip(log[name].peers, ages.T, strict=True):
         known = age_ms[np.isfinite(age_ms)]
         links[peer] = {
-            "delay_ms": log.scenario.links[f"{peer}->{name}"].delay_ms,
+            "delay_ms": log.scenario.links[f"{peer}->{name}"].moments().mean_ms,
             "age_ms": _spread(known, {"p50": 50.0, "min": 0.0, "max": 100.0}),
             "late_samples": stats[0].late.get(peer, 0) if stats else None,
             "duplicate_samples": stats[0].duplicate.get(peer, 0) if stats else None,

@@ -92,7 +92,7 @@ def _ages(log: Log, site: str, row: style.Grid) -> None:
     part = log[site]
     for peer, age_ms, axes in zip(part.peers, quantities.ages_ms(log, site).T, row, strict=True):
         style.draw(axes, part.tick, part.t_s, age_ms, **style.line(log, peer, 1.8))
-        axes.axhline(log.scenario.links[f"{peer}->{site}"].delay_ms, **_PERIOD)
+        axes.axhline(log.scenario.links[f"{peer}->{site}"].moments().mean_ms, **_PERIOD)
         axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
         if not np.any(np.isfinite(age_ms)):
             style.note(axes, "no sample in use")
@@ -101,7 +101,7 @@ def _ages(log: Log, site: str, row: style.Grid) -> None:
 def _age_limit_ms(log: Log) -> float:
     ages = [quantities.ages_ms(log, site) for site in log.sites]
     largest = max((float(a[np.isfinite(a)].max(initial=0.0)) for a in ages), default=0.0)
-    return 1.25 * max(largest, *(link.delay_ms for link in log.scenario.links.values()), 1.0)
+    return 1.25 * max(largest, *(link.moments().mean_ms for link in log.scenario.links.values()), 1.0)
 
 
 def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array) -> None:

@@ -1,12 +1,14 @@
-"""The paper's adaptive law, split where its equations are.
+"""The control laws: the paper's adaptive one, split where its equations are, and P+d.
 
 Law: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-order
 update explicit.
 
-Source: Eq. (9)-(13), (15) of the paper. Gains are diagonal and stand as vectors.
+Source: Eq. (9)-(13), (15) of the paper; P+d after Nuno, Basanez, Ortega and Spong, "Position Tracking for
+Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009). Gains are diagonal
+and stand as vectors.
 """
 
-from .arm import Array
+from .arm import Array, gravity
 from .jit import leaf
 
 
@@ -77,4 +79,30 @@ def torque(
         for p in range(theta_hat.shape[0]):
             total += Y[i, p] * theta_hat[p]
         total -= Kp[i] * r[i] + Kd[i] * ed[i]
+        tau[i] = min(max(total, -limit), limit)
+
+
+@leaf
+def p_d_torque(
+    theta: Array, g: float, K: Array, d: Array, q: Array, qd: Array, e: Array, limit: float, tau: Array
+) -> None:
+    """Writes tau = G(q) - K e - d qd, held within +-limit: P+d with known gravity.
+
+    For N sites with equal K and d per joint and one constant delay T, the linearised loop is stable from
+    d = abs(lambda_min(alpha)) K T on.
+
+    Args:
+        theta: true parameters, shape (5,).
+        g: gravitational acceleration, m/s^2.
+        K: stiffness, shape (n,), N m/rad.
+        d: damping, shape (n,), N m s/rad.
+        q: joint angles, shape (n,), rad.
+        qd: joint velocities, shape (n,), rad/s.
+        e: position error, shape (n,), rad.
+        limit: largest torque of a joint, N m.
+        tau: control torque, shape (n,), N m; written.
+    """
+    gravity(theta, g, q, tau)
+    for i in range(tau.shape[0]):
+        total = tau[i] - K[i] * e[i] - d[i] * qd[i]
         tau[i] = min(max(total, -limit), limit)

@@ -1,7 +1,7 @@
 """A fingerprint of the platform's arithmetic, by behaviour.
 
 Law (L5): two platforms with the same fingerprint gave the same bits for many sines and cosines and for a
-short run of two sites; only there is a whole run executed again and bit equality demanded.
+short run of two sites with random links; only there is a whole run executed again and bit equality demanded.
 """
 
 import hashlib
@@ -11,12 +11,14 @@ from functools import cache
 import numpy as np
 
 from .arm import Array, Links, parameters
+from .delay import Delay, Model
 from .jit import leaf
-from .setup import LinkSetup, Scheme, SiteSetup
+from .setup import Law, LinkSetup, Scheme, SiteSetup
 from .site import Site
 from .tick import Arrival, Tick
 
 _TICKS = 200
+_LINK = Model(kind=Delay.GAMMA, extra=2.7, scale=900.0, playout_us=2_000)
 
 
 @leaf
@@ -32,6 +34,7 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         name=name,
         rate_hz=1000,
         scheme=Scheme.SECOND_ORDER,
+        law=Law.ADAPTIVE,
         theta=theta,
         g_m_s2=9.81,
         Lambda=np.array([1.0, 1.3]),
@@ -39,12 +42,14 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         Kd=np.array([3.0, 2.1]),
         Gamma=np.ones(5),
         theta_hat0=0.3 * theta,
+        K=np.zeros(2),
+        d=np.zeros(2),
         tau_limit_nm=200.0,
         qd_limit_rad_s=100.0,
         q0=q0,
         qd0=(0.1, -0.2),
         pulses=np.array([[0.01, 0.15, 3.0, 2.0]]),
-        links=(LinkSetup(peer, 1.0, 3_000_000, 1000, (0.0, 0.0)),),
+        links=(LinkSetup(peer, 1.0, 1000, (0.0, 0.0), 7, (_LINK,)),),
     )
 
 

@@ -11,12 +11,15 @@ import numpy as np
 
 from . import control
 from .arm import JOINTS, PARAMETERS, Array, regressor
+from .delay import Points, Row
 from .exogenous import torque_on_arm
 from .grid import tick_ns
 from .integrator import STAGE_ROWS, advance
 from .jit import leaf
-from .link import Row, Rows, Ticks, accept, recall
-from .setup import Scheme
+from .link import Rows, Ticks, accept, recall
+from .setup import Law, Scheme
+from .shares import follow_ramps
+from .stale import mind_stale_peers
 from .tick import Mode
 
 _VECTOR = (JOINTS,)
@@ -26,7 +29,11 @@ SITE = np.dtype(
         [
             ("rate_hz", "i8"),
             ("scheme", "i8"),
-            ("mode", "i8"),
+            ("law", "i8"),
+            ("ramps", "i8"),
+            ("on_stale", "i8"),
+            ("stale_ns", "i8"),
+            ("return_ns", "i8"),
             ("g", "f8"),
             ("tau_limit", "f8"),
             ("qd_limit", "f8"),
@@ -35,7 +42,10 @@ SITE = np.dtype(
             ("Kp", "f8", _VECTOR),
             ("Kd", "f8", _VECTOR),
             ("Gamma", "f8", (PARAMETERS,)),
+            ("K", "f8", _VECTOR),
+            ("d", "f8", _VECTOR),
             # the state
+            ("mode", "i8"),
             ("q", "f8", _VECTOR),
             ("qd", "f8", _VECTOR),
             ("theta_hat", "f8", (PARAMETERS,)),
@@ -43,9 +53,12 @@ SITE = np.dtype(
             ("tau_before", "f8", _VECTOR),
             ("Yr", "f8", (PARAMETERS,)),
             ("Yr_before", "f8", (PARAMETERS,)),
+            ("q_held", "f8", _VECTOR),
+            ("return_from_ns", "i8"),
             # what a tick computes on its way
             ("q_des", "f8", _VECTOR),
             ("qd_des", "f8", _VECTOR),
+            ("q_followed", "f8", _VECTOR),
             ("on_arm", "f8", _VECTOR),
             ("e", "f8", _VECTOR),
             ("ed", "f8", _VECTOR),
@@ -66,20 +79,51 @@ ARRIVAL = np.dtype((np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", _VEC
 EMITTED = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 ROW_FLOATS = 6 * JOINTS + PARAMETERS
 
-_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_DIVERGED = int(Mode.DIVERGED)
 _DIGITAL = int(Scheme.DIGITAL)
+_P_D = int(Law.P_D)
 
 
 @leaf
-def _reference(links: Rows, q_des: Array, qd_des: Array) -> None:
-    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order."""
-    q_des[:] = 0.0
-    qd_des[:] = 0.0
+def _reference(t_ns: int, site: Row, links: Rows, ramps: Array) -> None:
+    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order.
+
+    While shares change, the derivative has their rates in it too.
+    """
+    if site.ramps > 1:
+        follow_ramps(t_ns, site.ramps, ramps, links)
+    site.q_followed[:] = site.q_des
+    site.q_des[:] = 0.0
+    site.qd_des[:] = 0.0
     for j in range(links.shape[0]):
         link: Row = links[j]
-        for i in range(q_des.shape[0]):
-            q_des[i] += link.alpha * link.q[i]
-            qd_des[i] += link.alpha * link.qd[i]
+        for i in range(site.q_des.shape[0]):
+            site.q_des[i] += link.alpha * link.q[i]
+            site.qd_des[i] += link.alpha * link.qd[i]
+            if link.alpha_rate != 0.0:
+                site.qd_des[i] += link.alpha_rate * link.q[i]
+    mind_stale_peers(t_ns, site, links)
+
+
+@leaf
+def _estimate(k: int, site: Row) -> None:
+    """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
+    if site.scheme == _DIGITAL or k == 0 or site.mode == _DIVERGED or site.law == _P_D:
+        return
+    half_s = 0.5 / site.rate_hz
+    for p in range(site.Yr.shape[0]):
+        site.theta_hat[p] -= half_s * site.Gamma[p] * (site.Yr_before[p] + site.Yr[p])
+
+
+@leaf
+def _torque(site: Row) -> None:
+    """Stage 6: the torque of the site's law."""
+    if site.law == _P_D:
+        control.p_d_torque(
+            site.theta, site.g, site.K, site.d, site.q, site.qd, site.e, site.tau_limit, site.tau
+        )
+    else:
+        control.torque(site.Y, site.theta_hat, site.Kp, site.Kd, site.r, site.ed, site.tau_limit, site.tau)
 
 
 @leaf
@@ -151,7 +195,7 @@ def _advance(k: int, site: Row, pulses: Array) -> None:
         site.q[:] = site.q_kept
         site.qd[:] = site.qd_kept
         site.mode = _DIVERGED
-    if site.scheme == _DIGITAL:
+    if site.scheme == _DIGITAL and site.law != _P_D:
         control.estimate(site.theta_hat, h_s, site.Gamma, site.Yr)
     site.tau_before[:] = site.tau
     site.Yr_before[:] = site.Yr
@@ -159,24 +203,36 @@ def _advance(k: int, site: Row, pulses: Array) -> None:
 
 @leaf
 def site_accept(
-    k: int, count: int, site: Rows, links: Rows, samples: Rows, calendars: Ticks, arrivals: Rows
+    k: int,
+    count: int,
+    site: Rows,
+    links: Rows,
+    models: Rows,
+    samples: Rows,
+    calendars: Ticks,
+    points: Points,
+    arrivals: Rows,
 ) -> None:
     """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
     rate_hz = site[0].rate_hz
     for n in range(count):
         arrival: Row = arrivals[n]
         j = arrival.peer
-        accept(k, rate_hz, arrival.tick, arrival.q, arrival.qd, links[j], samples[j], calendars[j])
+        tick, q, qd = arrival.tick, arrival.q, arrival.qd
+        accept(k, rate_hz, tick, q, qd, links[j], models[j], samples[j], calendars[j], points)
 
 
 @leaf
 def site_tick(
     k: int,
     count: int,
-    site: Row,
+    site: Rows,
     links: Rows,
+    models: Rows,
     samples: Rows,
     calendars: Ticks,
+    points: Points,
+    ramps: Array,
     arrivals: Rows,
     pulses: Array,
     row: Array,
@@ -188,28 +244,29 @@ def site_tick(
         count: how many rows of `arrivals` are filled.
         site: the site's state and constants, one row of dtype SITE, shape (1,).
         links: one row per peer, shape (P,), dtype LINK.
+        models: what the links' channels do, shape (P, M), dtype MODEL.
         samples: where samples wait, shape (P, pages), dtype SAMPLE.
         calendars: the links' calendars, shape (P, pages).
+        points: traces and outages, shape (n, 2).
+        ramps: how shares change, shape (R, 2 + P), see `shares`.
         arrivals: what came in, shape (MAX_ARRIVALS,), dtype ARRIVAL.
         pulses: the operator's torque, see `exogenous`.
         row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
     """
     s: Row = site[0]
-    site_accept(k, count, site, links, samples, calendars, arrivals)  # 1 accept
+    t_ns = tick_ns(k, s.rate_hz)
+    site_accept(k, count, site, links, models, samples, calendars, points, arrivals)  # 1 accept
     for j in range(links.shape[0]):  # 2 recall
-        recall(k, links[j], samples[j], calendars[j])
-    _reference(links, s.q_des, s.qd_des)  # 3 reference
+        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
+    _reference(t_ns, s, links, ramps)  # 3 reference
     _errors_and_regressor(s)  # 4 errors
-    if s.scheme != _DIGITAL and k > 0 and s.mode == _RUN:  # 5 estimate: the trapezoid rule, explicit
-        half_s = 0.5 / s.rate_hz
-        for p in range(s.Yr.shape[0]):
-            s.theta_hat[p] -= half_s * s.Gamma[p] * (s.Yr_before[p] + s.Yr[p])
-    control.torque(s.Y, s.theta_hat, s.Kp, s.Kd, s.r, s.ed, s.tau_limit, s.tau)  # 6 torque
-    torque_on_arm(tick_ns(k, s.rate_hz) * 1e-9, pulses, s.on_arm)
+    _estimate(k, s)  # 5 estimate
+    _torque(s)  # 6 torque
+    torque_on_arm(t_ns * 1e-9, pulses, s.on_arm)
     if not _within_limits(s):
         s.mode = _DIVERGED
     _emit(s, row)  # 7 emit
-    if s.mode == _RUN:  # 8 advance
+    if s.mode != _DIVERGED:  # 8 advance
         _advance(k, s, pulses)
 
 
@@ -218,5 +275,5 @@ def site_resume(k: int, site: Rows, pulses: Array) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
     s: Row = site[0]
     _errors_and_regressor(s)
-    if s.mode == _RUN:
+    if s.mode != _DIVERGED:
         _advance(k, s, pulses)

@@ -1,72 +1,105 @@
 """The receiving end of one directed link j -> i: where delay is applied.
 
-Law (L2): a sample of tick m on a link with delay T is due at t_m + T, on nominal stamps, in integer
+Law (L2): a sample of tick m is due when its channel says so, counted from its nominal stamp in integer
 nanoseconds; it is in use from the first tick of the receiver at or after that, never at its own stamp.
-When it really arrived has no influence as long as it arrived before it was due.
+When it really arrived has no influence as long as it arrived before it was due. (On a measured link a
+sample is due at once, so there its arrival is all that counts.)
 
 A link is a calendar. `accept` files a sample under its own tick and writes into the page of the tick
 that releases it which sample is the newest there; `recall` turns to the page of the present tick. Both
 cost the same whatever the delay. Newest wins: an older sample never replaces a newer one.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .arm import JOINTS, Array
+from .channel import LOST, foresee
+from .delay import LIMIT_US, Delay, Points, Row
 from .grid import NS_PER_S, first_tick_at, tick_ns
 from .jit import leaf
 
 # One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and
-# qd are the peer's start pose, at rest (L7). The last four count arrivals since the start.
+# qd are the peer's start pose, at rest (L7).
 LINK = np.dtype(
     (
         np.record,
         [
             ("alpha", "f8"),
-            ("delay_ns", "i8"),
+            ("alpha_rate", "f8"),
             ("rate_hz", "i8"),
             ("used", "i8"),
             ("q", "f8", (JOINTS,)),
             ("qd", "f8", (JOINTS,)),
+            # its channel
+            ("key", "u8"),
+            ("models", "i8"),
+            ("model", "i8"),
+            ("outage_first", "i8"),
+            ("outage_count", "i8"),
+            ("foreseen", "i8"),
+            ("bad", "i8"),
+            ("memory", "f8"),
+            ("due_before", "i8"),
+            # counts since the start
             ("accepted", "i8"),
             ("late", "i8"),
             ("duplicate", "i8"),
             ("refused", "i8"),
+            ("lost", "i8"),
+            ("superseded", "i8"),
+            ("copies", "i8"),
         ],
     )
 )
-# One row per sample that may wait: its tick (-1: empty) and the peer's joint state.
-SAMPLE = np.dtype((np.record, [("tick", "i8"), ("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,))]))
+# One page per sample: when the sample of that index is due, and the sample that waits there with its own
+# tick (-1: none) and the peer's joint state.
+SAMPLE = np.dtype(
+    (np.record, [("due_ns", "i8"), ("tick", "i8"), ("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,))])
+)
 
 AHEAD_LIMIT_S = 10
 AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
 """A stamp further ahead of the receiver than this is refused."""
 
-Row = Any
-"""A row of a structured array; NumPy's types cannot name its fields."""
-
 Rows = NDArray[np.void]
 Ticks = NDArray[np.int64]
 
+_MEASURED = int(Delay.MEASURED)
 
-def calendar_pages(delay_ns: int, rate_hz: int) -> int:
-    """Returns how many ticks a calendar must span for a delay: that delay and what may run ahead of it."""
-    ticks = first_tick_at(delay_ns + AHEAD_LIMIT_NS, rate_hz) + 2
+
+def calendar_pages(rate_hz: int) -> int:
+    """Returns how many ticks a calendar must span: the longest delay and what may run ahead of it."""
+    ticks = first_tick_at(LIMIT_US * 1000 + AHEAD_LIMIT_NS, rate_hz) + 2
     return 1 << int(ticks).bit_length()
 
 
 @leaf
-def release_tick(tick: int, link: Row, rate_hz: int) -> int:
-    """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by then."""
-    stamp_ns = tick_ns(tick, link.rate_hz)
-    return first_tick_at(stamp_ns + max(link.delay_ns, 1), rate_hz)
+def release_tick(tick: int, link: Row, models: Rows, samples: Rows, points: Points, rate_hz: int) -> int:
+    """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by then.
+
+    LOST where it never does, or where it is so old that its page has been turned.
+    """
+    foresee(tick, link, models, samples, points)
+    pages = samples.shape[0]
+    page: Row = samples[tick % pages]
+    if page.due_ns == LOST or tick <= link.foreseen - pages:
+        return LOST
+    return first_tick_at(max(page.due_ns, tick_ns(tick, link.rate_hz) + 1), rate_hz)
 
 
 @leaf
 def accept(
-    k: int, rate_hz: int, tick: int, q: Array, qd: Array, link: Row, samples: Rows, calendar: Ticks
+    k: int,
+    rate_hz: int,
+    tick: int,
+    q: Array,
+    qd: Array,
+    link: Row,
+    models: Rows,
+    samples: Rows,
+    calendar: Ticks,
+    points: Points,
 ) -> None:
     """Takes one arrival into a link; what it cannot use it counts.
 
@@ -77,8 +110,10 @@ def accept(
         q: the peer's joint angles, shape (n,), rad.
         qd: the peer's joint velocities, shape (n,), rad/s.
         link: the link's row, dtype LINK.
+        models: what its channel does, shape (M,), dtype MODEL.
         samples: where samples wait, shape (pages,), dtype SAMPLE.
         calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
+        points: the site's traces and outages.
     """
     link.accepted += 1
     # whole seconds first: a hostile tick must not overflow the arithmetic that comes after
@@ -90,34 +125,54 @@ def accept(
     if slot.tick == tick:
         link.duplicate += 1
         return
-    release = release_tick(tick, link, rate_hz)
+    release = release_tick(tick, link, models, samples, points, rate_hz)
+    if release == LOST:
+        link.lost += 1
+        return
     if release < k:
-        link.late += 1
+        model: Row = models[link.model]
+        if model.kind != _MEASURED:
+            link.late += 1
         release = k
     if slot.tick > tick or tick <= link.used:
+        link.superseded += 1
         return
     slot.tick = tick
     slot.q[:] = q
     slot.qd[:] = qd
     page = release % calendar.shape[0]
+    if calendar[page] >= 0:
+        link.superseded += 1
     calendar[page] = max(calendar[page], tick)
 
 
 @leaf
-def recall(k: int, link: Row, samples: Rows, calendar: Ticks) -> None:
+def recall(
+    k: int, rate_hz: int, link: Row, models: Rows, samples: Rows, calendar: Ticks, points: Points
+) -> None:
     """Brings into use the newest sample that tick k releases, if there is one; else the last one stays.
+
+    It also foresees the channel up to t_k, so that a long silence of the peer costs nothing at its end.
 
     Args:
         k: the receiver's present tick; every tick must be recalled once, in order.
+        rate_hz: the receiver's rate, Hz.
         link: the link's row, dtype LINK.
+        models: what its channel does, shape (M,), dtype MODEL.
         samples: where samples wait, shape (pages,), dtype SAMPLE.
         calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
+        points: the site's traces and outages.
     """
+    foresee(k * link.rate_hz // rate_hz, link, models, samples, points)
     page = k % calendar.shape[0]
     newest = calendar[page]
+    if newest < 0:
+        return
     calendar[page] = -1
     slot: Row = samples[newest % samples.shape[0]]
     if newest > link.used and slot.tick == newest:
         link.used = newest
         link.q[:] = slot.q
         link.qd[:] = slot.qd
+    else:
+        link.superseded += 1

@@ -13,15 +13,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from .arm import JOINTS
+from .channel import LOST
+from .delay import MODEL, Delay, Model, Row
 from .grid import NS_PER_S
 from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_resume, site_tick
-from .link import LINK, SAMPLE, Row, calendar_pages, release_tick
-from .setup import SiteSetup
-from .tick import MAX_ARRIVALS, Arrival, LinkCounts, Mode, Output, Tick
+from .link import LINK, SAMPLE, calendar_pages, release_tick
+from .setup import Law, LinkSetup, SiteSetup
+from .shares import RAMP_COLUMNS
+from .tick import MAX_ARRIVALS, Arrival, Command, LinkCounts, Mode, Output, Ramp, Tick
 
 _ARRIVAL_LAYOUT = struct.Struct(f"<qq{2 * JOINTS}d")
 _PACK_ARRIVAL, _PACK_ARRIVAL_SIZE = _ARRIVAL_LAYOUT.pack_into, _ARRIVAL_LAYOUT.size
 _MODES = {int(mode): mode for mode in Mode}
+_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+
+MAX_COMMANDS = 256
+"""Most changes of one link, or of the shares, that a site takes in a run besides its scenario's."""
 
 
 class Site:
@@ -46,27 +53,78 @@ class Site:
         self._arrivals = np.zeros(MAX_ARRIVALS, ARRIVAL)
         self._arrival_bytes = self._arrivals.view(np.uint8).data
         self._fill(setup)
-        self._connect(setup)
+        self._connect(setup.links)
+        self._share(setup)
 
     def _fill(self, setup: SiteSetup) -> None:
         s: Row = self._site[0]
-        s.rate_hz, s.scheme, s.mode = setup.rate_hz, int(setup.scheme), int(Mode.RUN)
+        s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, int(setup.scheme), int(setup.law), _RUN
         s.g, s.tau_limit, s.qd_limit = setup.g_m_s2, setup.tau_limit_nm, setup.qd_limit_rad_s
-        for name in ("theta", "Lambda", "Kp", "Kd", "Gamma"):
+        rule = setup.on_stale
+        s.on_stale, s.stale_ns, s.return_ns = int(rule.action), rule.age_ns, rule.return_ns
+        for name in ("theta", "Lambda", "Kp", "Kd", "Gamma", "K", "d"):
             s[name] = getattr(setup, name)
         s.q, s.qd, s.theta_hat = setup.q0, setup.qd0, setup.theta_hat0
+        if setup.law is Law.P_D:
+            s.theta_hat = setup.theta  # it knows them
 
-    def _connect(self, setup: SiteSetup) -> None:
-        peers = len(setup.links)
-        pages = max(calendar_pages(link.delay_ns, max(link.rate_hz, setup.rate_hz)) for link in setup.links)
+    def _connect(self, links: Sequence[LinkSetup]) -> None:
+        peers = len(links)
+        pages = max(calendar_pages(max(link.rate_hz, self.rate_hz)) for link in links)
         self._links = np.zeros(peers, LINK)
         self._samples = np.zeros((peers, pages), SAMPLE)
         self._samples["tick"] = -1
         self._calendars = np.full((peers, pages), -1, dtype=np.int64)
+        self._models = np.zeros((peers, max(len(link.models) for link in links) + MAX_COMMANDS), MODEL)
+        tables = [trace for link in links for trace in link.traces if trace is not None]
+        outages = [outage for link in links for outage in link.outages]
+        self._points = np.array(
+            [pair for table in tables for pair in table] + outages, dtype=np.int64
+        ).reshape(-1, 2)
+        trace_first, outage_first = 0, sum(map(len, tables))
         row: Row
-        for row, link in zip(self._links, setup.links, strict=True):
-            row.alpha, row.delay_ns, row.rate_hz = link.alpha, link.delay_ns, link.rate_hz
-            row.used, row.q = -1, link.q0
+        for row, models, link in zip(self._links, self._models, links, strict=True):
+            row.alpha, row.rate_hz, row.key = link.alpha, link.rate_hz, link.key
+            row.used, row.foreseen, row.q = -1, -1, link.q0
+            row.outage_first, row.outage_count = outage_first, len(link.outages)
+            outage_first += len(link.outages)
+            row.models = len(link.models)
+            for n, (model, trace) in enumerate(zip(link.models, link.traces, strict=True)):
+                count = 0 if trace is None else len(trace)
+                models[n] = model._replace(trace_first=trace_first, trace_count=count)
+                trace_first += count
+
+    def _share(self, setup: SiteSetup) -> None:
+        self._ramps = np.zeros((1 + len(setup.ramps) + MAX_COMMANDS, RAMP_COLUMNS + len(setup.links)))
+        self._ramps[0, RAMP_COLUMNS:] = [link.alpha for link in setup.links]
+        self._site[0].ramps = 1
+        for ramp in setup.ramps:
+            self._add_ramp(ramp)
+
+    def _add_ramp(self, ramp: Ramp) -> None:
+        count = int(self._site[0].ramps)
+        self._ramps[count] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
+        self._site[0].ramps = count + 1
+
+    def _add_model(self, peer: int, model: Model) -> None:
+        count = int(self._links[peer].models)
+        self._models[peer, count] = model
+        self._links[peer].models = count + 1
+
+    def order(self, command: Command) -> None:
+        """Takes in a change. It must not begin before those that the site has of the same thing.
+
+        Raises:
+            ValueError: the site has taken `MAX_COMMANDS` of them.
+        """
+        if command.model is not None:
+            if self._links[command.peer].models >= self._models.shape[1]:
+                raise ValueError(f"a run takes at most {MAX_COMMANDS} changes of a link")
+            self._add_model(command.peer, command.model)
+        if command.ramp is not None:
+            if self._site[0].ramps >= len(self._ramps):
+                raise ValueError(f"a run takes at most {MAX_COMMANDS} changes of its shares")
+            self._add_ramp(command.ramp)
 
     def step(self, tick: Tick) -> Output:
         """Computes one tick and returns its record.
@@ -75,26 +133,32 @@ class Site:
             tick: its number, one more than the last one's, and what came in since then.
 
         Raises:
-            ValueError: more than MAX_ARRIVALS arrivals.
+            ValueError: more than MAX_ARRIVALS arrivals, or MAX_COMMANDS commands.
         """
         taken = self._pack(tick.arrivals)
+        for command in tick.commands:
+            self.order(command)
         site_tick(
             tick.k,
             len(tick.arrivals),
             self._site,
             self._links,
+            self._models,
             self._samples,
             self._calendars,
+            self._points,
+            self._ramps,
             self._arrivals,
             self._pulses,
             self._row,
         )
         row = self._row.tolist()
         n = JOINTS
+        mode = self._site["mode"].item()
         return Output(
             tick.k,
             tick.k * NS_PER_S // self.rate_hz,
-            _MODES[self._site["mode"].item()],
+            _MODES[mode],
             row[:n],
             row[n : 2 * n],
             row[2 * n : 3 * n],
@@ -104,15 +168,32 @@ class Site:
             row[6 * n :],
             self._links["used"].tolist(),
             zlib.crc32(self._arrival_bytes[:taken]),
+            [command.text for command in tick.commands],
+            [] if mode in (_RUN, _DIVERGED) else self._memory(),
         )
+
+    def _memory(self) -> list[float]:
+        """Returns `Output.mem` of a site that holds, brakes or returns."""
+        s: Row = self._site[0]
+        return [*s.q_held.tolist(), float(s.return_from_ns)]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""
         return tuple(LinkCounts(*(int(link[field]) for field in LinkCounts._fields)) for link in self._links)
 
-    def release_tick(self, peer: int, tick: int) -> int:
-        """Returns the tick of this site at which a peer's sample comes into use if it is there by then."""
-        return int(release_tick(tick, self._links[peer], self.rate_hz))
+    def release_tick(self, peer: int, tick: int) -> int | None:
+        """Returns the tick of this site at which a peer's sample comes into use if it is there by then.
+
+        None where it never does: its link loses it, or forgot it long ago.
+        """
+        channel = self._links[peer], self._models[peer], self._samples[peer], self._points
+        release = int(release_tick(tick, *channel, self.rate_hz))
+        return None if release == LOST else release
+
+    def measures(self, peer: int) -> bool:
+        """True where a peer's samples are in use as soon as they have come: then none is late."""
+        link: Row = self._links[peer]
+        return bool(self._models[peer, link.model]["kind"] == Delay.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
         """Returns the tick rate of a peer, Hz."""
@@ -131,6 +212,8 @@ class Site:
         s.mode = int(last.mode)
         s.q, s.qd, s.theta_hat = last.q, last.qd, last.theta_hat
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
+        if last.mem:
+            s.q_held, s.return_from_ns = last.mem[:JOINTS], int(last.mem[JOINTS])
         site_resume(last.tick, self._site, self._pulses)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
@@ -148,10 +231,21 @@ class Site:
         self._calendars[:] = -1
         link: Row
         for link, sample in zip(self._links, in_use, strict=True):
+            link.foreseen, link.model = -1, 0  # the channel's memory is a function of what went before
             if sample is not None:
                 link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
         self._pack(waiting)
-        site_accept(k, len(waiting), self._site, self._links, self._samples, self._calendars, self._arrivals)
+        site_accept(
+            k,
+            len(waiting),
+            self._site,
+            self._links,
+            self._models,
+            self._samples,
+            self._calendars,
+            self._points,
+            self._arrivals,
+        )
 
     def _pack(self, arrivals: Sequence[Arrival]) -> int:
         """Writes arrivals into their table; returns the bytes that they take."""

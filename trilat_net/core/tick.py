@@ -1,4 +1,4 @@
-"""What goes into `Site.step` and what comes out: a tick, its arrivals, its record.
+"""What goes into `Site.step` and what comes out: a tick, its arrivals and commands, its record.
 
 Law (L3): the record of a tick names its inputs; which sample was used is an output.
 """
@@ -7,15 +7,25 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+from .delay import Model
+
 MAX_ARRIVALS = 4096
 """Most arrivals that one tick takes in; a driver leaves the rest for the next one."""
 
 
 class Mode(IntEnum):
-    """What a site is doing in a tick. Edges: RUN -> DIVERGED (a limit was passed), and no other."""
+    """What a site is doing in a tick.
+
+    RUN follows its peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
+    the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN.
+    DIVERGED passed a limit, from any of them, and is final.
+    """
 
     RUN = 1
     DIVERGED = 2
+    HOLD = 3
+    BRAKE = 4
+    RETURN = 5
 
 
 class Arrival(NamedTuple):
@@ -36,11 +46,42 @@ class Arrival(NamedTuple):
     latency_us: int = 0
 
 
+class Ramp(NamedTuple):
+    """A site's shares in its peers, changed linearly over a time.
+
+    Attributes:
+        start_ns: when it begins, ns since the epoch.
+        end_ns: when it is complete, not before `start_ns`.
+        alpha: the shares at its end, per peer in scenario order.
+    """
+
+    start_ns: int
+    end_ns: int
+    alpha: tuple[float, ...]
+
+
+class Command(NamedTuple):
+    """A change ordered from outside.
+
+    Attributes:
+        text: how the record names it; whoever reads the record makes the same command of it.
+        peer: the link that it changes, by its peer's index; -1 where it changes the shares.
+        model: what that link does from then on.
+        ramp: how the shares change.
+    """
+
+    text: str
+    peer: int = -1
+    model: Model | None = None
+    ramp: Ramp | None = None
+
+
 class Tick(NamedTuple):
-    """One call of `Site.step`: the tick's number and what came in since the one before, in order."""
+    """One call of `Site.step`: its number, what came in since the one before, in order, and commands."""
 
     k: int
     arrivals: Sequence[Arrival] = ()
+    commands: Sequence[Command] = ()
 
 
 class Output(NamedTuple):
@@ -60,6 +101,9 @@ class Output(NamedTuple):
         used: tick of the sample in use, per peer in scenario order; -1 before the first.
         rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian
             (peer i64, tick i64, q f64s, qd f64s) each; shows a changed input at its own tick.
+        cmd: texts of the commands that it took in.
+        mem: what the site remembers besides: empty in RUN and DIVERGED, else the pose that it holds, rad,
+            and when it began to return, ns since the epoch (0 where it does not yet).
     """
 
     tick: int
@@ -74,15 +118,41 @@ class Output(NamedTuple):
     theta_hat: list[float]
     used: list[int]
     rx_crc: int
+    cmd: list[str]
+    mem: list[float]
 
 
 class LinkCounts(NamedTuple):
-    """What one link has counted since the start: samples accepted, and of those late, duplicate, refused."""
+    """What one link has counted since the start.
+
+    Attributes:
+        accepted: samples that came.
+        late: of those, the ones that came after they were due.
+        duplicate: the ones that were there already.
+        refused: the ones whose stamp was out of range.
+        lost: the ones that the link's model lost.
+        superseded: the ones never used, because a newer one was released before or with them.
+        copies: duplicates that the link's model made.
+    """
 
     accepted: int
     late: int
     duplicate: int
     refused: int
+    lost: int
+    superseded: int
+    copies: int
+
+
+def mode_text(site: str, output: Output) -> str:
+    """Says that a site does something else from this tick on."""
+    doing = {
+        Mode.RUN: "follows its peers",
+        Mode.HOLD: "holds its reference: a peer is stale",
+        Mode.BRAKE: "holds its pose: a peer is stale",
+        Mode.RETURN: "returns to its peers",
+    }
+    return f"{site} {doing[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
 
 
 def diverged_text(site: str, output: Output) -> str:

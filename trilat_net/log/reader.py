@@ -7,6 +7,7 @@ Law: a log is read as it is. Files of every released schema version open; a torn
 whole, and says so (`complete`).
 """
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +19,12 @@ from numpy.typing import NDArray
 from .. import collector
 from ..core.arm import Array
 from ..core.grid import NS_PER_S
+from ..core.tick import Command
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
-from ..net.messages import STATE_VECTORS, Event, LinkStats, State
+from ..net.messages import READABLE, STATE_VECTORS, Event, LinkStats, State
 from ..net.wire import decode
-from ..scenario import Scenario, parse
+from ..scenario import Scenario, command_from, parse
 from .chunks import Walk
 from .writer import ACCOUNTS, SCENARIO, SESSION
 
@@ -56,7 +58,7 @@ class SiteLog:
         self.rate_hz = rate_hz
         try:
             with collector.paused():
-                pairs = [(decode(payload, State), payload) for payload in payloads]
+                pairs = [(decode(payload, State, READABLE), payload) for payload in payloads]
         except WireError as error:
             raise LogError(f"{source}: a record of {name} cannot be read: {error}") from None
         pairs.sort(key=lambda pair: pair[0].tick)
@@ -162,6 +164,7 @@ class Log:
         source: the file's name.
         session: what the file says of the session: driver, seed, epoch, versions, commit, fingerprint.
         scenario: the scenario that ran.
+        scenario_sha256: hash of its text in the file.
         events: what happened, in file order.
         accounts: per topic what arrived and what is missing, as written at the end; {} in a torn file.
         complete: False where the file was not finished.
@@ -177,7 +180,9 @@ class Log:
         if lacking:
             raise LogError(f"{source}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}")
         try:
-            self.scenario: Scenario = parse(walk.attachments[SCENARIO].decode(), f"{source}: scenario")
+            text = walk.attachments[SCENARIO]
+            self.scenario_sha256 = hashlib.sha256(text).hexdigest()
+            self.scenario: Scenario = parse(text.decode(), f"{source}: scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             raise LogError(f"{source}: its scenario cannot be read: {error}") from None
         self.accounts = walk.metadata.get(ACCOUNTS, {})
@@ -197,7 +202,7 @@ class Log:
     def _decoded(self, topic: str, kind: type[M]) -> Iterator[M]:
         try:
             for payload in self._payloads.get(topic, []):
-                yield decode(payload, kind)
+                yield decode(payload, kind, READABLE)
         except WireError as error:
             raise LogError(f"{self.source}: a message on {topic} cannot be read: {error}") from None
 
@@ -227,6 +232,32 @@ class Log:
                 self.source,
             )
         return self._sites[site]
+
+    def changes(self, site: str) -> dict[int, list[str]]:
+        """Returns the texts of the changes that a site took in, by tick, in order.
+
+        They stand in its records, and in its events, which tell of those whose record is missing.
+        """
+        named = {state.tick: state.cmd for state in self[site].states if state.cmd}
+        have = set(self[site].tick.tolist())
+        for event in self.events:
+            if event.kind == "change" and event.member == site and event.ticks not in have:
+                named.setdefault(event.ticks, []).append(event.command)
+        return dict(sorted(named.items()))
+
+    def commands(self, site: str) -> dict[int, list[Command]]:
+        """Returns the same, as the site took them in.
+
+        Raises:
+            LogError: the log names a change that is none.
+        """
+        try:
+            return {
+                tick: [command_from(self.scenario, site, text) for text in texts]
+                for tick, texts in self.changes(site).items()
+            }
+        except ScenarioError as error:
+            raise LogError(f"{self.source}: {error}") from None
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published, in order."""

@@ -83,10 +83,13 @@ def late_samples(log: Log) -> list[LateSample]:
     late = []
     for name in log.sites:
         site = Site(log.scenario.setup(name))
+        ordered = log.commands(name)
         for state in log[name].states:
+            for command in ordered.get(state.tick, ()):
+                site.order(command)
             for peer, tick, _ in state.rx:
                 due = site.release_tick(peer, tick)
-                if due < state.tick:
+                if due is not None and due < state.tick and not site.measures(peer):
                     late.append(LateSample(name, site.peers[peer], tick, due, state.tick))
     return sorted(late, key=lambda sample: sample.due_tick)
 

@@ -1,7 +1,7 @@
 """Where two executions differ: site, tick, field, both values."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..core.tick import Output
@@ -51,6 +51,11 @@ def close(a: float, b: float) -> bool:
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
+def _same(a: Sequence[float], b: Sequence[float], same: Same) -> bool:
+    """True where two lists of numbers are as long as each other and agree."""
+    return len(a) == len(b) and all(same(float(x), float(y)) for x, y in zip(a, b, strict=True))
+
+
 _NUMBERS = struct.Struct(f"<{sum(STATE_VECTORS.values())}d").pack
 
 
@@ -63,8 +68,8 @@ def identical(logged: State, computed: Output, peers: tuple[str, ...]) -> bool:
         and a.used == dict(zip(peers, b.used, strict=True))
         and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
         and a.mode == b.mode.name.lower()
-        and not a.cmd
-        and not a.mem
+        and a.cmd == b.cmd
+        and (a.mem == b.mem == [] or _same(a.mem, b.mem, same_bits))
     )
 
 
@@ -97,7 +102,8 @@ def first_difference(
             return differs(f"used[{peer}]", logged.used.get(peer), used.get(peer))
     if logged.rx_crc != computed.rx_crc:
         return differs("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
-    for field in ("cmd", "mem"):
-        if getattr(logged, field):
-            return differs(field, getattr(logged, field), [])
+    if logged.cmd != computed.cmd:
+        return differs("cmd", logged.cmd, computed.cmd)
+    if not _same(logged.mem, computed.mem, same):
+        return differs("mem", logged.mem, computed.mem)
     return None

@@ -4,16 +4,18 @@ Law (L3): two records in a row, and what waits in the links, suffice to resume; 
 counted, and is never a difference.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import islice
 
+from ..core.arm import JOINTS
 from ..core.grid import NS_PER_S
-from ..core.site import Site
-from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
+from ..core.site import MAX_COMMANDS, Site
+from ..core.tick import MAX_ARRIVALS, Arrival, Command, Mode, Output, Tick
+from ..errors import ScenarioError
 from ..log.reader import SiteLog
 from ..net.messages import State
-from ..scenario import Scenario
+from ..scenario import Scenario, command_from
 from .difference import Difference, close, first_difference, identical, same_bits
 from .verdict import Verdict
 
@@ -23,12 +25,13 @@ _LOOK_BACK = 100
 
 def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
     """Returns a record as `Site.step` returned it."""
-    mode = Mode.RUN if state.mode == "run" else Mode.DIVERGED
+    modes = {mode.name.lower(): mode for mode in Mode}
+    mem = state.mem if len(state.mem) == JOINTS + 1 else []
     used = [state.used.get(peer, -1) for peer in peers]
     return Output(
         state.tick,
         state.t_ns,
-        mode,
+        modes.get(state.mode, Mode.DIVERGED),
         state.q,
         state.qd,
         state.q_des,
@@ -38,6 +41,8 @@ def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
         state.theta_hat,
         used,
         state.rx_crc,
+        state.cmd,
+        mem,
     )
 
 
@@ -55,12 +60,14 @@ class Execution:
         self,
         scenario: Scenario,
         site_log: SiteLog,
+        changes: Mapping[int, Sequence[str]],
         by_tick: Mapping[str, Mapping[int, State]],
         ends: Mapping[str, int],
         verdict: Verdict,
     ) -> None:
         self._site = Site(scenario.setup(site_log.name))
-        self._log = site_log
+        self._scenario, self._log = scenario, site_log
+        self._changes = sorted(changes.items())
         self._peers = site_log.peers
         self._by_tick = [by_tick[peer] for peer in site_log.peers]
         self._ends = [ends[peer] for peer in site_log.peers]
@@ -99,11 +106,15 @@ class Execution:
             before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
             self._site.resume(before, last)
         arrivals, missing = self._arrivals(state)
+        commands, strange = self._commands(state.tick)
+        tick = Tick(state.tick, arrivals, commands)
         if missing is not None and missing.field != "":
-            verdict.differ(missing)
-            self._site.step(Tick(state.tick, arrivals))
+            strange = strange or missing
+        if strange is not None:
+            verdict.differ(strange)
+            self._site.step(tick)
             return
-        output = self._site.step(Tick(state.tick, arrivals))
+        output = self._site.step(tick)
         if missing is not None:  # the log lacks a sample that came in: its CRC cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
         if state.boot != states[0].boot:
@@ -116,6 +127,19 @@ class Execution:
             self._book(state, output, difference)
         else:
             verdict.identical += 1
+
+    def _commands(self, tick: int) -> tuple[list[Command], Difference | None]:
+        """Returns the changes up to a tick that have not been ordered yet; one that is none differs."""
+        commands: list[Command] = []
+        while self._changes and self._changes[0][0] <= tick:
+            named, texts = self._changes.pop(0)
+            for text in texts:
+                try:
+                    commands.append(command_from(self._scenario, self._log.name, text))
+                except ScenarioError:
+                    valid = "a change of one of its links or of its shares"
+                    return commands, Difference(self._log.name, named, "cmd", text, valid)
+        return commands[:MAX_COMMANDS], None
 
     def _book(self, state: State, output: Output, difference: Difference) -> None:
         in_doubt = any(
@@ -171,6 +195,8 @@ class Execution:
                     waiting.append(Arrival(j, tick, came.q, came.qd))
                 else:
                     self._lacking[j].add(tick)
+        for command in self._commands(states[n].tick - 1)[0]:  # given in the gap
+            self._site.order(command)
         self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
         self._site.resume(before, last)
         self._assured = True

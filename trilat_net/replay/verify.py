@@ -29,7 +29,7 @@ def verify(log: Log) -> Verdict:
         by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
         ends = last_ticks(log)
         for name in log.sites:
-            Execution(log.scenario, log[name], by_tick, ends, verdict).run()
+            Execution(log.scenario, log[name], log.changes(name), by_tick, ends, verdict).run()
     return verdict
 
 

@@ -4,20 +4,29 @@ Law: a scenario that loads is one that runs; everything that a person can get wr
 the path of the key and the nearest valid name.
 """
 
-from .model import Arm, Control, Limits, Link, Pulse, Scenario, SiteSpec
+from .commands import command, command_from, owner, present_links, resolve_change
+from .links import Link
+from .model import Adaptive, Arm, Limits, OnStale, ProportionalDamped, Pulse, Scenario, SiteSpec
 from .reader import load, override, parse, shipped, shipped_text, site_named, template_text
 
 __all__ = [
+    "Adaptive",
     "Arm",
-    "Control",
     "Limits",
     "Link",
+    "OnStale",
+    "ProportionalDamped",
     "Pulse",
     "Scenario",
     "SiteSpec",
+    "command",
+    "command_from",
     "load",
     "override",
+    "owner",
     "parse",
+    "present_links",
+    "resolve_change",
     "shipped",
     "shipped_text",
     "site_named",

@@ -7,12 +7,21 @@ import msgspec
 
 from ..core.arm import positive_definite
 from ..errors import ScenarioError
-from .model import Control, Link, Pulse, Scenario, SiteSpec
+from . import expectation
+from .links import Link, LinkBase
+from .model import OnStale, Pulse, Scenario, SiteSpec
 from .resolution import Table
+from .timeline import Change
 
 _CHOICES = {
     key: get_args(kind.__annotations__[key])
-    for kind, key in ((Scenario, "scheme"), (SiteSpec, "role"), (Control, "law"), (Pulse, "kind"))
+    for kind, key in (
+        (Scenario, "scheme"),
+        (SiteSpec, "role"),
+        (Pulse, "kind"),
+        (LinkBase, "order"),
+        (OnStale, "action"),
+    )
 }
 
 
@@ -36,7 +45,28 @@ def convert(resolved: Table) -> Scenario:
                     f"must be later than start_s = {pulse.start_s:g}, is {pulse.end_s:g}",
                     path=f"sites.{name}.hands[{n}].end_s",
                 )
+    for name, link in scenario.links.items():
+        if found := link.fault():
+            raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
+    for n, change in enumerate(scenario.timeline):
+        check_change(change, f"timeline[{n}]")
+    if expected := expectation.fault(scenario.expect, scenario.names, scenario.duration_s):
+        key, problem = expected
+        raise ScenarioError(problem, path=f"expect.{key}")
     return scenario
+
+
+def check_change(change: Change, path: str) -> None:
+    """Refuses a change that makes no link of its link."""
+    if not change.link:
+        return
+    try:
+        found = change.after.fault()
+    except msgspec.ValidationError as error:
+        problem, _, key = str(error).partition(" - at ")
+        raise ScenarioError(_plain(problem, key.strip("`$.")), path=f"{path}.to{key.strip('`$')}") from None
+    if found:
+        raise ScenarioError(found.problem, path=f"{path}.to.{found.key}")
 
 
 def _plain(problem: str, path: str) -> str:

@@ -16,7 +16,13 @@ from msgspec import Meta
 
 from ..core import dominance
 from ..core.arm import Array, Links, parameters
-from ..core.setup import LinkSetup, Scheme, SiteSetup
+from ..core.draw import link_key
+from ..core.setup import Law, LinkSetup, Scheme, SiteSetup, Stale, StaleRule
+from ..core.tick import Ramp
+from .expectation import Expect
+from .frozen import Frozen
+from .links import Link, LinkBase
+from .timeline import Change, later_links
 
 LARGEST = 1e9
 """Beyond this no quantity of an arm, a gain or a torque is meant; arithmetic stays far from its limits."""
@@ -38,10 +44,6 @@ _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 def _one_line(numbers: re.Match[str]) -> str:
     """Puts a list of numbers on one line."""
     return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
-
-
-class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of the scenario's types: immutable, unknown keys refused."""
 
 
 class Arm(Frozen, frozen=True):
@@ -75,11 +77,10 @@ class Arm(Frozen, frozen=True):
         return parameters(Links(**{name: getattr(self, name) for name in Links._fields}))
 
 
-class Control(Frozen, frozen=True):
-    """The law of a site and its gains, all diagonal.
+class Adaptive(Frozen, frozen=True, tag_field="law", tag="adaptive"):
+    """The paper's adaptive law, Eq. (13) and (15), and its gains, all diagonal.
 
     Attributes:
-        law: "adaptive", Eq. (13) and (15).
         Lambda: per joint, 1/s.
         Kp: per joint, N m s/rad.
         Kd: per joint, N m s/rad.
@@ -87,12 +88,47 @@ class Control(Frozen, frozen=True):
         theta_hat0: first estimate of theta, Eq. (24).
     """
 
-    law: Literal["adaptive"] = "adaptive"
     Lambda: PositiveJoints = (1.0, 1.0)
     Kp: PositiveJoints = (1.0, 1.0)
     Kd: NotNegativeJoints = (3.0, 3.0)
     Gamma: NotNegativeParameters = (1.0,) * 5
     theta_hat0: Parameters = (0.0,) * 5
+
+
+class ProportionalDamped(Frozen, frozen=True, tag_field="law", tag="p_d"):
+    """P+d with known gravity: tau = G(q) - K e - d qd.
+
+    Attributes:
+        K: stiffness per joint, N m/rad.
+        d: damping per joint, N m s/rad.
+    """
+
+    K: PositiveJoints = (10.0, 10.0)
+    d: NotNegativeJoints = (3.0, 3.0)
+
+
+Control = Adaptive | ProportionalDamped
+LAWS: dict[str, type[Frozen]] = {"adaptive": Adaptive, "p_d": ProportionalDamped}
+"""The laws by their names."""
+
+
+class OnStale(Frozen, frozen=True, omit_defaults=True):
+    """What a site does about a peer whose sample in use is too old.
+
+    Attributes:
+        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is.
+        age_ms: older than this is too old, ms.
+        return_s: how long the way back takes once a fresh sample is in use, s.
+    """
+
+    action: Literal["use", "hold", "brake"] = "use"
+    age_ms: Annotated[float, Meta(gt=0.0, le=1e6)] = 350.0
+    return_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
+
+    @property
+    def rule(self) -> StaleRule:
+        """The same, as the core has it."""
+        return StaleRule(Stale[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9))
 
 
 class Limits(Frozen, frozen=True):
@@ -134,6 +170,7 @@ class SiteSpec(Frozen, frozen=True):
         arm: its links.
         control: its law and gains.
         limits: where it stops.
+        on_stale: what it does about a peer whose samples are too old.
         hands: what its operator does.
     """
 
@@ -144,22 +181,8 @@ class SiteSpec(Frozen, frozen=True):
     arm: Arm
     control: Control
     limits: Limits
+    on_stale: OnStale = OnStale()
     hands: tuple[Pulse, ...] = ()
-
-
-class Link(Frozen, frozen=True):
-    """One directed link.
-
-    Attributes:
-        delay_ms: constant delay on nominal stamps, ms; 0 means one period.
-    """
-
-    delay_ms: Annotated[float, Meta(ge=0.0, le=10_000.0)]
-
-    @property
-    def delay_ns(self) -> int:
-        """The delay in integer nanoseconds, rounded to whole microseconds (L4)."""
-        return round(self.delay_ms * 1_000) * 1_000
 
 
 class Scenario(Frozen, frozen=True, dict=True):
@@ -176,15 +199,19 @@ class Scenario(Frozen, frozen=True, dict=True):
         sites: the manipulators, in order; the first leads a live session.
         dominance: row i, column j: share of site j in the reference of site i, Eq. (6).
         links: "j->i" for every pair of sites.
+        timeline: what changes during the run.
+        expect: what `trilat test` demands of it.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
     duration_s: Annotated[float, Meta(gt=0.0, le=86_400.0)]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     scheme: Literal["second_order", "digital"]
     sites: dict[str, SiteSpec]
     dominance: dict[str, dict[str, float]]
     links: dict[str, Link]
+    timeline: tuple[Change, ...] = ()
+    expect: Expect = Expect()
     title: str = ""
     about: str = ""
     assumed: tuple[str, ...] = ()
@@ -210,6 +237,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         tables: dict[str, Any] = msgspec.to_builtins(self)
         words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         words = {key: value for key, value in words.items() if value}
+        for table in (tables, *tables["sites"].values()):
+            for key in ("timeline", "expect", "on_stale"):  # what nobody asked for is not there
+                if not table.get(key, True):
+                    del table[key]
         numbers = _NUMBERS.sub(_one_line, tomli_w.dumps(tables))
         return tomli_w.dumps(words, multiline_strings=True) + numbers
 
@@ -226,37 +257,70 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns the peers of a site, in scenario order."""
         return tuple(name for name in self.names if name != site)
 
+    @property
+    def random(self) -> bool:
+        """True where anything is drawn: then another seed is another run."""
+        later = [link for name in self.links for _, link in later_links(self.timeline, name)]
+        return any(link.random for link in (*self.links.values(), *later))
+
+    @property
+    def measured(self) -> bool:
+        """True where a sample of some link is in use as soon as it has come: then the network decides."""
+        return any(link.measured for link in self.links.values())
+
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
         spec = self.sites[site]
         c = spec.control
+        adaptive = c if isinstance(c, Adaptive) else Adaptive()
+        p_d = c if isinstance(c, ProportionalDamped) else ProportionalDamped()
         return SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
             scheme=Scheme[self.scheme.upper()],
+            law=Law.ADAPTIVE if c is adaptive else Law.P_D,
             theta=spec.arm.theta,
             g_m_s2=spec.arm.g_m_s2,
-            Lambda=np.array(c.Lambda),
-            Kp=np.array(c.Kp),
-            Kd=np.array(c.Kd),
-            Gamma=np.array(c.Gamma),
-            theta_hat0=np.array(c.theta_hat0),
+            Lambda=np.array(adaptive.Lambda),
+            Kp=np.array(adaptive.Kp),
+            Kd=np.array(adaptive.Kd),
+            Gamma=np.array(adaptive.Gamma),
+            theta_hat0=np.array(adaptive.theta_hat0),
+            K=np.array(p_d.K),
+            d=np.array(p_d.d),
             tau_limit_nm=spec.limits.tau_limit_nm,
             qd_limit_rad_s=spec.limits.qd_limit_rad_s,
             q0=spec.q0_rad,
             qd0=spec.qd0_rad_s,
             pulses=np.array([[p.start_s, p.end_s, *p.peak_nm] for p in spec.hands]).reshape(-1, 4),
-            links=tuple(
-                LinkSetup(
-                    peer=peer,
-                    alpha=self.dominance[site].get(peer, 0.0),
-                    delay_ns=self.links[f"{peer}->{site}"].delay_ns,
-                    rate_hz=self.sites[peer].rate_hz,
-                    q0=self.sites[peer].q0_rad,
-                )
-                for peer in self.peers(site)
+            links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
+            ramps=tuple(
+                self.ramp(site, change.shares, change.start_ns, change.ramp_s)
+                for change in self.timeline
+                if change.dominance == site
             ),
+            on_stale=spec.on_stale.rule,
         )
+
+    def _link_setup(self, peer: str, site: str) -> LinkSetup:
+        name = f"{peer}->{site}"
+        first = self.links[name]
+        models: list[tuple[int, LinkBase]] = [(0, first), *later_links(self.timeline, name)]
+        return LinkSetup(
+            peer=peer,
+            alpha=self.dominance[site].get(peer, 0.0),
+            rate_hz=self.sites[peer].rate_hz,
+            q0=self.sites[peer].q0_rad,
+            key=link_key(self.seed, name),
+            models=tuple(link.core(from_ns) for from_ns, link in models),
+            traces=tuple(link.points for _, link in models),
+            outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
+        )
+
+    def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> Ramp:
+        """Returns a change of a site's shares, as the core has it."""
+        alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
+        return Ramp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment with nobody at the arms: the twin that hands are measured against."""

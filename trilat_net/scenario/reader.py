@@ -11,6 +11,9 @@ from .conversion import convert
 from .model import Scenario, SiteSpec
 from .resolution import Table, nearest, resolve
 
+_KINDS = ("model", "preset", "law")
+"""Keys that say which other keys a table has."""
+
 _FOLDER = resources.files("trilat_net") / "scenarios"
 
 
@@ -55,7 +58,7 @@ def load(source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[
         except (OSError, UnicodeDecodeError) as error:
             reason = getattr(error, "strerror", None) or "not UTF-8 text"
             raise ScenarioError(f"cannot be read: {reason}", source=name) from None
-        return parse(text, name, overrides)
+        return parse(text, name, overrides, Path(source).parent)
     return parse(shipped_text(name), name, overrides)
 
 
@@ -73,13 +76,19 @@ def site_named(scenario: Scenario, name: str) -> SiteSpec:
     return scenario.sites[name]
 
 
-def parse(text: str, source: str = "", overrides: Mapping[str, Any] | Sequence[str] = ()) -> Scenario:
+def parse(
+    text: str,
+    source: str = "",
+    overrides: Mapping[str, Any] | Sequence[str] = (),
+    folder: Path = Path(),
+) -> Scenario:
     """Returns the scenario that a TOML text describes.
 
     Args:
         text: the TOML text.
         source: what errors call it.
         overrides: see `load`.
+        folder: where the files that it names lie.
 
     Raises:
         ScenarioError: with the path of the offending key.
@@ -90,7 +99,7 @@ def parse(text: str, source: str = "", overrides: Mapping[str, Any] | Sequence[s
         raise ScenarioError(f"is not TOML: {error}", source=source) from None
     try:
         override(tables, overrides)
-        return convert(resolve(tables))
+        return convert(resolve(tables, folder))
     except ScenarioError as error:
         raise ScenarioError(error.problem, path=error.path, source=source) from None
 
@@ -100,9 +109,12 @@ def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> Non
 
     Args:
         tables: as read from TOML.
-        overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word.
+        overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word. One
+            that names a kind (a link's model or preset, a law) replaces what the table said besides.
     """
-    for key, value in _pairs(overrides):
+    pairs = _pairs(overrides)
+    overridden = {key for key, _ in pairs}
+    for key, value in pairs:
         *folders, last = key.split(".")
         sites = tables.get("sites")
         if len(folders) > 1 and folders[0] == "sites" and isinstance(sites, dict) and folders[1] not in sites:
@@ -114,6 +126,9 @@ def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> Non
             if not isinstance(entry, dict):
                 raise ScenarioError("is a value, not a table", path=".".join(folders[: depth + 1]))
             table = entry
+        if last in _KINDS:  # what the file says is of another kind
+            for other in [k for k in table if ".".join([*folders, k]) not in overridden]:
+                del table[other]
         table[last] = value
 
 

@@ -8,6 +8,7 @@ import difflib
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,17 +17,36 @@ import numpy as np
 from ..core import dominance
 from ..core.arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
-from .model import Arm, Control, Limits, Link, Pulse, SiteSpec
+from .expectation import Expect
+from .links import LINKS
+from .model import LAWS, Arm, Limits, OnStale, Pulse, SiteSpec
+from .presets import PRESETS
+from .timeline import Change
+from .traces import read_trace
 
 Table = dict[str, Any]
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
-_TABLES = ("arm", "control", "limits", "link", "sites", "dominance", "links")
-_SITE = ("role", "rate_hz", "q0_rad", "qd0_rad_s", "arm", "control", "limits", "hands")
+_TABLES = (
+    "arm",
+    "control",
+    "limits",
+    "on_stale",
+    "link",
+    "sites",
+    "dominance",
+    "links",
+    "timeline",
+    "expect",
+)
+_SITE = ("role", "rate_hz", "q0_rad", "qd0_rad_s", "arm", "control", "limits", "on_stale", "hands")
+_GROUPS: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
 _VECTORS = {
     "Lambda": JOINTS,
     "Kp": JOINTS,
     "Kd": JOINTS,
+    "K": JOINTS,
+    "d": JOINTS,
     "q0_rad": JOINTS,
     "qd0_rad_s": JOINTS,
     "peak_nm": JOINTS,
@@ -80,16 +100,24 @@ def _finite(value: Any, path: str) -> None:
             _finite(entry, f"{path}[{n}]")
 
 
-def resolve(tables: Table) -> Table:
-    """Returns the tables with every default written out, in the shape of `Scenario`."""
+def resolve(tables: Table, folder: Path) -> Table:
+    """Returns the tables with every default written out, in the shape of `Scenario`.
+
+    Args:
+        tables: as an author wrote them.
+        folder: where files that they name lie.
+    """
     _known(tables, _TOP + _TABLES, "")
     _finite(tables, "")
     for required in ("name", "sites", "dominance"):
         if required not in tables:
             raise ScenarioError("is missing", path=required)
-    for group, kind in (("arm", Arm), ("control", Control), ("limits", Limits), ("link", Link)):
+    groups: dict[str, type[msgspec.Struct]] = {**_GROUPS, "expect": Expect}
+    for group, kind in groups.items():
         _known(tables.get(group, {}), _fields(kind), group)
+    _resolve_control(tables.get("control", {}), {}, "control")
     sites = _resolve_sites(tables)
+    links = _resolve_links(tables, list(sites), folder)
     resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
     return {
         "duration_s": 20.0,
@@ -98,8 +126,27 @@ def resolve(tables: Table) -> Table:
         **resolved,
         "sites": sites,
         "dominance": _resolve_dominance(tables, list(sites)),
-        "links": _resolve_links(tables, list(sites)),
+        "links": links,
+        "timeline": _resolve_timeline(tables.get("timeline", []), links, list(sites)),
+        "expect": tables.get("expect", {}),
     }
+
+
+def _resolve_control(written: Any, default: Table, path: str) -> Table:
+    """Returns a law and its gains: what is written, and the rest from a default of the same law."""
+    if not isinstance(written, dict):
+        raise ScenarioError("must be a table", path=path)
+    law = str(written.get("law", default.get("law", "adaptive")))
+    _one_of(law, list(LAWS), f"{path}.law")
+    own = _known(written, ("law", *_fields(LAWS[law])), path)
+    inherited = default if default.get("law", "adaptive") == law else {}
+    return _vectors({**inherited, **own, "law": law})
+
+
+def _one_of(word: Any, valid: Sequence[str], path: str) -> None:
+    if word not in valid:
+        hint = nearest(str(word), valid)
+        raise ScenarioError(f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path)
 
 
 def _unix_lines(value: Any) -> Any:
@@ -122,7 +169,10 @@ def _resolve_sites(tables: Table) -> Table:
                 path=path,
             )
         site = _vectors(_known(written, _SITE, path))
-        for group, kind in (("arm", Arm), ("control", Control), ("limits", Limits)):
+        site["control"] = _resolve_control(
+            site.get("control", {}), tables.get("control", {}), f"{path}.control"
+        )
+        for group, kind in _GROUPS.items():
             own = _known(site.get(group, {}), _fields(kind), f"{path}.{group}")
             site[group] = _vectors({**tables.get(group, {}), **own})
         site.setdefault("role", "master")
@@ -148,25 +198,129 @@ def _resolve_dominance(tables: Table, names: list[str]) -> Table:
         path = f"dominance.{name}"
         if name not in written:
             raise ScenarioError("is missing: whom does this site follow?", path=path)
-        row = _known(written[name], names, path)
-        for peer, share in row.items():
-            if isinstance(share, bool) or not isinstance(share, int | float):
-                raise ScenarioError(f"must be a number, is {share!r}", path=f"{path}.{peer}")
-        fault = dominance.row_fault(np.array([float(row.get(peer, 0.0)) for peer in names]), own)
-        if fault:
-            raise ScenarioError(fault, path=path)
-        rows[name] = {peer: float(row.get(peer, 0.0)) for peer in names if peer != name}
+        rows[name] = _row(_known(written[name], names, path), names, own, path)
     return rows
 
 
-def _resolve_links(tables: Table, names: list[str]) -> Table:
+def _row(row: Table, names: list[str], own: int, path: str) -> Table:
+    """Returns one row of the dominance matrix with every peer's share, checked."""
+    for peer, share in row.items():
+        if isinstance(share, bool) or not isinstance(share, int | float):
+            raise ScenarioError(f"must be a number, is {share!r}", path=f"{path}.{peer}")
+    fault = dominance.row_fault(np.array([float(row.get(peer, 0.0)) for peer in names]), own)
+    if fault:
+        raise ScenarioError(fault, path=path)
+    return {peer: float(row.get(peer, 0.0)) for peer in names if peer != names[own]}
+
+
+def _resolve_links(tables: Table, names: list[str], folder: Path) -> Table:
     every = [f"{j}->{i}" for i in names for j in names if i != j]
     written = _known(tables.get("links", {}), every, "links")
-    default = tables.get("link", {})
+    default = resolve_link(tables.get("link", {}), {}, "link", folder)
     links: Table = {}
     for name in every:
-        own = _known(written.get(name, {}), _fields(Link), f"links.{name}")
-        links[name] = {**default, **own}
-        if "delay_ms" not in links[name]:
-            raise ScenarioError("is missing; give it here or in [link]", path=f"links.{name}.delay_ms")
+        path = f"links.{name}"
+        link = resolve_link(written.get(name, {}), default, path, folder)
+        for field in msgspec.structs.fields(LINKS[link["model"]]):
+            if field.required and field.name not in link:
+                raise ScenarioError("is missing; give it here or in [link]", path=f"{path}.{field.name}")
+        links[name] = link
     return links
+
+
+def resolve_link(written: Any, base: Table, path: str, folder: Path | None = None) -> Table:
+    """Returns a link: what is written upon what it was, or anew where a model or a preset is named.
+
+    Args:
+        written: the author's table.
+        base: what the link is otherwise.
+        path: what errors call it.
+        folder: where a trace's file lies; None where no file may be named.
+    """
+    if not isinstance(written, dict):
+        raise ScenarioError("must be a table", path=path)
+    start = {} if "model" in written or "preset" in written else base
+    if "preset" in written:
+        _one_of(written["preset"], list(PRESETS), f"{path}.preset")
+        start = PRESETS[written["preset"]]
+    model = written.get("model", start.get("model", "constant"))
+    _one_of(model, list(LINKS), f"{path}.model")
+    if model != start.get("model", model):
+        start = {}
+    files = ("file", "of") if model == "trace" else ()
+    valid = ("model", "preset", *_fields(LINKS[model]), *files)
+    link = {**start, **_known(written, valid, path), "model": model}
+    link.pop("preset", None)
+    if "file" in link:
+        if folder is None:
+            raise ScenarioError("no file can be named here", path=f"{path}.file")
+        file, of = str(link.pop("file")), str(link.pop("of", path.removeprefix("links.")))
+        try:
+            link["trace"] = read_trace(folder / file, of)
+        except ScenarioError as error:
+            raise ScenarioError(error.problem, path=f"{path}.file") from None
+    return link
+
+
+def _resolve_timeline(written: Any, links: Table, names: list[str]) -> list[Table]:
+    """Returns the changes, each complete in itself, checked against the sites and the change before."""
+    if not isinstance(written, list):
+        raise ScenarioError("must be a list of tables [[timeline]]", path="timeline")
+    present = dict(links)
+    changes = []
+    before_s = 0.0
+    for n, entry in enumerate(written):
+        path = f"timeline[{n}]"
+        change = dict(_known(entry, _fields(Change), path))
+        at_s = change.get("at_s")
+        if not isinstance(at_s, int | float) or isinstance(at_s, bool):
+            raise ScenarioError("must be a time in s", path=f"{path}.at_s")
+        if at_s < before_s:
+            raise ScenarioError(
+                f"must not be before the change above it, {before_s:g} s", path=f"{path}.at_s"
+            )
+        before_s = at_s
+        if ("link" in change) == ("dominance" in change):
+            raise ScenarioError("names either a link or, as dominance, a site", path=path)
+        if "link" in change:
+            change["to"] = present[change["link"]] = change_link(
+                change.get("to", {}), change["link"], present, path
+            )
+        else:
+            change["to"] = change_shares(change.get("to", {}), change["dominance"], names, path)
+        changes.append(change)
+    return changes
+
+
+def change_link(written: Any, link: str, present: Table, path: str) -> Table:
+    """Returns what a link becomes.
+
+    Args:
+        written: what is to change of it.
+        link: its name.
+        present: what every link is now.
+        path: what errors call the change.
+    """
+    if link not in present:
+        hint = nearest(link, list(present)) or f"; links are {', '.join(present)}"
+        raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
+    after = resolve_link(written, present[link], f"{path}.to")
+    for key in ("trace", "outages_s"):
+        if after.get(key) != present[link].get(key):
+            raise ScenarioError("cannot change in a run", path=f"{path}.to.{key}")
+    return after
+
+
+def change_shares(written: Any, site: str, names: list[str], path: str) -> Table:
+    """Returns a row of the dominance matrix, complete and checked.
+
+    Args:
+        written: the shares; a peer that is not named has none.
+        site: whose row it is.
+        names: the sites.
+        path: what errors call the change.
+    """
+    if site not in names:
+        hint = nearest(site, names) or f"; sites are {', '.join(names)}"
+        raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
+    return _row(_known(written, names, f"{path}.to"), names, names.index(site), f"{path}.to")

@@ -6,13 +6,13 @@ runs of one scenario and seed are the same file, SHA-256 and all.
 
 import bisect
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import BinaryIO, NamedTuple
 
 from .. import collector
 from ..core.grid import NS_PER_S
 from ..core.site import Site
-from ..core.tick import Arrival, Mode, Output, Tick, diverged_text
+from ..core.tick import Arrival, Command, Mode, Output, Tick, diverged_text, mode_text
 from ..log.writer import LogWriter
 from ..net import topics
 from ..net.messages import Event
@@ -30,7 +30,11 @@ class Stepped(NamedTuple):
     output: Output
 
 
-def run(scenario: Scenario, network: Network | None = None) -> Iterator[Stepped]:
+Commands = Mapping[str, Mapping[int, Sequence[Command]]]
+"""Per site and tick the commands that come in then."""
+
+
+def run(scenario: Scenario, network: Network | None = None, commands: Commands = {}) -> Iterator[Stepped]:  # noqa: B006
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
     A site whose network is not ready lets the others go first. A run that diverges ends with the ticks of
@@ -39,6 +43,7 @@ def run(scenario: Scenario, network: Network | None = None) -> Iterator[Stepped]
     Args:
         scenario: the experiment.
         network: what joins the sites; by default every sample arrives at the next tick.
+        commands: what is ordered from outside.
     """
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     sites = [Site(scenario.setup(name)) for name in scenario.names]
@@ -50,10 +55,10 @@ def run(scenario: Scenario, network: Network | None = None) -> Iterator[Stepped]
         t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = joined.deliver(site.name, k)
-        output = site.step(Tick(k, arrivals))
+        output = site.step(Tick(k, arrivals, commands.get(site.name, {}).get(k, ())))
         joined.send(site.name, output)
         yield Stepped(site, arrivals, output)
-        if output.mode is not Mode.RUN:
+        if output.mode is Mode.DIVERGED:
             last_ns = t_ns
         if k + 1 < ticks[index]:
             bisect.insort(pending, ((k + 1) * NS_PER_S // site.rate_hz, index, k + 1))
@@ -76,6 +81,7 @@ class _Member:
             channel: topics.key(scenario.name, site.name, channel)
             for channel in (topics.STATE, topics.LINK, topics.EVENT)
         }
+        self._mode = Mode.RUN
         self.ticks = 0
 
     def write(self, arrivals: list[Arrival], output: Output) -> None:
@@ -86,8 +92,11 @@ class _Member:
         self.ticks = k + 1
         if self._stats.due(k):
             self._writer.add(self._keys[topics.LINK], encode(self._stats.take(output)), t_ns, t_ns, k)
-        if output.mode is not Mode.RUN:
-            self.say("diverged", diverged_text(site.name, output), t_ns)
+        if output.mode is not self._mode:
+            self._mode = output.mode
+            diverged = output.mode is Mode.DIVERGED
+            text = diverged_text if diverged else mode_text
+            self.say("diverged" if diverged else "mode", text(site.name, output), t_ns)
 
     def say(self, kind: str, text: str, t_ns: int) -> None:
         """Writes one event."""
@@ -127,7 +136,7 @@ def record(
                 if site.name not in members:
                     members[site.name] = _Member(scenario, site, writer)
                 members[site.name].write(arrivals, output)
-                within &= output.mode is Mode.RUN
+                within &= output.mode is not Mode.DIVERGED
                 t_ns = output.t_ns
                 if stopped():
                     break

@@ -1,0 +1,126 @@
+"""What the network does to each sample of a directed link: when it is due, or that it is lost.
+
+Law (L4): the fate of sample m is a function of the link's key, m, and the model in force at its stamp.
+What has memory (bursts of loss, correlated delay, order) advances sample by sample, by index, whatever
+arrives and when.
+"""
+
+from .delay import (
+    COPY,
+    DELAY,
+    DUPLICATE,
+    LOSS,
+    AtEnd,
+    Delay,
+    Points,
+    Row,
+    correlated,
+    drawn_us,
+    sine_us,
+    traced_us,
+    whole_us,
+)
+from .draw import Key, uniforms
+from .grid import tick_ns
+from .jit import leaf
+
+LOST = -1
+"""In the place of a time: the sample is lost."""
+
+_AR1, _SINE, _TRACE, _MEASURED = int(Delay.AR1), int(Delay.SINE), int(Delay.TRACE), int(Delay.MEASURED)
+
+Samples = Row
+Models = Row
+
+__all__ = ["LOST", "AtEnd", "foresee"]
+
+
+@leaf
+def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
+    """True where a stamp lies in an outage of the link: its beginning belongs to it, its end does not."""
+    for n in range(link.outage_first, link.outage_first + link.outage_count):
+        if points[n, 0] <= stamp_ns < points[n, 1]:
+            return True
+    return False
+
+
+@leaf
+def _lost(sample: int, fresh: bool, link: Row, model: Row) -> bool:
+    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample and says whether that is lost.
+
+    A fresh chain begins in its stationary distribution.
+    """
+    if model.loss_good == 0.0 and model.enter == 0.0:
+        return False
+    key: Key = link.key
+    u, v = uniforms(key, sample, LOSS, 0)
+    if fresh:
+        link.bad = u * (model.enter + model.leave) < model.enter
+    elif link.bad:
+        link.bad = u >= model.leave
+    else:
+        link.bad = u < model.enter
+    probability: float = model.loss_bad if link.bad else model.loss_good
+    return v < probability
+
+
+@leaf
+def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
+    """Returns the delay of a sample, us; LOST where a trace says so."""
+    key: Key = link.key
+    if model.kind == _MEASURED:
+        return 0
+    if model.kind == _TRACE:
+        return traced_us(stamp_ns, model, points)
+    if model.kind == _SINE:
+        return whole_us(sine_us(stamp_ns, model))
+    if model.kind == _AR1:
+        link.memory = correlated(key, sample, model.weight, link.memory, fresh)
+        return whole_us(model.location + model.scale * link.memory)
+    return whole_us(drawn_us(key, sample, DELAY, model))
+
+
+@leaf
+def _due_ns(sample: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
+    """Returns when a sample is due, ns since the epoch, or LOST."""
+    stamp_ns = tick_ns(sample, link.rate_hz)
+    lost = _lost(sample, fresh, link, model)
+    delay_us = _delay_us(sample, stamp_ns, fresh, link, model, points)
+    if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
+        return LOST
+    if model.duplicate > 0.0:
+        key: Key = link.key
+        u, _ = uniforms(key, sample, DUPLICATE, 0)
+        if u < model.duplicate:
+            link.copies += 1
+            if model.kind < _AR1:  # models with memory or by time give the copy the same delay
+                delay_us = min(delay_us, whole_us(drawn_us(key, sample, COPY, model)))
+    due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
+    if model.in_order == 1:
+        due_ns = max(due_ns, link.due_before)
+        link.due_before = due_ns
+    return due_ns
+
+
+@leaf
+def foresee(sample: int, link: Row, models: Models, samples: Samples, points: Points) -> None:
+    """Decides the fate of every sample up to one and writes it into its page, `due_ns`.
+
+    Args:
+        sample: the index of the last one.
+        link: the link's row, dtype LINK.
+        models: its models in the order of their first stamps, shape (M,), dtype MODEL.
+        samples: the link's pages, shape (pages,), dtype SAMPLE.
+        points: the site's traces and outages.
+    """
+    pages = samples.shape[0]
+    while link.foreseen < sample:
+        m = link.foreseen + 1
+        fresh = m == 0
+        stamp_ns = tick_ns(m, link.rate_hz)
+        while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
+            link.model += 1
+            fresh = True
+        page: Row = samples[m % pages]
+        page.due_ns = _due_ns(m, fresh, link, models[link.model], points)
+        link.foreseen = m

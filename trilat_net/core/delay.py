@@ -1,0 +1,192 @@
+"""Delay models: how long a sample of a link is under way.
+
+Law (L4): a delay is a function of the link's key, the sample's index and its stamp, rounded to whole
+microseconds. Only AR1 looks at the sample before; it advances by index, not by arrival.
+"""
+
+import math
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .draw import Key, normal, standard_gamma, uniforms
+from .jit import leaf
+
+LIMIT_US = 10_000_000
+"""No delay is longer; what a distribution's tail gives beyond is cut off here."""
+
+
+class Delay(IntEnum):
+    """The kinds of delay, and what the four parameters of a `Model` mean in each; times in us.
+
+    CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`, drawn again
+    where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of a normal of `location`, `scale`.
+    HYPER_EXPONENTIAL: `location` + Exp(`scale`), or with probability `weight` + Exp(`extra`).
+    AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off at zero.
+    SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none is
+    injected; a sample is used as soon as it has come.
+    """
+
+    CONSTANT = 0
+    UNIFORM = 1
+    NORMAL = 2
+    GAMMA = 3
+    LOG_NORMAL = 4
+    HYPER_EXPONENTIAL = 5
+    AR1 = 6
+    SINE = 7
+    TRACE = 8
+    MEASURED = 9
+
+
+class AtEnd(IntEnum):
+    """What a trace does behind its last point: hold it, or begin again."""
+
+    HOLD = 0
+    LOOP = 1
+
+
+class Model(NamedTuple):
+    """What a link does to the samples from one stamp on.
+
+    Attributes:
+        from_ns: the first stamp that it applies to, ns since the epoch.
+        kind: a `Delay`.
+        location: see `Delay`.
+        scale: see `Delay`.
+        extra: see `Delay`.
+        weight: see `Delay`.
+        at_end: an `AtEnd`, of a trace.
+        trace_first: where its points begin in the site's table, of a trace.
+        trace_count: how many they are.
+        loss_good: probability that a sample is lost in the good state.
+        loss_bad: probability that it is lost in the bad state.
+        enter: probability to go from good to bad, per sample.
+        leave: probability to go from bad to good, per sample.
+        duplicate: probability that a sample has a copy, with a delay of its own.
+        in_order: 1 where no sample is released before an older one, 0 where the newest wins.
+        playout_us: every sample is held at least so long, us.
+    """
+
+    from_ns: int = 0
+    kind: int = Delay.CONSTANT
+    location: float = 0.0
+    scale: float = 0.0
+    extra: float = 0.0
+    weight: float = 0.0
+    at_end: int = AtEnd.HOLD
+    trace_first: int = 0
+    trace_count: int = 0
+    loss_good: float = 0.0
+    loss_bad: float = 0.0
+    enter: float = 0.0
+    leave: float = 1.0
+    duplicate: float = 0.0
+    in_order: int = 0
+    playout_us: int = 0
+
+
+MODEL = np.dtype(
+    (np.record, [(name, "f8" if kind is float else "i8") for name, kind in Model.__annotations__.items()])
+)
+
+Row = Any
+"""A row of a structured array; NumPy's types cannot name its fields."""
+
+Points = NDArray[np.int64]
+"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay of -1 is a
+sample lost) and outages (first and last stamp, ns), one after the other."""
+
+LOSS, DUPLICATE, DELAY, COPY = 0, 1, 2, 5
+"""Purposes of draws; a delay takes up to three, see `standard_gamma`."""
+
+_UNIFORM, _NORMAL, _GAMMA = int(Delay.UNIFORM), int(Delay.NORMAL), int(Delay.GAMMA)
+_LOG_NORMAL, _HYPER = int(Delay.LOG_NORMAL), int(Delay.HYPER_EXPONENTIAL)
+_LOOP = int(AtEnd.LOOP)
+
+
+@leaf
+def drawn_us(key: Key, sample: int, purpose: int, model: Row) -> float:
+    """Returns a draw of a distribution without memory, us, not rounded.
+
+    Args:
+        key: the link's, see `draw.link_key`.
+        sample: the sample's index.
+        purpose: DELAY, or COPY for that of a duplicate.
+        model: a row of dtype MODEL.
+    """
+    location: float = model.location
+    scale: float = model.scale
+    extra: float = model.extra
+    if model.kind == _UNIFORM:
+        u, _ = uniforms(key, sample, purpose, 0)
+        return location + scale * (2.0 * u - 1.0)
+    if model.kind == _NORMAL:
+        for attempt in range(64):  # the mean is not negative: each attempt suits with 1/2 or more
+            x = location + scale * normal(key, sample, purpose, attempt)
+            if x >= 0.0:
+                return x
+    if model.kind == _GAMMA:
+        return scale * standard_gamma(key, sample, purpose, extra)
+    if model.kind == _LOG_NORMAL:
+        return math.exp(location + scale * normal(key, sample, purpose, 0))
+    if model.kind == _HYPER:
+        u, v = uniforms(key, sample, purpose, 0)
+        return location - (extra if u < model.weight else scale) * math.log(v)
+    return location
+
+
+@leaf
+def correlated(key: Key, sample: int, correlation: float, before: float, fresh: bool) -> float:
+    """Returns the next number of an AR(1) sequence: standard normal, whatever the correlation.
+
+    Args:
+        key: the link's.
+        sample: the sample's index.
+        correlation: of a number with the one before, from 0 to below 1.
+        before: the number before.
+        fresh: True where there is none.
+    """
+    x = normal(key, sample, DELAY, 0)
+    if fresh:
+        return x
+    return correlation * before + math.sqrt(1.0 - correlation * correlation) * x
+
+
+@leaf
+def sine_us(stamp_ns: int, model: Row) -> float:
+    """Returns T(t) of a sinusoidal delay, us."""
+    location: float = model.location
+    scale: float = model.scale
+    turns = stamp_ns * 1e-3 / model.extra
+    return location + scale * math.sin(2.0 * math.pi * turns + model.weight)
+
+
+@leaf
+def traced_us(stamp_ns: int, model: Row, points: Points) -> int:
+    """Returns the delay of a trace, that of its last point at or before the stamp; -1: the sample is lost.
+
+    The last point lasts as long as the one before it; behind that the trace holds it or begins again.
+    """
+    first, count = model.trace_first, model.trace_count
+    t_us = stamp_ns // 1000
+    if model.at_end == _LOOP and count > 1:
+        end_us = points[first + count - 1, 0]
+        t_us %= 2 * end_us - points[first + count - 2, 0]
+    low, high = 0, count  # the last point at or before t lies in [low, high)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if points[first + middle, 0] <= t_us:
+            low = middle
+        else:
+            high = middle
+    delay_us: int = points[first + low, 1]
+    return delay_us
+
+
+@leaf
+def whole_us(delay_us: float) -> int:
+    """Returns a delay in whole microseconds, from 0 to `LIMIT_US`."""
+    return int(min(max(math.floor(delay_us + 0.5), 0.0), 10_000_000.0))
