@@ -103,16 +103,23 @@ class Site:
 
     def _add_ramp(self, ramp: Ramp) -> None:
         count = int(self._site[0].ramps)
-        self._ramps[count] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
+        place = 1 + int(np.searchsorted(self._ramps[1:count, 0], ramp.start_ns, side="right"))
+        self._ramps[place + 1 : count + 1] = self._ramps[place:count].copy()
+        self._ramps[place] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
         self._site[0].ramps = count + 1
 
     def _add_model(self, peer: int, model: Model) -> None:
-        count = int(self._links[peer].models)
-        self._models[peer, count] = model
-        self._links[peer].models = count + 1
+        link: Row = self._links[peer]
+        models, count = self._models[peer], int(link.models)
+        place = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
+        models[place + 1 : count + 1] = models[place:count].copy()
+        models[place] = model
+        link.models = count + 1
+        if link.model >= place:  # samples from ahead have been foreseen already: they stay as they are
+            link.model += 1
 
     def order(self, command: Command) -> None:
-        """Takes in a change. It must not begin before those that the site has of the same thing.
+        """Takes in a change; one that its scenario or an earlier command plans for later still comes then.
 
         Raises:
             ValueError: the site has taken `MAX_COMMANDS` of them.

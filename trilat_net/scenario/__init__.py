@@ -4,7 +4,8 @@ Law: a scenario that loads is one that runs; everything that a person can get wr
 the path of the key and the nearest valid name.
 """
 
-from .commands import command, command_from, owner, present_links, resolve_change
+from .commands import command, command_from, later_tables, owner, present_links, resolve_change
+from .expectation import Expect
 from .links import Link
 from .model import Adaptive, Arm, Limits, OnStale, ProportionalDamped, Pulse, Scenario, SiteSpec
 from .reader import load, override, parse, shipped, shipped_text, site_named, template_text
@@ -12,6 +13,7 @@ from .reader import load, override, parse, shipped, shipped_text, site_named, te
 __all__ = [
     "Adaptive",
     "Arm",
+    "Expect",
     "Limits",
     "Link",
     "OnStale",
@@ -21,6 +23,7 @@ __all__ = [
     "SiteSpec",
     "command",
     "command_from",
+    "later_tables",
     "load",
     "override",
     "owner",

@@ -40,6 +40,8 @@ def resolve_change(scenario: Scenario, present: Present, written: dict[str, Any]
         raise ScenarioError("a change names either a link or, as dominance, a site")
     if "link" in change:
         change["to"] = change_link(change.get("to", {}), change["link"], present, "change")
+        if change["to"]["model"] == "trace":  # a record cannot hold it
+            raise ScenarioError("a link with a trace can only be given another model", path="change.to")
     else:
         change["to"] = change_shares(
             change.get("to", {}), change["dominance"], list(scenario.names), "change"
@@ -85,3 +87,8 @@ def command_from(scenario: Scenario, site: str, text: str) -> Command:
         raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
     check_change(change, "cmd")
     return command(scenario, change)
+
+
+def later_tables(scenario: Scenario) -> list[tuple[int, str, dict[str, Any]]]:
+    """Returns what links become by the scenario's own timeline: (from when, ns, the link, its table)."""
+    return [(change.start_ns, change.link, change.to) for change in scenario.timeline if change.link]

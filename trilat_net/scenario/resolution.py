@@ -305,10 +305,12 @@ def change_link(written: Any, link: str, present: Table, path: str) -> Table:
         hint = nearest(link, list(present)) or f"; links are {', '.join(present)}"
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
     after = resolve_link(written, present[link], f"{path}.to")
-    for key in ("trace", "outages_s"):
-        if after.get(key) != present[link].get(key):
-            raise ScenarioError("cannot change in a run", path=f"{path}.to.{key}")
-    return after
+    before = present[link]
+    if after["model"] == "trace" and after.get("trace") != before.get("trace"):
+        raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
+    if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
+        raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
+    return {**after, "outages_s": before["outages_s"]} if "outages_s" in before else after
 
 
 def change_shares(written: Any, site: str, names: list[str], path: str) -> Table:
