@@ -50,7 +50,7 @@ def convert(resolved: Table) -> Scenario:
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
-    if expected := expectation.fault(scenario.expect, scenario.names, scenario.duration_s):
+    if expected := expectation.fault(scenario.expect, scenario.names):
         key, problem = expected
         raise ScenarioError(problem, path=f"expect.{key}")
     return scenario

@@ -77,17 +77,13 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
 
-def fault(expect: Expect, sites: Sequence[str], duration_s: float) -> tuple[str, str] | None:
+def fault(expect: Expect, sites: Sequence[str]) -> tuple[str, str] | None:
     """Returns what no run of a scenario could meet: (key below `expect`, problem), or None.
 
     Args:
         expect: what is expected.
         sites: names of the scenario's sites.
-        duration_s: how long it runs, s.
     """
-    by_s = expect.synchronised_by_s
-    if by_s is not None and by_s >= duration_s:
-        return "synchronised_by_s", f"must be before the end of the run at {duration_s:g} s, is {by_s:g}"
     for name in expect.end_pose_rad:
         if name not in sites:
             return f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}"

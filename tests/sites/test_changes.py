@@ -1,0 +1,134 @@
+"""Changes that a running site is asked for."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sites.changes import AHEAD_MS, Changes
+from trilat_net.core.site import MAX_COMMANDS, Site
+from trilat_net.core.tick import Command, Tick
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, Inbox, LocalNetwork
+from trilat_net.net.messages import Order, Reply
+from trilat_net.net.wire import decode, encode
+from trilat_net.scenario import Scenario, command_from, load
+
+SESSION = "changes"
+KEY = topics.key(SESSION, "s", topics.SET)
+
+
+class Asked:
+    """A site `s` that listens, and somebody who asks it."""
+
+    def __init__(self, scenario: Scenario | None = None) -> None:
+        network = LocalNetwork()
+        self.scenario = scenario or load("paper")
+        self._client: Bus = network.join()
+        self.changes = Changes(self.scenario, "s", network.join().questions(KEY))
+
+    def send(self, payload: bytes) -> Inbox:
+        return self._client.ask(KEY, payload)
+
+    def ask(self, k: int, **order: Any) -> tuple[list[Command], Reply]:
+        replies = self.send(encode(Order(**order)))
+        taken = list(self.changes.take(k))
+        answer = replies.poll()
+        assert answer is not None
+        return taken, decode(answer[1], Reply)
+
+
+@given(st.integers(0, 10_000))
+def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k: int) -> None:
+    """What the next tick's record says makes the same command again, and it holds from the tick of the answer on."""
+    asked = Asked()
+    (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
+    assert reply.accepted and reply.tick == k + AHEAD_MS
+    assert command_from(asked.scenario, "s", taken.text) == taken
+    assert taken.model is not None
+    assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
+    assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)
+
+
+def test_what_a_change_does_not_name_stays_as_it_was_even_by_the_timeline() -> None:
+    later = {"at_s": 1.0, "link": "m1->s", "to": {"loss": 0.25}}
+    asked = Asked(load("paper", {"timeline": [later]}))
+    (before,), _ = asked.ask(10, link="m1->s", to={"duplicate": 0.5})
+    (after,), _ = asked.ask(1000, link="m1->s", to={"delay_ms": 10.0})
+    (last,), _ = asked.ask(1001, link="m1->s", to={"playout_ms": 20.0})
+    models = [taken.model for taken in (before, after, last)]
+    assert [m and (m.location, m.loss_good, m.duplicate, m.playout_us) for m in models] == [
+        (200_000.0, 0.0, 0.5, 0),
+        (10_000.0, 0.25, 0.0, 0),
+        (10_000.0, 0.25, 0.0, 20_000),
+    ]
+
+
+def test_shares_are_ramped_from_the_first_tick_on() -> None:
+    (taken,), reply = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=2.0)
+    first_ns = reply.tick * 1_000_000
+    assert taken.ramp == (first_ns, first_ns + 2_000_000_000, (0.9, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("order", "says"),
+    [
+        ({"link": "m1->z", "to": {"delay_ms": 1.0}}, "m1->s"),
+        ({"link": "s->m1", "to": {"delay_ms": 1.0}}, "ask m1"),
+        ({"link": "m1->s", "to": {"delay_mss": 1.0}}, "delay_ms"),
+        ({"link": "m1->s", "to": {"delay_ms": -1.0}}, "delay_ms"),
+        ({"link": "m1->s", "to": {"delay_ms": float("nan")}}, "delay_ms"),
+        ({"link": "m1->s", "to": {"model": "gama"}}, "gamma"),
+        ({"link": "m1->s", "to": {"preset": "5gg"}}, "5g"),
+        ({"link": "m1->s", "to": {"loss": 0.9, "loss_burst": 1.1}}, "loss"),
+        ({"link": "m1->s", "to": {"model": "trace", "trace": "0 1"}}, "trace"),
+        ({"link": "m1->s", "to": {"model": "trace", "file": "/etc/passwd"}}, "file"),
+        ({"link": "m1->s", "to": {"outages_s": [[1.0, 2.0]]}}, "outages_s"),
+        ({"dominance": "s", "to": {"m1": 0.9, "m2": 0.2}}, "sum"),
+        ({"dominance": "s", "to": {"m1": 1.5, "m2": -0.5}}, "between 0 and 1"),
+        ({"dominance": "s", "to": {"m1": 0.5, "x": 0.5}}, "x"),
+        ({"dominance": "x", "to": {"m1": 1.0}}, "sites are"),
+        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "ask m1"),
+        ({"dominance": "s", "to": {"m1": 1.0}, "ramp_s": -1.0}, "ramp_s"),
+        ({"to": {}}, "either a link or"),
+        ({"link": "m1->s", "dominance": "s", "to": {}}, "either a link or"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_reason(order: Mapping[str, Any], says: str) -> None:
+    taken, reply = Asked().ask(5, **order)
+    assert taken == []
+    assert not reply.accepted
+    assert says in reply.text
+
+
+def test_a_client_of_another_version_is_refused_with_both_versions() -> None:
+    asked = Asked()
+    replies = asked.send(encode(Order(v=99, link="m1->s", to={"delay_ms": 1.0})))
+    assert asked.changes.take(0) == []
+    answer = replies.poll()
+    assert answer is not None
+    assert "99" in decode(answer[1], Reply).text
+
+
+def test_what_is_no_order_is_answered_and_harmless() -> None:
+    asked = Asked()
+    replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
+    assert asked.changes.take(0) == []
+    assert all((answer := r.poll()) and not decode(answer[1], Reply).accepted for r in replies)
+
+
+def test_a_change_that_the_run_does_not_live_to_see_is_refused() -> None:
+    taken, reply = Asked().ask(19_950, link="m1->s", to={"delay_ms": 1.0})
+    assert taken == [] and "20000" in reply.text
+
+
+def test_a_run_takes_a_bounded_number_of_changes() -> None:
+    """L6: the site's tables hold every change that was accepted, and one more is refused."""
+    asked = Asked()
+    site = Site(asked.scenario.setup("s"))
+    for k in range(MAX_COMMANDS):
+        (taken,), _ = asked.ask(k, link="m1->s", to={"delay_ms": float(k)})
+        assert site.step(Tick(k, (), [taken])).cmd == [taken.text]
+    assert asked.ask(MAX_COMMANDS, link="m1->s", to={"delay_ms": 1.0})[0] == []
