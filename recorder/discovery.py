@@ -1,13 +1,15 @@
 """How a recorder that was told no endpoints finds a session on its own machine."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from trilat_net.errors import ScenarioError, SessionError, WireError
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock
 from trilat_net.net.endpoints import default_endpoint, default_endpoints
+from trilat_net.net.meeting import ASK_EVERY_NS
 from trilat_net.net.messages import Info
-from trilat_net.net.session import ASK_EVERY_NS, token
+from trilat_net.net.voice import token
 from trilat_net.net.wire import decode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import parse
@@ -21,12 +23,13 @@ class Discovery:
     Args:
         session: the session's name.
         boot: the recorder's boot.
+        own: settings of a person's own for Zenoh.
     """
 
-    def __init__(self, session: str, boot: int) -> None:
+    def __init__(self, session: str, boot: int, own: Mapping[str, Any] | None = None) -> None:
         self._session = session
         self._first = default_endpoint(session, 0)
-        self._bus = ZenohBus([], [self._first])
+        self._bus = ZenohBus([], [self._first], own=own)
         self._bus.announce(token(session, topics.RECORDER, boot))
 
     def endpoints(self, clock: Clock, stopped: Callable[[], bool], timeout_s: float | None) -> list[str]:

@@ -1,14 +1,15 @@
 """The recorder as one process: from its arguments to its exit code."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from trilat_net.errors import RunFailed
 from trilat_net.interrupt import Interrupt
-from trilat_net.net.clock import SystemClock
-from trilat_net.net.session import new_boot
-from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection, open_bus
+from trilat_net.net.voice import new_boot
 
 from .discovery import Discovery
 from .recorder import Recorder
@@ -17,9 +18,9 @@ from .recorder import Recorder
 def record_session(
     session: str,
     path: Path,
-    listen: Sequence[str],
-    connect: Sequence[str] | None,
+    connection: Connection,
     join_timeout_s: float | None,
+    clock: Clock,
     say: Callable[[str], None],
 ) -> int:
     """Records one session, as a process of its own.
@@ -27,9 +28,10 @@ def record_session(
     Args:
         session: the session's name.
         path: where the log goes; must not exist.
-        listen: endpoints to listen at.
-        connect: endpoints to connect to; None to ask the session's first site, on this machine.
+        connection: how it takes part in the network; without endpoints to connect to it asks the session's
+            first site, on this machine.
         join_timeout_s: how long to wait for the session to begin, s, or None.
+        clock: the time.
         say: tells a person what happens.
 
     Returns:
@@ -38,16 +40,20 @@ def record_session(
     Raises:
         TrilatError: the session did not begin, the file cannot be written, or records are missing.
     """
-    clock = SystemClock()
     boot = new_boot()
     say(f"recorder: waiting for session {session!r} to begin")
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
-        if connect is None:
-            discovery = Discovery(session, boot)
+        if connection.connect is None:
+            discovery = Discovery(session, boot, connection.own)
             stack.callback(discovery.close)
-            connect = discovery.endpoints(clock, interrupt.requested, join_timeout_s)
-        bus = ZenohBus(listen, connect)
+            found = discovery.endpoints(clock, interrupt.requested, join_timeout_s)
+            connection = replace(connection, connect=found)
+        bus = open_bus(
+            connection, clock, interrupt.requested, join_timeout_s, lambda text: say(f"recorder: {text}")
+        )
+        if bus is None:
+            return interrupt.exit_code
         stack.callback(bus.close)
         recorder = Recorder(bus, clock, session, boot, path, interrupt.requested, say)
         epoch = recorder.join(join_timeout_s)

@@ -17,7 +17,8 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import Info
-from trilat_net.net.session import Epoch, Joining, Voice
+from trilat_net.net.session import Epoch, Joining
+from trilat_net.net.voice import Voice
 from trilat_net.scenario import parse
 
 from .recording import Recording
@@ -90,12 +91,12 @@ class Recorder:
                 return epoch
             now_ns = self._clock.monotonic_ns()
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                met = ", ".join(self._joining.met) or "nobody"
+                met = ", ".join(self._joining.meeting.met) or "nobody"
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
                     f"it met {met}"
                 )
-            self._clock.sleep_until(now_ns + POLL_NS)
+            self._clock.sleep_until(now_ns + self._joining.pinger.pause_ns(POLL_NS))
         return None
 
     def record(self, epoch: Epoch) -> Recording:
@@ -108,7 +109,7 @@ class Recorder:
         self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
         scenario = next(
             parse(info.scenario, info.member)
-            for info in self._joining.met.values()
+            for info in self._joining.meeting.met.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )
         with new_file(self._path) as stream:

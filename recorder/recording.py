@@ -11,7 +11,8 @@ from trilat_net.errors import WireError
 from trilat_net.log.writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
-from trilat_net.net.session import Epoch, Voice
+from trilat_net.net.session import Epoch
+from trilat_net.net.voice import Voice
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario
 

@@ -21,7 +21,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import Scenario
 
 from .display import Display
-from .process import warm_up
+from .warming import warm_up
 from .watch import Watch
 
 POLL_NS = 100_000_000

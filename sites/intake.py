@@ -2,6 +2,8 @@
 
 Law: nothing that arrives can raise out of the loop. A payload is a peer's sample, or it is counted by
 reason and dropped.
+
+Samples carry the instants of their arrival, stamped as they came and not as they are drained.
 """
 
 from collections import Counter
@@ -11,8 +13,9 @@ from trilat_net.core.grid import NS_PER_S
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.tick import MAX_ARRIVALS, Arrival
 from trilat_net.errors import WireError
-from trilat_net.net.bus import Inbox
+from trilat_net.net.bus import StampedInbox
 from trilat_net.net.messages import Sample
+from trilat_net.net.meter import Meter
 from trilat_net.net.wire import decode
 
 
@@ -27,32 +30,36 @@ class Intake:
     """
 
     def __init__(
-        self, peers: Sequence[str], rings: Sequence[Inbox], rates: Sequence[int], dropped: Counter[str]
+        self, peers: Sequence[str], rings: Sequence[StampedInbox], rates: Sequence[int], dropped: Counter[str]
     ) -> None:
         self._peers, self._rings, self._rates = peers, rings, rates
         self._dropped = dropped
         self._boots: list[int] = []
+        self._meters: list[Meter] = []
         self._last = [-1] * len(peers)
 
-    def admit(self, boots: Sequence[int]) -> None:
-        """Says which start of each peer belongs to the session; messages of others are dropped."""
-        self._boots = list(boots)
+    def admit(self, boots: Sequence[int], meters: Sequence[Meter]) -> None:
+        """Says which start of each peer belongs to the session, and what measures its link.
+
+        Messages of other starts are dropped.
+        """
+        self._boots, self._meters = list(boots), list(meters)
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Returns what has come, peer by peer, each in its order; at most MAX_ARRIVALS, the rest waits.
 
         Args:
-            since_epoch_ns: time since the epoch, ns.
+            since_epoch_ns: nominal time since the epoch, ns.
         """
         arrivals: list[Arrival] = []
         for index, ring in enumerate(self._rings):
             while len(arrivals) < MAX_ARRIVALS and (message := ring.poll()) is not None:
-                arrival = self._arrival(index, message[1], since_epoch_ns)
+                arrival = self._arrival(index, *message, since_epoch_ns)
                 if arrival is not None:
                     arrivals.append(arrival)
         return arrivals
 
-    def _arrival(self, index: int, payload: bytes, since_epoch_ns: int) -> Arrival | None:
+    def _arrival(self, index: int, payload: bytes, arrived_ns: int, since_epoch_ns: int) -> Arrival | None:
         try:
             sample = decode(payload, Sample)
         except WireError as error:
@@ -68,4 +75,5 @@ class Intake:
         if sample.tick > self._last[index] + 1:  # dropped on the way, or the ring overflowed
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
-        return Arrival(index, sample.tick, sample.q, sample.qd, (since_epoch_ns - stamp_ns) // 1000)
+        delay_ns = self._meters[index].take(sample, arrived_ns)
+        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000)

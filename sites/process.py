@@ -5,34 +5,38 @@ epoch its arm is braked; at the end it stays until the recorder has every record
 """
 
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import msgspec
 
 from trilat_net.core.fingerprint import fingerprint
 from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Mode, Output, Tick, diverged_text
+from trilat_net.core.tick import Mode, Output, diverged_text, mode_text
 from trilat_net.errors import RunFailed, SessionError, WireError
 from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.clock import Clock, system_clock
+from trilat_net.net.connection import Connection, open_bus
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.session import Epoch, Joining, Voice, new_boot
+from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.stats import LoopStats
-from trilat_net.net.wire import decode, encode_state
-from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.timing import Timing
+from trilat_net.net.voice import Voice, new_boot
+from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 
 from . import realtime
+from .changes import Changes
+from .clocks import clock_texts, peers_of
 from .intake import Intake
 from .loop import Ports, run_loop
+from .warming import warm_up
 
 LINGER_S = 5
 POLL_NS = 5_000_000
 LAST_WORD_NS = 100_000_000
-_WARM_TICKS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,19 +45,21 @@ class Options:
 
     Attributes:
         session: the session's name.
-        listen: endpoints to listen at.
-        connect: endpoints to connect to.
+        connection: how it takes part in the network.
         join_timeout_s: how long to wait for the others, s.
         needs_recorder: whether a recorder must be there.
         cpu: the processor to stay on, or None.
+        clock_offset_s: injected: how far the clock is ahead of the machine's, s.
+        clock_drift_ppm: injected: by how much it runs faster, ppm.
     """
 
     session: str
-    listen: Sequence[str]
-    connect: Sequence[str]
+    connection: Connection
     join_timeout_s: float = 60.0
     needs_recorder: bool = False
     cpu: int | None = None
+    clock_offset_s: float = 0.0
+    clock_drift_ppm: float = 0.0
 
 
 def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str], None]) -> int:
@@ -74,24 +80,20 @@ def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str
         RunFailed: the run diverged.
     """
     with Interrupt() as interrupt:
-        bus = ZenohBus(options.listen, options.connect)
+        clock = system_clock(options.clock_offset_s, options.clock_drift_ppm)
+        bus = open_bus(
+            options.connection,
+            clock,
+            interrupt.requested,
+            options.join_timeout_s,
+            lambda text: say(f"{name}: {text}"),
+        )
+        if bus is None:
+            return interrupt.exit_code
         try:
-            return Member(scenario, name, options, bus, SystemClock(), interrupt, say).live()
+            return Member(scenario, name, options, bus, clock, interrupt, say).live()
         finally:
             bus.close()
-
-
-def warm_up(scenario: Scenario, name: str) -> None:
-    """Steps a throw-away site, so that everything that a tick runs through is compiled and in memory."""
-    site = Site(scenario.setup(name))
-    for k in range(_WARM_TICKS):
-        arrivals = [
-            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0))
-            for j, link in enumerate(scenario.setup(name).links)
-            if k > 0
-        ]
-        output = site.step(Tick(k, arrivals))
-        encode_state(name, 0, site.peers, output, arrivals, 0, 0)
 
 
 class Member:
@@ -114,11 +116,16 @@ class Member:
         rates = [scenario.sites[peer].rate_hz for peer in self._site.peers]
         self._stats = LoopStats(self._site, self._boot, rates)
         session = options.session
-        rings = [bus.inbox(topics.key(session, peer, topics.STATE)) for peer in self._site.peers]
+        rings = [
+            bus.stamped(topics.key(session, peer, topics.STATE), clock.monotonic_ns)
+            for peer in self._site.peers
+        ]
         self._intake = Intake(self._site.peers, rings, rates, self._stats.dropped)
         self._publish_state = bus.publisher(topics.key(session, name, topics.STATE))
         self._publish_link = bus.publisher(topics.key(session, name, topics.LINK))
         self._peer_events = [bus.inbox(topics.key(session, p, topics.EVENT), 256) for p in self._site.peers]
+        self._changes = Changes(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
+        self._mode = Mode.RUN
         self._ended_by = ""
         self._gone: set[str] = set()
         self._ended: set[str] = set()
@@ -147,50 +154,75 @@ class Member:
         if epoch is None:
             return self._interrupt.exit_code
         self._epoch = epoch
-        self._intake.admit([epoch.boots[peer] for peer in self._site.peers])
+        peers = peers_of(self._scenario, self._name, epoch, self._joining.pinger)
+        self._timing = Timing(epoch.mono_ns, self._site.rate_hz, peers, self._scenario.names[0])
+        clocks = clock_texts(peers, epoch.mono_ns)
+        self._intake.admit([epoch.boots[peer] for peer in self._site.peers], self._timing.meters)
         self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
         obtained = realtime.prepare(self._options.cpu)
-        self._voice.say("setup", ", ".join(f"{key}: {value}" for key, value in obtained.items()))
+        self._voice.say(
+            "setup",
+            ", ".join([*(f"{key}: {value}" for key, value in obtained.items()), *clocks]),
+            epoch_mono_ns=epoch.mono_ns,
+            clock=self._clock.identity(),
+        )
         self._say(f"{self._name}: the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
+        for sentence in clocks:
+            self._say(f"{self._name}: {sentence}")
         ports = Ports(
             self._clock,
             self._intake,
+            self._timing,
             self._publish_state,
             self._publish_link,
             self._slack,
             lambda: self._interrupt.requested() or bool(self._ended_by),
+            self._changes.take,
+            self._tell,
         )
         ticks = self._scenario.ticks(self._name)
-        output = run_loop(self._site, self._boot, ticks, epoch, self._stats, ports)
+        output = run_loop(self._site, self._boot, ticks, self._stats, ports)
         return self._leave(output)
 
     def _join(self) -> Epoch | None:
         """Waits for the others; None where a signal came first."""
         clock = self._clock
         give_up_ns = clock.monotonic_ns() + int(self._options.join_timeout_s * 1e9)
-        self._say(f"{self._name}: waiting for {', '.join(self._joining.missing()) or 'the epoch'}")
+        meeting = self._joining.meeting
+        self._say(f"{self._name}: waiting for {', '.join(meeting.missing()) or 'the epoch'}")
         while not self._interrupt.requested():
             epoch = self._joining.poll()
             if epoch is not None:
                 return epoch
             now_ns = clock.monotonic_ns()
             if now_ns > give_up_ns:
-                missing = self._joining.missing()
+                missing = meeting.missing()
                 who = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
-                for member, reason in self._joining.unreadable.items():
+                for member, reason in meeting.unreadable.items():
                     who += f"; the answer of {member} cannot be understood: {reason}"
                 raise SessionError(
                     f"{self._name} waited {self._options.join_timeout_s:g} s in session "
                     f"{self._options.session!r}: {who}"
                 )
-            clock.sleep_until(now_ns + POLL_NS)
+            clock.sleep_until(now_ns + self._joining.pinger.pause_ns(POLL_NS))
         return None
 
     def _slack(self, k: int, t_ns: int) -> None:
-        """Ten times a second: answers questions, and says who is gone."""
+        """Ten times a second: answers questions, follows the leader's grid, and says who is gone."""
         self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
         self._voice.answer()
+        for news in self._timing.settle(k + 1, self._clock.monotonic_ns()):
+            self._voice.say(news.kind, news.text, t_ns=t_ns, **news.facts)
         self._watch(t_ns)
+
+    def _tell(self, output: Output) -> None:
+        """Says what a tick changed."""
+        for text in output.cmd:
+            said = f"{self._name} takes in {text}"
+            self._voice.say("change", said, t_ns=output.t_ns, ticks=output.tick, command=text)
+        if output.mode is not self._mode:
+            self._mode = output.mode
+            self._voice.say("mode", mode_text(self._name, output), t_ns=output.t_ns, ticks=output.tick)
 
     def _hear(self) -> None:
         """Takes what the peers say of their own end."""

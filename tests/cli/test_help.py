@@ -10,7 +10,9 @@ COMMANDS = [
     ["demo"],
     ["site"],
     ["record"],
+    ["router"],
     ["sim"],
+    ["test"],
     ["verify"],
     ["report"],
     ["scenario", "list"],
@@ -45,7 +47,7 @@ def test_these_are_all_the_commands() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "show", "check")]
+    "command", [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "test", "show", "check")]
 )
 def test_every_command_that_takes_a_scenario_takes_overrides(command: list[str]) -> None:
     assert "--set" in printed(*command, "--help")

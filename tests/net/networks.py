@@ -1,12 +1,14 @@
-"""The two networks that keep the contract of `Bus`, behind one face for the tests."""
+"""The networks that keep the contract of `Bus`, behind one face for the tests."""
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
 
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.endpoints import free_endpoints
-from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.zenoh_bus import ZenohBus, read_zenoh_file
 
+from .certificates import Certificates
 from .waiting import until
 
 SEATS = 3
@@ -34,25 +36,72 @@ class Local:
             member.close()
 
 
-class Zenoh:
+class Mesh:
     """A full mesh of Zenoh sessions on loopback, at most SEATS of them."""
 
-    def __init__(self) -> None:
-        self._endpoints = free_endpoints(SEATS)
+    def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
+        self.own = own
+        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in free_endpoints(SEATS)]
         self._members: list[Bus] = []
 
     def join(self) -> Bus:
         seat = len(self._members)
-        bus = ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat])
-        greeting = bus.publisher("greeting")
-        for member in self._members:
-            meet(greeting, member, "greeting")
+        bus = ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own)
+        greet(bus, self._members)
         self._members.append(bus)
         return bus
 
     def close(self) -> None:
         for member in self._members:
             member.close()
+
+
+class Routed:
+    """Zenoh sessions that reach a router and nothing else."""
+
+    def __init__(self) -> None:
+        self._endpoints = free_endpoints(1)
+        self._router = ZenohBus(self._endpoints, mode="router")
+        self._members: list[Bus] = []
+
+    def join(self) -> Bus:
+        bus = ZenohBus([], self._endpoints, "client")
+        greet(bus, self._members)
+        self._members.append(bus)
+        return bus
+
+    def restart(self) -> None:
+        """The router ends, and another one begins at its place."""
+        self._router.close()
+        self._router = ZenohBus(self._endpoints, mode="router")
+
+    def close(self) -> None:
+        for member in (*self._members, self._router):
+            member.close()
+
+
+def encrypted(protocol: str, folder: Path) -> Mesh:
+    """A mesh whose members prove to each other who they are, by a person's own configuration."""
+    made = Certificates(folder)
+    file = folder / "zenoh.json5"
+    file.write_text(
+        f"""{{ // both sides show a certificate of the same authority
+            transport: {{ link: {{ tls: {{
+                root_ca_certificate: "{made.authority}",
+                enable_mtls: true,
+                listen_certificate: "{made.certificate}", listen_private_key: "{made.key}",
+                connect_certificate: "{made.certificate}", connect_private_key: "{made.key}",
+            }} }} }},
+        }}"""
+    )
+    return Mesh(protocol, read_zenoh_file(file).settings)
+
+
+def greet(newcomer: Bus, members: Sequence[Bus]) -> None:
+    """Returns once a newcomer is heard by those who were there before."""
+    greeting = newcomer.publisher("greeting")
+    for member in members:
+        meet(greeting, member, "greeting")
 
 
 def meet(publish: Callable[[bytes], None], receiver: Bus, key: str) -> None:
@@ -66,4 +115,10 @@ def meet(publish: Callable[[bytes], None], receiver: Bus, key: str) -> None:
     until(heard)
 
 
-NETWORKS: dict[str, Callable[[], Network]] = {"local": Local, "zenoh": Zenoh}
+NETWORKS: dict[str, Callable[[Path], Network]] = {
+    "local": lambda _: Local(),
+    "zenoh": lambda _: Mesh(),
+    "router": lambda _: Routed(),
+    "tls": lambda folder: encrypted("tls", folder),
+}
+"""All that keep the contract; each is made in a folder of its own."""

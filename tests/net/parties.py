@@ -8,7 +8,8 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, ManualClock
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.session import Epoch, Joining, Voice
+from trilat_net.net.session import Epoch, Joining
+from trilat_net.net.voice import Voice
 from trilat_net.net.wire import decode
 
 SESSION = "t"
@@ -77,7 +78,8 @@ class Party:
         self._boot += 1
         clock = facts.pop("on_clock", self.clock)
         sites = () if name == topics.RECORDER else self.sites
-        return Member(self.network.join(), clock, sites, told(name, **{"boot": self._boot, **facts}))
+        facts = {"boot": self._boot, "clock": clock.identity(), **facts}
+        return Member(self.network.join(), clock, sites, told(name, **facts))
 
     def start(self, *names: str, **facts: object) -> None:
         """Starts members, in this order."""

@@ -1,21 +1,21 @@
 """The contract of `Bus`, kept by the real one and by its fake."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from trilat_net.errors import UsageError
-from trilat_net.net.bus import Bus, Inbox, LocalNetwork, matches
-from trilat_net.net.endpoints import free_endpoints
-from trilat_net.net.zenoh_bus import ZenohBus, configuration
+from trilat_net.net.bus import Bus, Inbox, LocalNetwork, StampedInbox, StampingRing, matches
 
 from .networks import NETWORKS, Network
 from .waiting import drained, received, until
 
 
 @pytest.fixture(params=list(NETWORKS))
-def network(request: pytest.FixtureRequest) -> Iterator[Network]:
-    made = NETWORKS[request.param]()
+def network(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Network]:
+    made = NETWORKS[request.param](tmp_path)
     yield made
     made.close()
 
@@ -123,6 +123,137 @@ def test_everyone_who_answers_is_heard_once(network: Network) -> None:
     assert sorted(until(answers)) == [("t/a/info", b"a"), ("t/b/info", b"b")]
 
 
+def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None:
+    asker, other = pair
+    questions = other.questions("t/a/info")
+    for sent in (b"", b"\x00\xff" * 2000, b"again"):
+
+        def asked(sent: bytes = sent) -> bool:
+            asker.ask("t/*/info", sent)
+            question = questions.poll()
+            return question is not None and question.payload == sent  # or one that was asked before
+
+        until(asked)
+
+
+def test_a_responder_answers_at_once_while_nobody_polls(pair: tuple[Bus, Bus]) -> None:
+    asker, other = pair
+    other.respond("t/a/ping", lambda sent: sent[::-1])
+
+    def answered() -> tuple[str, bytes] | None:
+        replies = asker.ask("t/*/ping", b"123")
+        try:
+            return until(replies.poll, timeout_s=0.5)
+        except AssertionError:  # the responder is not known yet
+            return None
+
+    assert until(answered) == ("t/a/ping", b"321")
+
+
+def test_a_responder_may_keep_silent_and_then_only_the_others_are_heard(network: Network) -> None:
+    asker, silent, other = (network.join() for _ in range(3))
+    asked: list[bytes] = []
+    silent.respond("t/a/ping", asked.append)
+    other.respond("t/b/ping", lambda _: b"here")
+    heard: list[tuple[str, bytes]] = []
+    pending: list[Inbox] = []
+
+    def both() -> bool:
+        pending.append(asker.ask("t/*/ping", b"?"))
+        for replies in pending:
+            heard.extend(drained(replies))
+        return bool(asked and heard)
+
+    until(both)
+    assert set(asked) == {b"?"}
+    assert set(heard) == {("t/b/ping", b"here")}
+
+
+def test_nobody_answers_oneself(pair: tuple[Bus, Bus]) -> None:
+    own, other = pair
+    own.respond("t/a/ping", lambda _: b"own")
+    own_questions = own.questions("t/b/ping")
+    other.respond("t/c/ping", lambda _: b"theirs")
+
+    def answers() -> list[tuple[str, bytes]]:
+        replies = own.ask("t/*/ping")
+        try:
+            return [until(replies.poll, timeout_s=0.5), *drained(replies)]
+        except AssertionError:
+            return []
+
+    assert until(answers) == [("t/c/ping", b"theirs")]
+    assert own_questions.poll() is None
+
+
+class Ticking:
+    """A clock whose every reading is one more than the one before."""
+
+    def __init__(self) -> None:
+        self.readings = 0
+
+    def __call__(self) -> int:
+        self.readings += 1
+        return self.readings
+
+
+def opened_stamps(publish: Callable[[bytes], None], inbox: StampedInbox) -> None:
+    """Returns once a stamped inbox hears the publisher, with nothing more under way and empty."""
+
+    def heard() -> bool:
+        publish(b"probe")
+        return inbox.poll() is not None
+
+    until(heard)
+    publish(b"last probe")
+    until(lambda: (inbox.poll() or (b"", 0))[0] == b"last probe")
+
+
+def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    clock = Ticking()
+    inbox, publish = receiver.stamped("t/a", clock), sender.publisher("t/a")
+    opened_stamps(publish, inbox)
+    before = clock.readings
+    for number in NUMBERS:
+        publish(number)
+    taken = [until(inbox.poll) for _ in NUMBERS]
+    assert taken == [(number, before + 1 + n) for n, number in enumerate(NUMBERS)]
+    assert inbox.poll() is None
+    assert inbox.overflowed == 0
+
+
+def test_a_stamped_ring_that_is_full_counts_the_oldest_that_it_loses(pair: tuple[Bus, Bus]) -> None:
+    sender, receiver = pair
+    inbox, publish = receiver.stamped("t/a", Ticking(), 16), sender.publisher("t/a")
+    opened_stamps(publish, inbox)
+    before = inbox.overflowed
+    for number in NUMBERS:
+        publish(number)
+    until(lambda: inbox.overflowed >= before + len(NUMBERS) - 16)
+    kept = [inbox.poll() for _ in range(17)]
+    assert [entry and entry[0] for entry in kept] == [*NUMBERS[-16:], None]
+    assert inbox.overflowed == before + len(NUMBERS) - 16
+
+
+@given(capacity=st.integers(1, 5), takes=st.lists(st.booleans(), max_size=60))
+def test_a_stamped_message_is_polled_or_waits_or_is_counted(capacity: int, takes: list[bool]) -> None:
+    ring = StampingRing(Ticking(), capacity)
+    held: list[int] = []
+    taken = lost = 0
+    for take in takes:
+        if take:
+            taken += 1
+            held.append(taken)
+            ring.take(bytes([taken]))
+            lost += len(held) > capacity
+            held = held[-capacity:]
+        else:
+            first = held.pop(0) if held else None
+            assert ring.poll() == (first and (bytes([first]), first))
+        assert ring.overflowed == lost
+
+
 def test_nobody_who_answers_means_no_answer_and_no_error(pair: tuple[Bus, Bus]) -> None:
     replies = pair[0].ask("t/*/info")
     for _ in range(20):
@@ -205,26 +336,3 @@ def test_members_of_two_networks_never_meet() -> None:
     inbox = other.inbox("**")
     one.publisher("t/a")(b"1")
     assert inbox.poll() is None
-
-
-def test_a_busy_port_is_the_callers_error_and_named() -> None:
-    (endpoint,) = free_endpoints(1)
-    first = ZenohBus([endpoint])
-    try:
-        with pytest.raises(UsageError, match=rf"{endpoint}: the port is in use"):
-            ZenohBus([endpoint])
-    finally:
-        first.close()
-
-
-@pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1:2"])
-@pytest.mark.parametrize("side", ["listen", "connect"])
-def test_a_malformed_endpoint_is_the_callers_error(endpoint: str, side: str) -> None:
-    with pytest.raises(UsageError, match="cannot"):
-        ZenohBus(**{side: [endpoint]}).close()
-
-
-def test_nothing_is_found_that_was_not_named() -> None:
-    settings = configuration(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
-    assert settings["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-    assert settings["transport"]["shared_memory"] == {"enabled": False}

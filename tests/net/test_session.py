@@ -8,9 +8,11 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
+from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.messages import Event, Info
-from trilat_net.net.session import AHEAD_NS, DECIDE_NS, new_boot
+from trilat_net.net.messages import VERSION, Event, Info
+from trilat_net.net.session import AHEAD_NS, DECIDE_NS
+from trilat_net.net.voice import new_boot
 from trilat_net.net.wire import encode
 
 from .parties import SESSION, STEP_NS, Member, Party, told
@@ -137,7 +139,7 @@ def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
     session.kill("s")
     session.rounds(100)
     assert [member.epoch for member in session.members.values()] == [None, None]
-    assert session.members["m1"].joining.missing() == ["s"]
+    assert session.members["m1"].joining.meeting.missing() == ["s"]
     session.start("s")
     session.agreed()
 
@@ -157,7 +159,7 @@ def test_a_recorder_that_announces_itself_is_waited_for() -> None:
     session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")  # there, and not joining yet
     session.rounds(100)
     assert session.kinds() == []
-    assert session.members["m1"].joining.missing() == [RECORDER]
+    assert session.members["m1"].joining.meeting.missing() == [RECORDER]
     session.stranger.close()
     session.agreed()
 
@@ -175,10 +177,10 @@ def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
 
 def test_missing_names_who_is_missing() -> None:
     session = party("m2")
-    assert session.members["m2"].joining.missing() == ["m1", "s"]
+    assert session.members["m2"].joining.meeting.missing() == ["m1", "s"]
     session.start("s")
     session.rounds(30)
-    assert session.members["m2"].joining.missing() == ["m1"]
+    assert session.members["m2"].joining.meeting.missing() == ["m1"]
 
 
 def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
@@ -240,9 +242,11 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
     session = Party(SITES)
     twins = [session.member("m1", boot=boot) for boot in (7, 9)]
     others = [session.member(name) for name in ("m2", "s")]
-    deaf = [twin.joining._take for twin in twins]
-    for twin, take in zip(twins, deaf, strict=True):
-        twin.joining._take = lambda info, take=take: None if info.member == "m1" else take(info)
+    for twin in twins:
+        take = twin.joining.meeting.take
+        twin.joining.meeting.take = lambda info, invited, take=take: (
+            None if info.member == "m1" else take(info, invited=invited)
+        )
     reasons = polled_until_refused(*twins, *others, clock=session.clock)
     assert len(reasons) == 1
     assert "is running" in reasons[0]
@@ -262,25 +266,64 @@ def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(nam
     assert {str(member.epoch) for member in session.members.values()} == {str(epoch)}
 
 
-def test_another_machine_gets_the_epoch_by_unix_time() -> None:
+class Elsewhere(ManualClock):
+    """The clock of another machine: both of its readings are other ones than here."""
+
+    def __init__(self, here: ManualClock, ahead_ns: int, unix_ns: int, name: str = "elsewhere") -> None:
+        super().__init__(here.monotonic_ns() + ahead_ns, unix_ns)
+        self._name = name
+
+    def identity(self) -> str:
+        return self._name
+
+
+def round_of_all(session: Party, *elsewhere: ManualClock) -> None:
+    """One round in which the clocks of all machines go on by as much."""
+    session.round()
+    for clock in elsewhere:
+        clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+
+
+@given(
+    ahead_ns=st.dictionaries(
+        st.sampled_from([*SITES, RECORDER]), st.integers(-(10**9) + 1, 10**15), min_size=1, max_size=4
+    ),
+    unix_ns=st.integers(0, 2**60),
+)
+@settings(max_examples=50)
+def test_members_on_other_clocks_get_the_same_instant_whatever_their_wall_clocks_say(
+    ahead_ns: dict[str, int], unix_ns: int
+) -> None:
+    session = Party(SITES)
+    clocks = {
+        name: Elsewhere(session.clock, ns, unix_ns + ns, f"machine of {name}")
+        for name, ns in ahead_ns.items()
+    }
+    for name in (*SITES, RECORDER):
+        session.start(name, **({"on_clock": clocks[name]} if name in clocks else {}))
+    for _ in range(200):
+        round_of_all(session, *clocks.values())
+    epochs = {name: member.epoch for name, member in session.members.items()}
+    assert all(epochs.values())
+    here_ns = epochs["m1"].mono_ns - ahead_ns.get("m1", 0)
+    assert here_ns + 10**9 > session.clock.monotonic_ns() - 200 * STEP_NS
+    for name, epoch in epochs.items():
+        assert epoch.mono_ns == here_ns + ahead_ns.get(name, 0)
+        assert epoch.epochs[name] == epoch.mono_ns
+        assert (epoch.unix_ns, epoch.boots) == (epochs["m1"].unix_ns, epochs["m1"].boots)
+        assert epoch.epochs == epochs["m1"].epochs
+
+
+def test_nobody_is_ready_before_the_other_clocks_are_known() -> None:
     session = party("m1", "m2")
-
-    class Remote(ManualClock):
-        def identity(self) -> str:
-            return "another machine"
-
-    offset_ns = 123_456_789_000  # its monotonic clock reads this much more, its wall clock the same
-    there = session.clock.monotonic_ns() + offset_ns
-    remote = Remote(there, session.clock.unix_ns() - there)
+    remote = Elsewhere(session.clock, 5_000_000_000, 0)
     session.start("s", on_clock=remote)
-    for _ in range(100):
-        session.round()
-        remote.sleep_until(remote.monotonic_ns() + STEP_NS)
-    here, away = session.members["m1"].epoch, session.members["s"].epoch
-    assert here is not None
-    assert away is not None
-    assert away.mono_ns == here.mono_ns + offset_ns
-    assert (away.unix_ns, away.boots) == (here.unix_ns, here.boots)
+    session.members["m2"].bus.ask = lambda *_: LocalNetwork().join().inbox("nothing")
+    for _ in range(300):  # nobody answers m2
+        round_of_all(session, remote)
+    assert "epoch" in session.kinds() or session.members["m2"].joining.meeting.missing()
+    assert {event.member for event in session.listen() if event.kind == "ready"} <= {"s"}
+    assert [member.epoch for member in session.members.values()] == [None] * 3
 
 
 def test_a_recorder_without_the_scenario_is_not_ready() -> None:
@@ -360,19 +403,19 @@ def test_an_answer_under_the_key_of_another_counts_for_nobody() -> None:
         while (question := asked.poll()) is not None:
             question.answer(encode(told("s", 1)))
         session.round()
-    assert session.members["m1"].joining.missing() == ["s"]
+    assert session.members["m1"].joining.meeting.missing() == ["s"]
 
 
 def test_what_another_version_answers_is_remembered_for_the_error() -> None:
     session = party("m1", "m2")
     asked = session.stranger.questions(topics.key(SESSION, "s", topics.INFO))
-    newer: Info = told("s", 1, v=2)
+    newer: Info = told("s", 1, v=VERSION + 1)
     for _ in range(50):
         while (question := asked.poll()) is not None:
             question.answer(encode(newer))
         session.round()
-    assert session.members["m1"].joining.missing() == ["s"]
-    assert "version 2" in session.members["m1"].joining.unreadable["s"]
+    assert session.members["m1"].joining.meeting.missing() == ["s"]
+    assert f"version {VERSION + 1}" in session.members["m1"].joining.meeting.unreadable["s"]
 
 
 def test_boots_are_random_64_bit_numbers() -> None:

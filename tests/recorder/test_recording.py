@@ -21,8 +21,9 @@ from trilat_net.log.reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.session import Epoch, Voice
+from trilat_net.net.session import Epoch
 from trilat_net.net.stats import LoopStats
+from trilat_net.net.voice import Voice
 from trilat_net.net.wire import Event, Info, decode, encode, encode_state
 from trilat_net.scenario import load
 
@@ -344,8 +345,10 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
             clock="c",
             fingerprint="f",
         )
-        recorder._joining.met["x"] = msgspec.structs.replace(site, member="x", boot=5, scenario="garbage")
-        recorder._joining.met["m"] = site
+        recorder._joining.meeting.met["x"] = msgspec.structs.replace(
+            site, member="x", boot=5, scenario="garbage"
+        )
+        recorder._joining.meeting.met["m"] = site
         recorder.record(EPOCH)
 
     def publish(clock: RelayClock) -> None:

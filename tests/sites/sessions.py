@@ -11,6 +11,7 @@ from sites.process import Member, Options
 from trilat_net.interrupt import Interrupt
 from trilat_net.log.reader import Log, open_log
 from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import Scenario
@@ -44,7 +45,7 @@ class Session:
 
     def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
         """A site's life, from its connection to its exit code."""
-        options = Options(SESSION, [], [], 10.0, needs_recorder)
+        options = Options(SESSION, Connection(), 10.0, needs_recorder)
         interrupt = self.interrupts.get(name, Interrupt())
         bus = self.network.join()
         try:

@@ -11,8 +11,12 @@ from hypothesis import strategies as st
 from sites.intake import Intake
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.tick import MAX_ARRIVALS
-from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.bus import LocalNetwork
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.course import Course
 from trilat_net.net.messages import VERSION
+from trilat_net.net.meter import Meter, Sent
+from trilat_net.net.offset import known
 from trilat_net.net.wire import MAX_BYTES
 
 PEERS = ("m2", "s")
@@ -28,8 +32,12 @@ def payload(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
         "tick": tick,
         "q": [0.1 * tick, 0.2],
         "qd": [0.3, 0.4],
+        "sent_ns": tick * 1_000_000,
     }
     return msgpack.packb({**message, **changed})
+
+
+EPOCH_NS = 7_000_000_000
 
 
 class Desk:
@@ -38,11 +46,17 @@ class Desk:
     def __init__(self, capacity: int = 16_384, rates: tuple[int, int] = (RATE_HZ, RATE_HZ)) -> None:
         network = LocalNetwork()
         receiver, sender = network.join(), network.join()
-        rings: list[Inbox] = [receiver.inbox(name, capacity) for name in PEERS]
+        self.clock = ManualClock(EPOCH_NS)
+        rings = [receiver.stamped(name, self.clock.monotonic_ns, capacity) for name in PEERS]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
         self.intake = Intake(PEERS, rings, rates, self.dropped)
-        self.intake.admit(BOOTS)
+        self.meters = [Meter(EPOCH_NS, 0, Sent(), Course(known(0)), None) for _ in PEERS]
+        self.intake.admit(BOOTS, self.meters)
+
+    def wait(self, until_ns: int) -> None:
+        """Time goes on, to an instant since the epoch."""
+        self.clock.sleep_until(EPOCH_NS + until_ns)
 
 
 def test_samples_come_peer_by_peer_each_in_its_order() -> None:
@@ -56,11 +70,24 @@ def test_samples_come_peer_by_peer_each_in_its_order() -> None:
     assert desk.intake.drain(6_000_000) == []
 
 
-def test_latency_is_now_minus_the_nominal_stamp_at_the_senders_rate() -> None:
+def test_a_delay_is_from_the_senders_stamp_to_the_arrival_however_late_it_is_drained() -> None:
     desk = Desk(rates=(300, 1000))
-    desk.send[0](payload(100, 0))  # 333 333 333 ns
-    desk.send[1](payload(100, 1))  # 100 ms
-    assert [a.latency_us for a in desk.intake.drain(400_000_000)] == [66_666, 300_000]
+    desk.wait(40_000_000)
+    desk.send[0](payload(3, 0, sent_ns=12_345_678))
+    desk.send[1](payload(20, 1, sent_ns=19_999_001))
+    desk.wait(900_000_000)
+    assert [a.latency_us for a in desk.intake.drain(900_000_000)] == [27_654, 20_000]
+
+
+def test_what_comes_before_it_was_sent_is_counted_and_used() -> None:
+    desk = Desk()
+    desk.wait(5_000_000)
+    desk.send[0](payload(0, 0, sent_ns=5_000_001))
+    desk.send[0](payload(1, 0, sent_ns=4_000_000))
+    assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [(0, -1), (1, 1000)]
+    assert [meter.figures().faults for meter in desk.meters] == [1, 0]
+    assert desk.meters[0].faulty() == 1
+    assert not desk.dropped
 
 
 REFUSED = {
@@ -77,13 +104,19 @@ REFUSED = {
         payload(tick=2**40),
         payload(tick=1.5),
         payload(boot=-1),
+        payload(sent_ns=2**59),
+        payload(sent_ns=-(2**63)),
+        payload(sent_ns=0.5),
+        payload(echo=[[0, 1]]),
+        payload(echo=[[0, 1, 2**59]]),
+        payload(echo=7),
         b"\x91" * 10_000,
     ],
     "oversized": [payload(padding="x" * MAX_BYTES), bytes(MAX_BYTES + 1)],
     "version": [payload(v=VERSION + 1), payload(v=0)],
     "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],
     "stranger": [payload(boot=99), payload(site="s"), payload(site="nobody")],
-    "ahead": [payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1), payload(tick=2**40 - 1)],
+    "ahead": [payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1), payload(tick=2**40 - 1, sent_ns=0)],
 }
 
 
@@ -108,7 +141,7 @@ def test_no_bytes_raise(sent: list[bytes]) -> None:
 
 @given(
     st.dictionaries(
-        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "more"]),
+        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "sent_ns", "echo", "more"]),
         st.recursive(
             st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
             lambda inner: (

@@ -17,15 +17,15 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import LinkStats, State
-from trilat_net.net.session import Epoch
 from trilat_net.net.stats import LoopStats
+from trilat_net.net.timing import Timing
 from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario, load
 
 from .relay import RelayClock
 from .sessions import SESSION, Session, in_log, in_virtual_time
 
-EPOCH = Epoch(5_000_000_123, 0, {})
+EPOCH_NS = 5_000_000_123
 
 
 class LateClock(ManualClock):
@@ -59,12 +59,13 @@ class Alone:
         ports = Ports(
             self._clock,
             Intake((), (), (), self.stats.dropped),
+            Timing(EPOCH_NS, self.site.rate_hz, (), "s"),
             lambda payload: self.states.append(decode(payload, State)),
             lambda payload: self.links.append(decode(payload, LinkStats)),
             lambda k, t_ns: self.slack.append((k, t_ns)),
             lambda: self.stopped(),
         )
-        return run_loop(self.site, 1, self._ticks, EPOCH, self.stats, ports)
+        return run_loop(self.site, 1, self._ticks, self.stats, ports)
 
 
 @pytest.mark.parametrize("rate_hz", [100, 333, 1000, 1024, 3000])
@@ -72,10 +73,10 @@ def test_ticks_lie_on_an_absolute_grid_at_any_rate(rate_hz: int) -> None:
     clock = LateClock()
     Alone(clock, {"rate_hz": rate_hz}).run()
     assert len(clock.deadlines) == 2 * rate_hz
-    assert clock.deadlines[0] == EPOCH.mono_ns
-    assert clock.deadlines[rate_hz] == EPOCH.mono_ns + 1_000_000_000  # one second, exactly: no drift
+    assert clock.deadlines[0] == EPOCH_NS
+    assert clock.deadlines[rate_hz] == EPOCH_NS + 1_000_000_000  # one second, exactly: no drift
     for k, deadline_ns in enumerate(clock.deadlines):
-        off = (deadline_ns - EPOCH.mono_ns) * rate_hz - k * 1_000_000_000
+        off = (deadline_ns - EPOCH_NS) * rate_hz - k * 1_000_000_000
         assert -rate_hz < off <= 0  # rounded down, by less than a nanosecond
 
 
@@ -94,7 +95,8 @@ def test_lateness_enters_no_formula() -> None:
     prompt, late = Alone(LateClock()), Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
     prompt.run()
     late.run()
-    assert [msgspec.structs.replace(state, late_us=0) for state in late.states] == prompt.states
+    on_time = [msgspec.structs.replace(state, late_us=0, sent_ns=state.t_ns) for state in late.states]
+    assert on_time == prompt.states
     assert max(state.late_us for state in late.states) == 400_000
 
 

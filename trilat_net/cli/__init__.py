@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 from ..errors import TrilatError
 from ..interrupt import Interrupt
-from . import logs, scenarios, sessions
+from . import changes, logs, pings, routers, scenarios, sessions, trials
 from .options import err
 
 
@@ -47,8 +47,12 @@ app = typer.Typer(
     epilog="Begin with: trilat demo paper",
 )
 app.add_typer(sessions.app)
+app.add_typer(routers.app)
+app.add_typer(pings.app)
 app.add_typer(logs.app)
+app.add_typer(trials.app)
 app.add_typer(scenarios.app, name="scenario")
+app.add_typer(changes.app, name="set")
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """What the commands have in common: their options, and how a scenario is loaded from them."""
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +11,7 @@ from rich.console import Console
 from ..errors import UsageError
 
 if TYPE_CHECKING:
+    from ..net.connection import Connection
     from ..scenario import Scenario
 
 out = Console(highlight=False)
@@ -32,13 +35,66 @@ ConnectOption = Annotated[
     list[str] | None, typer.Option("--connect", metavar="EP", help="Endpoint to connect to; repeatable.")
 ]
 
+RouterOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--router",
+        metavar="EP",
+        help="Endpoint of a router to go through instead, as in tcp/192.0.2.1:7447; repeatable: the first "
+        "that answers.",
+    ),
+]
+ZenohConfigOption = Annotated[
+    Path | None,
+    typer.Option("--zenoh-config", metavar="FILE", help="Your own Zenoh configuration: TLS, QUIC, access."),
+]
 
-def finite_seconds(value: float | None) -> float | None:
+
+def say(text: str) -> None:
+    """Prints a line at once, as a process does that others watch."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def finite_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
     """Refuses what is no time to wait."""
     if value is not None and not 0.0 <= value <= 86_400.0:
-        raise UsageError(f"--join-timeout is a number of seconds from 0 to 86400, not {value:g}")
+        raise UsageError(f"{param.opts[0]} is a number of seconds from 0 to 86400, not {value:g}")
     return value
 
+
+def injected_offset(value: float) -> float:
+    """Refuses what no clock can be ahead by."""
+    if not -1e6 <= value <= 1e6:
+        raise UsageError(f"--clock-offset-s is a number of seconds from -1e6 to 1e6, not {value:g}")
+    return value
+
+
+def injected_drift(value: float) -> float:
+    """Refuses a drift that nobody follows."""
+    if not -200.0 <= value <= 200.0:
+        raise UsageError(f"--clock-drift-ppm is a number from -200 to 200, not {value:g}")
+    return value
+
+
+ClockOffsetOption = Annotated[
+    float,
+    typer.Option(
+        "--clock-offset-s",
+        metavar="S",
+        help="For tests: a clock that is ahead of the machine's by this, s.",
+        callback=injected_offset,
+    ),
+]
+ClockDriftOption = Annotated[
+    float,
+    typer.Option(
+        "--clock-drift-ppm",
+        metavar="PPM",
+        help="For tests: a clock that runs faster than the machine's by this, ppm.",
+        callback=injected_drift,
+    ),
+]
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 
@@ -55,3 +111,19 @@ def chosen_scenario(
     if seed is not None:
         given.append(f"seed={seed}")
     return load(source, given)
+
+
+def chosen_connection(
+    listen: list[str] | None,
+    connect: list[str] | None,
+    routers: list[str] | None,
+    zenoh_config: Path | None,
+    listen_else: Sequence[str],
+    connect_else: Sequence[str] | None,
+) -> "Connection":
+    """Returns how a member takes part by a command's options, and by default."""
+    from ..net.connection import member_connection
+    from ..net.zenoh_bus import read_zenoh_file
+
+    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
+    return member_connection(listen, connect, routers, file, listen_else, connect_else)

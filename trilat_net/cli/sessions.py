@@ -1,7 +1,6 @@
 """Commands that take part in a live session: demo, site, record."""
 
 import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,17 +9,23 @@ from rich.markup import escape
 
 from ..errors import UsageError
 from .options import (
+    ClockDriftOption,
+    ClockOffsetOption,
     ConnectOption,
     DurationOption,
     ForceOption,
     ListenOption,
+    RouterOption,
     ScenarioArgument,
     SeedOption,
     SetOption,
+    ZenohConfigOption,
+    chosen_connection,
     chosen_scenario,
     err,
     finite_seconds,
     out,
+    say,
 )
 from .show import show_conclusion
 
@@ -75,6 +80,8 @@ def site(
     ] = None,
     listen: ListenOption = None,
     connect: ConnectOption = None,
+    router: RouterOption = None,
+    zenoh_config: ZenohConfigOption = None,
     join_timeout: Annotated[
         float,
         typer.Option(
@@ -85,6 +92,8 @@ def site(
         bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
     ] = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Stay on this processor.")] = None,
+    clock_offset: ClockOffsetOption = 0.0,
+    clock_drift: ClockDriftOption = 0.0,
     duration: DurationOption = None,
     seed: SeedOption = None,
     overrides: SetOption = None,
@@ -106,13 +115,16 @@ def site(
     before = chosen.names[: chosen.names.index(name)]
     options = Options(
         session=identity,
-        listen=listen if listen is not None else [places[name]],
-        connect=connect if connect is not None else [places[peer] for peer in before],
+        connection=chosen_connection(
+            listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
+        ),
         join_timeout_s=join_timeout,
         needs_recorder=needs_recorder,
         cpu=cpu,
+        clock_offset_s=clock_offset,
+        clock_drift_ppm=clock_drift,
     )
-    code = run_site(chosen, name, options, _say)
+    code = run_site(chosen, name, options, say)
     raise typer.Exit(code)
 
 
@@ -121,6 +133,8 @@ def record(
     session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session to record.")],
     listen: ListenOption = None,
     connect: ConnectOption = None,
+    router: RouterOption = None,
+    zenoh_config: ZenohConfigOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
     ] = None,
@@ -133,6 +147,8 @@ def record(
             callback=finite_seconds,
         ),
     ] = None,
+    clock_offset: ClockOffsetOption = 0.0,
+    clock_drift: ClockDriftOption = 0.0,
     force: ForceOption = False,
 ) -> None:
     """Records one session, from its epoch to its end or to Ctrl-C.
@@ -141,19 +157,18 @@ def record(
     """
     from recorder.process import record_session
 
+    from ..net.clock import system_clock
+
+    connection = chosen_connection(listen, connect, router, zenoh_config, [], None)
     path = output if output is not None else Path(f"{_session_name(session)}.mcap")
     if path.exists() and (not force or path.is_dir()):
         raise UsageError(f"{path}: exists; choose another name, or replace a file with --force")
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
     path.unlink(missing_ok=True)
-    code = record_session(_session_name(session), path, listen or [], connect, join_timeout, _say)
+    clock = system_clock(clock_offset, clock_drift)
+    code = record_session(_session_name(session), path, connection, join_timeout, clock, say)
     raise typer.Exit(code)
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
 
 
 def _session_name(name: str) -> str:

@@ -1,13 +1,15 @@
 """The bus: what a member needs of a network, behind a small Protocol, and a fake that keeps it.
 
-Law: nothing that arrives runs code in a site. Messages wait in bounded rings until the loop asks; what
-overflows is lost oldest first, and the receiver sees it by the ticks. Only the recorder takes callbacks.
+Law: what arrives runs nothing in a site but a stamp, an append, or a short answer. Messages wait in bounded
+rings until the loop asks; what overflows is lost oldest first, and is counted where messages are stamped;
+elsewhere the receiver sees it by the ticks. Only the recorder takes callbacks of its own.
 
 `zenoh_bus` is the real one; `LocalBus` joins members of one process. Both pass the same contract tests.
 """
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
 
 RING = 16_384
@@ -24,6 +26,17 @@ class Inbox(Protocol):
         """Returns the oldest message (key, payload), or None; never waits."""
 
 
+class StampedInbox(Protocol):
+    """A bounded ring of messages with the instants at which they arrived."""
+
+    @property
+    def overflowed(self) -> int:
+        """How many messages the full ring has lost, oldest first."""
+
+    def poll(self) -> tuple[bytes, int] | None:
+        """Returns the oldest message (payload, instant of its arrival in ns), or None; never waits."""
+
+
 class Presence(Protocol):
     """A bounded ring of liveliness changes."""
 
@@ -33,6 +46,10 @@ class Presence(Protocol):
 
 class Question(Protocol):
     """A question that waits for an answer."""
+
+    @property
+    def payload(self) -> bytes:
+        """What the asker sent with it; b"" if nothing."""
 
     def answer(self, payload: bytes) -> None:
         """Answers it."""
@@ -54,13 +71,25 @@ class Bus(Protocol):
     def inbox(self, key: str, capacity: int = RING) -> Inbox:
         """Returns a ring that fills with what others publish under a key expression."""
 
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+        """Returns a ring whose messages are stamped by `now_ns` as they come, in a thread of the bus."""
+
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Calls back with (key, payload) as messages come, in a thread of the bus."""
 
     def questions(self, key: str) -> Questions:
         """Returns a ring of the questions that others ask under a key."""
 
-    def ask(self, key: str) -> Inbox:
+    def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
+        """Answers questions under a key at once, in a thread of the bus.
+
+        Args:
+            key: without wildcards.
+            answer: takes what the asker sent and returns what to answer, or None for no answer; short,
+                because what arrives meanwhile waits, and without exceptions.
+        """
+
+    def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """Asks everyone who answers under a key expression; answers come into the ring as they come."""
 
     def announce(self, key: str) -> None:
@@ -101,10 +130,44 @@ class _Ring(Generic[T]):
         return self._entries.popleft() if self._entries else None
 
 
+class StampingRing:
+    """The `StampedInbox` of every bus; `take` may run in another thread than `poll`.
+
+    Args:
+        now_ns: the time.
+        capacity: how many messages it holds, 1 or more.
+
+    Attributes:
+        overflowed: see `StampedInbox`; every message taken is polled, waits, or is counted here.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], capacity: int) -> None:
+        self.overflowed = 0
+        self._now_ns, self._capacity = now_ns, capacity
+        self._entries: deque[tuple[bytes, int]] = deque()
+
+    def take(self, payload: bytes) -> None:
+        """Stamps a message and appends it."""
+        self._entries.append((payload, self._now_ns()))
+        # not `maxlen`: what a full deque pushes out could not be told from what `poll` has just taken
+        if len(self._entries) > self._capacity:
+            with suppress(IndexError):  # polled empty since the line before
+                self._entries.popleft()
+                self.overflowed += 1
+
+    def poll(self) -> tuple[bytes, int] | None:
+        """See `StampedInbox`."""
+        try:
+            return self._entries.popleft()
+        except IndexError:
+            return None
+
+
 class _LocalQuestion:
     """A question inside one process."""
 
-    def __init__(self, key: str, replies: _Ring[tuple[str, bytes]]) -> None:
+    def __init__(self, key: str, payload: bytes, replies: _Ring[tuple[str, bytes]]) -> None:
+        self.payload = payload
         self._key = key
         self._replies = replies
 
@@ -132,7 +195,7 @@ class LocalBus:
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
-        self._answering: list[tuple[str, _Ring[Question]]] = []
+        self._answering: list[tuple[str, Callable[[_LocalQuestion], None]]] = []
         self._watching: list[tuple[str, _Ring[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
@@ -153,6 +216,12 @@ class LocalBus:
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+        """See `Bus`."""
+        ring = StampingRing(now_ns, capacity)
+        self._sinks.append((key, lambda _, payload: ring.take(payload)))
+        return ring
+
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
         self._sinks.append((key, callback))
@@ -160,16 +229,26 @@ class LocalBus:
     def questions(self, key: str) -> Questions:
         """See `Bus`."""
         ring = _Ring[Question]()
-        self._answering.append((key, ring))
+        self._answering.append((key, ring.put))
         return ring
 
-    def ask(self, key: str) -> Inbox:
+    def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
+        """See `Bus`."""
+
+        def at_once(question: _LocalQuestion) -> None:
+            answered = answer(question.payload)
+            if answered is not None:
+                question.answer(answered)
+
+        self._answering.append((key, at_once))
+
+    def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
         replies = _Ring[tuple[str, bytes]]()
         for member in self._network.members:
-            for answered, ring in member._answering:
+            for answered, take in member._answering:
                 if member is not self and matches(key, answered):
-                    ring.put(_LocalQuestion(answered, replies))
+                    take(_LocalQuestion(answered, payload, replies))
         return replies
 
     def announce(self, key: str) -> None:

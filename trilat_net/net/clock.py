@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Protocol
 
+from ..core.grid import NS_PER_S
+
 
 class Clock(Protocol):
     """What a driver may ask of time."""
@@ -49,6 +51,51 @@ class SystemClock:
         except OSError:
             return f"process-{time.get_clock_info('monotonic').implementation}"
         return f"{boot}/{namespace}"
+
+
+class SkewedClock:
+    """A clock that runs beside another one: test injection, as of a machine that was started elsewhere.
+
+    It reads start + offset + (other - start) (1 + drift), where start is the other's reading when this one
+    was made. Its identity says so, and is equal to no other: whoever knows it can undo it.
+
+    Args:
+        clock: the other one; its wall clock is left as it is.
+        offset_ns: how far it is ahead at its start.
+        drift_ppb: by how much it runs faster, ns/s.
+    """
+
+    def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
+        self._clock, self._offset_ns, self._drift_ppb = clock, offset_ns, drift_ppb
+        self._start_ns = clock.monotonic_ns()
+
+    def monotonic_ns(self) -> int:
+        """See `Clock`."""
+        passed_ns = self._clock.monotonic_ns() - self._start_ns
+        return self._start_ns + self._offset_ns + passed_ns + passed_ns * self._drift_ppb // NS_PER_S
+
+    def unix_ns(self) -> int:
+        """See `Clock`."""
+        return self._clock.unix_ns()
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        """See `Clock`."""
+        passed_ns = deadline_ns - self._start_ns - self._offset_ns
+        self._clock.sleep_until(self._start_ns - -passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))
+
+    def identity(self) -> str:
+        """See `Clock`."""
+        return (
+            f"{self._clock.identity()}, skewed by {self._offset_ns} ns "
+            f"and {self._drift_ppb} ns/s since {self._start_ns} ns"
+        )
+
+
+def system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
+    """Returns the machine's clock, or one that runs beside it where an offset (s) or a drift is injected."""
+    if not offset_s and not drift_ppm:
+        return SystemClock()
+    return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))
 
 
 class ManualClock:

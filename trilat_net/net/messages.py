@@ -11,10 +11,18 @@ from msgspec import Meta
 
 from ..core.arm import JOINTS, PARAMETERS
 
-VERSION = 1
+VERSION = 2
+"""What is sent, and all that is accepted from others."""
+READABLE = (1, 2)
+"""What is read in files: every version that was released."""
 
 U64 = Annotated[int, Meta(ge=0)]
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
+
+
+Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
+"""Nanoseconds of a clock: eighteen years, so that sums and differences of some still fit a payload."""
+Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:
@@ -35,7 +43,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boot: the sender's process start, random.
         tick: its tick.
         t_ns: nominal time, ns since the session's epoch.
-        mode: "run" or "diverged".
+        mode: "run", "hold", "brake", "return" or "diverged", see `core.tick.Mode`.
         q: joint angles.
         qd: joint velocities.
         q_des: reference, Eq. (6).
@@ -44,12 +52,16 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         tau_x: exogenous torque as Eq. (8) subtracts it.
         theta_hat: estimate of theta, Eq. (24).
         used: per peer the tick of the sample in use, -1 before the first.
-        rx: arrivals in the order accepted: index of the peer among the sender's peers, its tick, latency us.
+        rx: arrivals in the order accepted: index of the peer among the sender's peers, its tick, its one-way
+            delay in us by the offset in force (before version 2: the age of its nominal stamp).
         rx_crc: CRC-32 of those arrivals as the step took them in.
-        cmd: commands that took effect.
-        mem: whatever else the controller remembers.
+        cmd: commands taken in, each the JSON of a `scenario.timeline.Change`.
+        mem: what the site remembers besides, see `core.tick.Output`.
         late_us: wake-up minus deadline of this tick.
         busy_us: computing time of the tick before.
+        sent_ns: when it was sent: the sender's clock as it runs, never slewed, ns since the epoch on it.
+        echo: of each peer the newest sample that this tick took in: index of the peer, its tick, and its
+            arrival on the same clock as `sent_ns`.
     """
 
     v: int
@@ -66,12 +78,14 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     tau_x: Torques
     theta_hat: list[float]
     used: dict[str, int]
-    rx: list[Annotated[list[int], Meta(min_length=3, max_length=3)]]
+    rx: list[Stamp]
     rx_crc: U64
     cmd: list[str]
     mem: list[float]
     late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
+    sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
+    echo: list[Stamp] = []
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,6 +97,8 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     tick: TickNumber
     q: list[float]
     qd: list[float]
+    sent_ns: Instant = 0
+    echo: list[Stamp] = []
 
 
 class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,10 +116,21 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         late: per peer, those that came after they were due.
         duplicate: per peer, those that came twice.
         refused: per peer, those whose stamp was out of range.
+        lost: per peer, those that the link's model lost.
+        superseded: per peer, those never used because a newer one was released before or with them.
+        copies: per peer, duplicates that the link's model made.
         dropped: messages that were none of ours or overflowed, by reason.
         late_max_us: largest lateness of a wake-up since the last statistics.
         busy_max_us: largest computing time of a tick since then.
         overruns: ticks since the start whose work began after the next one was due.
+        offset_us: per peer, its clock minus the own one, as in force.
+        bound_us: per peer, how far that is from the truth at most.
+        delay_us: per peer, one-way delay: median since the last statistics; -1 where nothing came.
+        delay_max_us: per peer, its largest.
+        rtt_us: per peer, smallest round trip since the last statistics; -1 where none was made.
+        clock_faults: per peer, samples since the start that came before they were sent, beyond the bound.
+        grid_error_us: how late the own grid of ticks is against the leader's.
+        slew_ppb: by how much it lags the own clock to follow the leader's, ns/s.
     """
 
     v: int
@@ -117,10 +144,21 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     late: dict[str, int]
     duplicate: dict[str, int]
     refused: dict[str, int]
+    lost: dict[str, int] = {}
+    superseded: dict[str, int] = {}
+    copies: dict[str, int] = {}
     dropped: dict[str, int]
     late_max_us: Annotated[int, _unit("us", "largest lateness of a wake-up")]
     busy_max_us: Annotated[int, _unit("us", "largest computing time of a tick")]
     overruns: int
+    offset_us: Annotated[dict[str, int], _unit("us", "the peer's clock minus the own one")] = {}
+    bound_us: Annotated[dict[str, int], _unit("us", "how far that is from the truth at most")] = {}
+    delay_us: Annotated[dict[str, int], _unit("us", "one-way delay, median")] = {}
+    delay_max_us: Annotated[dict[str, int], _unit("us", "one-way delay, largest")] = {}
+    rtt_us: Annotated[dict[str, int], _unit("us", "smallest round trip")] = {}
+    clock_faults: dict[str, int] = {}
+    grid_error_us: Annotated[int, _unit("us", "how late the grid is against the leader's")] = 0
+    slew_ppb: Annotated[int, _unit("ns/s", "by how much the grid lags the clock")] = 0
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -130,7 +168,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         v: version of this schema.
         member: who says it: a site, or "recorder".
         boot: the sender's process start.
-        kind: "epoch", "ready", "start", "lost", "back", "diverged", "end", "stored", "refused", "setup".
+        kind: "epoch", "ready", "start", "lost", "back", "diverged", "end", "stored", "refused", "setup",
+            "mode", "change", "clock", "clock fault".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
@@ -139,7 +178,15 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         clock: identity of that monotonic clock.
         boots: members of the session and their boots.
         about: the member that it concerns.
-        ticks: how many ticks.
+        ticks: how many ticks; of "clock" the tick from which on it holds.
+        command: the change that was taken in, as the record of tick `ticks` names it.
+        clocks: per member the identity of its clock.
+        epochs: per member the epoch on its own clock.
+        offset_ns: of "clock": the clock of `about` minus the own one, at that tick; of "clock fault" by how
+            much a sample came before it was sent.
+        bound_ns: how far that offset is from the truth at most, for a second from there; then it grows.
+        drift_ppb: by how much the offset grows, ns/s.
+        drift_bound_ppb: how far that is from the truth at most.
     """
 
     v: int = VERSION
@@ -149,12 +196,19 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     text: str
     t_ns: int = -1
     attempt: int = 0
-    epoch_mono_ns: int = 0
+    epoch_mono_ns: Instant = 0
     epoch_unix_ns: int = 0
     clock: str = ""
     boots: dict[str, int] = {}
     about: str = ""
     ticks: int = 0
+    command: str = ""
+    clocks: dict[str, str] = {}
+    epochs: dict[str, Instant] = {}
+    offset_ns: int = 0
+    bound_ns: int = 0
+    drift_ppb: int = 0
+    drift_bound_ppb: int = 0
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -185,6 +239,62 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     needs_recorder: bool = False
     running: bool = False
     ticks: int = 0
+
+
+class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a member answers to a ping, at once.
+
+    Attributes:
+        v: version of this schema.
+        member: a site, or "recorder".
+        boot: its process start.
+        clock: identity of its monotonic clock.
+        came_ns: that clock when the ping had come.
+        left_ns: that clock when the answer was given.
+    """
+
+    v: int = VERSION
+    member: str
+    boot: U64
+    clock: str
+    came_ns: Instant
+    left_ns: Instant
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A change that somebody asks a site for, as in a scenario's timeline, from as soon as it can be.
+
+    Attributes:
+        v: version of this schema.
+        link: the link to change, as in "m1->s", or "".
+        dominance: the site whose shares to change, or "".
+        to: what the link or the row is to be.
+        ramp_s: how long shares take, s.
+    """
+
+    v: int = VERSION
+    link: str = ""
+    dominance: str = ""
+    to: dict[str, Any]
+    ramp_s: float = 0.0
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a site answers to an `Order`.
+
+    Attributes:
+        v: version of this schema.
+        member: who answers.
+        accepted: whether it does it.
+        text: from when on, or why not.
+        tick: its first tick, at its own rate, for which the change holds; -1 where it was refused.
+    """
+
+    v: int = VERSION
+    member: str
+    accepted: bool
+    text: str
+    tick: int = -1
 
 
 SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}

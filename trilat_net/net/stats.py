@@ -1,6 +1,8 @@
 """What a loop tells about itself ten times a second."""
 
 from collections import Counter
+from collections.abc import Mapping
+from typing import Any
 
 from ..core.grid import NS_PER_S
 from ..core.site import Site
@@ -44,8 +46,13 @@ class LoopStats:
         """True at the ticks after which statistics are published."""
         return k % self._every == 0
 
-    def take(self, output: Output) -> LinkStats:
-        """Returns the statistics as of a tick and begins anew with the largest values."""
+    def take(self, output: Output, measured: Mapping[str, Any] | None = None) -> LinkStats:
+        """Returns the statistics as of a tick and begins anew with the largest values.
+
+        Args:
+            output: the record of that tick.
+            measured: what a clock measured, by field of `LinkStats`; none in virtual time.
+        """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))
         age_us = {
@@ -64,10 +71,14 @@ class LoopStats:
             late={peer: count.late for peer, count in counts.items()},
             duplicate={peer: count.duplicate for peer, count in counts.items()},
             refused={peer: count.refused for peer, count in counts.items()},
+            lost={peer: count.lost for peer, count in counts.items()},
+            superseded={peer: count.superseded for peer, count in counts.items()},
+            copies={peer: count.copies for peer, count in counts.items()},
             dropped=dict(self.dropped),
             late_max_us=self._late_max_us,
             busy_max_us=self._busy_max_us,
             overruns=self.overruns,
+            **(measured or {}),
         )
         self._late_max_us = self._busy_max_us = 0
         return stats

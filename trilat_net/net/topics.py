@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 ROOT = "trilat"
 RECORDER = "recorder"
-STATE, LINK, EVENT, INFO, ALIVE = "state", "link", "event", "info", "alive"
+STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
 
 
 class Address(NamedTuple):

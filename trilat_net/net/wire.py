@@ -8,7 +8,7 @@ Payloads are MessagePack maps with string keys and plain lists, encoded by `msgp
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -17,13 +17,28 @@ import msgspec
 
 from ..core.tick import Arrival, Output
 from ..errors import WireError
-from .messages import SAMPLE_VECTORS, STATE_VECTORS, VERSION, Event, Info, LinkStats, Sample, State
+from .messages import (
+    SAMPLE_VECTORS,
+    STATE_VECTORS,
+    VERSION,
+    Event,
+    Info,
+    LinkStats,
+    Order,
+    Pong,
+    Reply,
+    Sample,
+    State,
+)
 
 MAX_BYTES = 65_536
+MAX_INFO_BYTES = 64 * 1024 * 1024
+"""Most bytes of a message; those of an `Info`, which holds a whole scenario, traces and all."""
 
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in (State, Sample, LinkStats, Event, Info)
+    kind: msgspec.msgpack.Decoder(kind)
+    for kind in (State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
 }
 _isfinite = math.isfinite
 
@@ -39,6 +54,8 @@ def encode_state(
     arrivals: Sequence[Arrival],
     late_us: int,
     busy_us: int,
+    sent_ns: int | None = None,
+    echo: Sequence[Sequence[int]] = (),
 ) -> bytes:
     """Returns the payload of one record.
 
@@ -50,12 +67,14 @@ def encode_state(
         arrivals: what the tick took in.
         late_us: wake-up minus deadline, us.
         busy_us: computing time of the tick before, us.
+        sent_ns: when it is sent, ns since the epoch on the own clock; None in virtual time: as nominal.
+        echo: of each peer the newest sample that came: (index of the peer, its tick, arrival as `sent_ns`).
 
     Raises:
         WireError: a number is not finite.
     """
-    (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc) = output
-    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat]
+    (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem) = output
+    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem]
     # a sum is finite only if its terms are; the second look is for terms whose sum overflows
     if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
@@ -77,41 +96,45 @@ def encode_state(
             "used": dict(zip(peers, used, strict=True)),
             "rx": [(a.peer, a.tick, a.latency_us) for a in arrivals],
             "rx_crc": rx_crc,
-            "cmd": [],
-            "mem": [],
+            "cmd": cmd,
+            "mem": mem,
             "late_us": late_us,
             "busy_us": busy_us,
+            "sent_ns": t_ns if sent_ns is None else sent_ns,
+            "echo": echo,
         }
     )
     return packed
 
 
-def encode(message: LinkStats | Event | Info) -> bytes:
+def encode(message: LinkStats | Event | Info | Pong | Order | Reply) -> bytes:
     """Returns the payload of any message but a `State`."""
     packed: bytes = _pack(msgspec.structs.asdict(message))
     return packed
 
 
-M = TypeVar("M", State, Sample, LinkStats, Event, Info)
+M = TypeVar("M", State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
 
 
-def decode(payload: bytes, kind: type[M]) -> M:
+def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:
     """Returns the message that a payload holds.
 
     Args:
         payload: as it came.
         kind: the type that the key promises.
+        versions: schema versions that are accepted: one from others, `messages.READABLE` from a file.
 
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
     """
-    if len(payload) > MAX_BYTES:
-        raise WireError("oversized", f"{len(payload)} bytes, at most {MAX_BYTES}")
+    limit = MAX_INFO_BYTES if kind is Info else MAX_BYTES
+    if len(payload) > limit:
+        raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
     try:
         message: M = _DECODERS[kind].decode(payload)
     except (ValueError, RecursionError) as error:
         raise WireError("malformed", str(error)) from None
-    if message.v != VERSION:
+    if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
     if isinstance(message, Sample | State):
         _check_numbers(message)

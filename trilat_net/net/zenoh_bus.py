@@ -1,67 +1,31 @@
 """The bus over Eclipse Zenoh; the only importer of `zenoh`.
 
-Law: explicit endpoints and nothing else. No multicast, no gossip, no shared memory: two sessions on one
-host, or on a crowded network, never meet by accident.
-
-Three defaults of Zenoh do not suit a 1 kHz loop and are set here: a transmission queue of 2 batches (16
-here: a burst of catch-up ticks must fit), a publisher that waits 1 ms for room (0: a loop never waits; the
-receiver counts what was dropped), and `express`, which sends each message by itself and is left off:
-batching is what makes bursts of thousands of small messages fit.
+Law: nothing here waits for the network. What is published is dropped rather than kept waiting, what is asked
+is answered into a ring, and a session that cannot open yet says so.
 """
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
-from ..errors import UsageError
-from .bus import RING, Inbox, Presence, Questions
-
-LEASE_MS = 5_000
-"""A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
-closed connection; a silent one by the age of its samples."""
+from ..errors import SessionError, UsageError
+from .bus import RING, Inbox, Presence, Questions, StampedInbox, StampingRing
+from .zenoh_config import Endpoint, Mode, configuration
+from .zenoh_file import ZenohFile, understood
 
 ASK_TIMEOUT_S = 1.0
+MAX_DEPTH = 100
+"""Of a configuration; Zenoh's parser recurses, and overflows its stack where that goes deep."""
 
 
-def configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a member of a session."""
-    queue = {
-        "size": dict.fromkeys(
-            (
-                "control",
-                "real_time",
-                "interactive_high",
-                "interactive_low",
-                "data_high",
-                "data",
-                "data_low",
-                "background",
-            ),
-            16,
-        ),
-        "congestion_control": {"drop": {"wait_before_drop": 0}},
-        "batching": {"enabled": True},
-    }
-    return {
-        "mode": "peer",
-        "listen": {"endpoints": list(listen), "exit_on_failure": True},
-        "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-        },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "unicast": {"open_timeout": 2_000, "accept_timeout": 2_000},
-            "link": {"tx": {"lease": LEASE_MS, "keep_alive": 4, "queue": queue}},
-            "shared_memory": {"enabled": False},
-        },
-    }
+class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
+    """A router that does not answer, or not yet."""
 
 
 class _Ring:
@@ -106,6 +70,10 @@ class _Question:
         self._query = query
         self._key = key
 
+    @property
+    def payload(self) -> bytes:
+        return _sent(self._query)
+
     def answer(self, payload: bytes) -> None:
         with self._query as query:  # a query ends for the asker only when it is dropped
             query.reply(self._key, payload)
@@ -121,23 +89,42 @@ class _QuestionRing:
         return None if query is None else _Question(query, self._key)
 
 
+def _sent(query: zenoh.Query) -> bytes:
+    """Returns what came with a question."""
+    return b"" if query.payload is None else query.payload.to_bytes()
+
+
 class ZenohBus:
     """A `Bus` over a Zenoh session of its own.
 
     Args:
         listen: endpoints to listen at, as in "tcp/127.0.0.1:7447".
-        connect: endpoints to connect to, again and again until they answer.
+        connect: endpoints to connect to, again and again until they answer; a client connects to the first
+            that answers now, and again and again should it lose it.
+        mode: what the session is to Zenoh; peers reach those whom they connect to, clients and routers
+            everyone whom a router reaches.
+        own: settings of a person's own, as `read_zenoh_file` returns them.
 
     Raises:
         UsageError: an endpoint is malformed, or cannot be listened at.
+        RouterSilent: a client's router does not answer.
     """
 
-    def __init__(self, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        listen: Sequence[Endpoint] = (),
+        connect: Sequence[Endpoint] = (),
+        mode: Mode = "peer",
+        own: Mapping[str, Any] | None = None,
+    ) -> None:
+        zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # says nothing without RUST_LOG
         try:
-            config = zenoh.Config.from_json5(json.dumps(configuration(listen, connect)))
+            config = zenoh.Config.from_json5(json.dumps(configuration(listen, connect, mode, own)))
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
-            raise UsageError(_open_problem(str(error), listen, connect)) from None
+            if mode == "client" and "Unable to connect" in str(error):
+                raise RouterSilent(f"no router answers at {_places(connect)}") from None
+            raise UsageError(_open_problem(error, listen, connect)) from None
         self._kept: list[Any] = []
         self._tokens: set[str] = set()
 
@@ -161,15 +148,21 @@ class ZenohBus:
             )
         )
 
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+        """See `Bus`."""
+        ring = StampingRing(now_ns, capacity)
+        self._call(key, lambda sample: ring.take(sample.payload.to_bytes()))
+        return ring
+
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
+        self._call(key, lambda sample: callback(str(sample.key_expr), sample.payload.to_bytes()))
 
-        def forward(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr), sample.payload.to_bytes())
-
+    def _call(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
+        """Calls back as messages come, in the thread that received them."""
         self._kept.append(
             self._session.declare_subscriber(
-                key, handlers.Callback(forward, indirect=False), allowed_origin=Locality.REMOTE
+                key, handlers.Callback(callback, indirect=False), allowed_origin=Locality.REMOTE
             )
         )
 
@@ -180,7 +173,22 @@ class ZenohBus:
             key,
         )
 
-    def ask(self, key: str) -> Inbox:
+    def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
+        """See `Bus`."""
+
+        def at_once(query: zenoh.Query) -> None:
+            with query:  # a query ends for the asker only when it is dropped
+                payload = answer(_sent(query))
+                if payload is not None:
+                    query.reply(key, payload)
+
+        self._kept.append(
+            self._session.declare_queryable(
+                key, handlers.Callback(at_once, indirect=False), allowed_origin=Locality.REMOTE
+            )
+        )
+
+    def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
         return _Replies(
             self._session.get(
@@ -190,6 +198,10 @@ class ZenohBus:
                 consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
                 timeout=ASK_TIMEOUT_S,
                 allowed_destination=Locality.REMOTE,
+                payload=payload,
+                # answers take these from the question: nobody who answers waits for an asker that hangs
+                congestion_control=CongestionControl.DROP,
+                priority=Priority.REAL_TIME,
             )
         )
 
@@ -212,13 +224,66 @@ class ZenohBus:
         self._kept.clear()
 
 
-def _open_problem(error: str, listen: Sequence[str], connect: Sequence[str]) -> str:
+def read_zenoh_file(path: Path) -> ZenohFile:
+    """Returns a person's own Zenoh configuration.
+
+    Args:
+        path: a file of Zenoh's own kind, JSON5 or JSON.
+
+    Raises:
+        UsageError: it cannot be read, is no configuration, or contradicts what a session needs.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: is no text in UTF-8") from None
+    return understood(str(path), _parsed(str(path), text), _refusal)
+
+
+def _parsed(source: str, text: str) -> object:
+    """Returns what JSON5 says, by Zenoh's own parser: its `metadata` may be anything."""
+    if max(accumulate((c in "[{") - (c in "]}") for c in text), default=0) > MAX_DEPTH:
+        raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
+    try:
+        config = zenoh.Config.from_json5(f"{{metadata: [\n{text}\n]}}")
+    except zenoh.ZError as error:
+        place = re.search(r"--> (\d+):(\d+)", str(error))
+        expected = re.search(r"= (expected .*)", str(error))
+        where = f"line {int(place[1]) - 1}, column {place[2]}: " if place else ""
+        raise UsageError(
+            f"{source}: {where}no JSON5: {expected[1] if expected else _reason(error)}"
+        ) from None
+    objects: list[object] = json.loads(config.get_json("metadata"))
+    if len(objects) != 1:
+        raise UsageError(f"{source}: a Zenoh configuration is one object in braces; here are {len(objects)}")
+    return objects[0]
+
+
+def _refusal(settings: Mapping[str, Any]) -> str:
+    """Says why Zenoh refuses a configuration; "" where it takes it."""
+    try:
+        zenoh.Config.from_json5(json.dumps(settings))
+    except zenoh.ZError as error:
+        return _reason(error)
+    return ""
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """Puts what Zenoh says into one line, without the lines of its source."""
+    return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
+
+
+def _places(endpoints: Sequence[Endpoint]) -> str:
+    return ", ".join(map(str, endpoints))
+
+
+def _open_problem(error: zenoh.ZError, listen: Sequence[Endpoint], connect: Sequence[Endpoint]) -> str:
     """Puts Zenoh's refusal to open a session into one sentence."""
-    endpoints = ", ".join([*listen, *connect])
-    if "in use" in error or "AddrInUse" in error:
+    if "in use" in str(error) or "AddrInUse" in str(error):
         return (
-            f"cannot listen at {', '.join(listen)}: the port is in use; "
+            f"cannot listen at {_places(listen)}: the port is in use; "
             "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
         )
-    reason = re.sub(r" at /\S+:\d+\.?", "", error.splitlines()[0])[:300]
-    return f"cannot open a Zenoh session with {endpoints}: {reason}"
+    return f"cannot open a Zenoh session with {_places([*listen, *connect])}: {_reason(error)}"

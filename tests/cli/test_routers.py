@@ -1,0 +1,79 @@
+"""Routers and Zenoh configurations of one's own, as options: bad input is one line and exit code 2."""
+
+from pathlib import Path
+
+import pytest
+
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus
+
+from .running import trilat
+
+COMMANDS = [
+    ("site", "m", "--scenario", "two_sites"),
+    ("record", "--session", "t"),
+    ("router",),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    ("text", "facts"),
+    [
+        (None, ["No such file or directory"]),
+        ("{mode: ", ["line 2, column 1: no JSON5"]),
+        ("{mod: 'peer'}", ["mod: no key of Zenoh's; did you mean mode?"]),
+        (
+            "{transport: {link: {tx: {queue: {size: {real_time: 2}}}}}}",
+            ["transport/link/tx/queue/size/real_time: 2 must be 16"],
+        ),
+        ("{scouting: {multicast: {enabled: true}}}", ["scouting/multicast/enabled: true must be false"]),
+        (
+            "{transport: {link: {tls: {root_ca_certificate: 'none.pem'}}}}",
+            ["transport/link/tls/root_ca_certificate: none.pem cannot be read"],
+        ),
+    ],
+    ids=["missing", "torn", "unknown key", "short queue", "multicast", "no certificate"],
+)
+def test_a_bad_configuration_is_refused_in_one_line(
+    command: tuple[str, ...], text: str | None, facts: list[str], tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / "mine.json5").write_text(text)
+    done = trilat(*command, "--zenoh-config", "mine.json5", cwd=tmp_path)
+    done.refuses("mine.json5: ", *facts)
+    assert done.out == ""
+
+
+@pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    ("options", "fact"),
+    [
+        (["--router", "tcp/127.0.0.1:1", "--listen", "tcp/127.0.0.1:2"], "listens nowhere"),
+        (["--router", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"], "leave out --connect"),
+        (["--router", "nonsense"], "an endpoint is like tcp/192.0.2.1:7447, not 'nonsense'"),
+    ],
+)
+def test_a_router_goes_alone(command: tuple[str, ...], options: list[str], fact: str, tmp_path: Path) -> None:
+    trilat(*command, *options, cwd=tmp_path).refuses("--router: ", fact)
+
+
+def test_a_router_that_does_not_answer_is_named(tmp_path: Path) -> None:
+    (endpoint,) = free_endpoints(1)
+    done = trilat(*COMMANDS[1], "--router", endpoint, "--join-timeout", "0", cwd=tmp_path)
+    done.refuses(f"no router answers at {endpoint} within 0 s")
+    assert not (tmp_path / "t.mcap").exists()
+
+
+def test_a_router_on_a_busy_port_says_so(tmp_path: Path) -> None:
+    (endpoint,) = free_endpoints(1)
+    other = ZenohBus([endpoint])
+    try:
+        trilat("router", "--listen", endpoint, cwd=tmp_path).refuses(f"{endpoint}: the port is in use")
+    finally:
+        other.close()
+
+
+@pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
+def test_a_time_that_is_none_is_refused_by_its_name(seconds: str, tmp_path: Path) -> None:
+    trilat("router", "--until-idle", seconds, cwd=tmp_path).refuses("--until-idle is a number of seconds")

@@ -1,0 +1,50 @@
+"""Certificates of a test's own: an authority, and one key for this machine that it has signed."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+NAMES = "subjectAltName=DNS:localhost,IP:127.0.0.1"
+
+
+class Certificates:
+    """Files of an authority and of a machine, made by `openssl`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.authority, self.certificate, self.key = (
+            folder / name for name in ("ca.pem", "machine.pem", "machine.key")
+        )
+        if shutil.which("openssl") is None:
+            pytest.skip("there is no openssl to make certificates with")
+        request = folder / "machine.csr"
+        extension = folder / "machine.ext"
+        extension.write_text(NAMES)
+        new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+        openssl(
+            *("req", "-x509", *new, "-days", "2", "-subj", "/CN=trilat test authority"),
+            *("-keyout", folder / "ca.key", "-out", self.authority),
+        )
+        openssl(
+            *("req", *new, "-subj", "/CN=machine", "-keyout", self.key, "-out", request),
+        )
+        openssl(
+            *(
+                "x509",
+                "-req",
+                "-in",
+                request,
+                "-days",
+                "2",
+                "-CA",
+                self.authority,
+                "-CAkey",
+                folder / "ca.key",
+            ),
+            *("-CAcreateserial", "-extfile", extension, "-out", self.certificate),
+        )
+
+
+def openssl(*arguments: str | Path) -> None:
+    subprocess.run(["openssl", *arguments], check=True, capture_output=True, timeout=30)

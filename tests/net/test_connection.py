@@ -1,0 +1,149 @@
+"""How a member takes part: what the command line and a file say together."""
+
+import pytest
+
+from trilat_net.errors import SessionError, UsageError
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.connection import Connection, member_connection, open_bus, router_connection
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.zenoh_file import ZenohFile, understood
+
+HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
+A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"
+
+
+def file(**stated: object) -> ZenohFile:
+    return understood("mine.json5", stated, lambda _: "")
+
+
+def member(
+    listen: list[str] | None = None,
+    connect: list[str] | None = None,
+    routers: list[str] | None = None,
+    own: ZenohFile | None = None,
+) -> Connection:
+    return member_connection(listen, connect, routers, own, HERE, THERE)
+
+
+def test_who_names_nothing_is_on_this_machine() -> None:
+    assert member() == Connection(HERE, THERE, "peer", {})
+    assert member(own=file(namespace="n")) == Connection(HERE, THERE, "peer", {"namespace": "n"})
+
+
+def test_a_place_that_is_named_replaces_the_one_on_this_machine() -> None:
+    assert member(listen=[A]) == Connection([A], THERE)
+    assert member(connect=[A, B]) == Connection(HERE, [A, B])
+    assert member(listen=[], connect=[]) == Connection([], [])
+    assert member(own=file(listen={"endpoints": [A]})).listen == [A]
+    assert member(own=file(connect={"endpoints": [A]})).connect == [A]
+
+
+def test_connections_of_both_sides_are_united_those_of_the_command_first() -> None:
+    assert member(connect=[B], own=file(connect={"endpoints": [A, B]})).connect == [B, A]
+
+
+def test_places_to_listen_at_are_given_in_one_place() -> None:
+    with pytest.raises(UsageError, match=r"mine\.json5: listen/endpoints: given by --listen too"):
+        member(listen=[A], own=file(listen={"endpoints": [B]}))
+
+
+def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> None:
+    assert member(routers=[A, B]) == Connection((), [A, B], "client", {})
+    stated = file(mode="client", connect={"endpoints": [C]})
+    assert member(routers=[A], own=stated) == Connection((), [A, C], "client", {"connect": {}})
+    assert member(own=stated) == Connection((), [C], "client", {"connect": {}})
+    assert member(connect=[A], own=stated).connect == [A, C]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ({"routers": [A], "listen": [B]}, "--router: a client of a router listens nowhere"),
+        ({"routers": [A], "connect": [B]}, "--router: a client connects to a router only"),
+        ({"routers": [A], "own": file(listen={"endpoints": [B]})}, "--router: a client .* listens nowhere"),
+        ({"routers": [A], "own": file(mode="peer")}, "mine.json5: mode: peer contradicts --router"),
+        ({"own": file(mode="client")}, "mine.json5: mode: client: there is no router to connect to"),
+        (
+            {"own": file(mode="client"), "listen": [A]},
+            "mine.json5: mode: client: a client .* listens nowhere",
+        ),
+        ({"own": file(mode="router")}, "mine.json5: mode: router is for `trilat router`"),
+        *(
+            ({"routers": [endpoint]}, "--router: an endpoint is like tcp/192.0.2.1:7447, not")
+            for endpoint in ("", "nonsense", "tcp/", "tcp/host", "carrier-pigeon/1:2", "192.0.2.1:7447")
+        ),
+    ],
+)
+def test_what_contradicts_itself_is_refused(arguments: dict[str, object], problem: str) -> None:
+    with pytest.raises(UsageError, match=problem):
+        member(**arguments)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [A, "tls/[::1]:7447", "quic/host:7447#iface=eth0", "udp/h:1?rel=0", "unixsock-stream//run/zenoh.sock"],
+)
+def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
+    assert member(routers=[endpoint]).connect == [endpoint]
+
+
+def test_a_router_listens_where_it_is_told_and_may_connect_to_others() -> None:
+    assert router_connection(None, None, None, HERE) == Connection(HERE, (), "router", {})
+    assert router_connection([A], [B], file(mode="router"), HERE) == Connection([A], [B], "router", {})
+    places = {"router": [C], "peer": [B]}
+    assert router_connection(None, None, file(listen={"endpoints": places}), HERE).listen == [C]
+    for mode in ("peer", "client"):
+        with pytest.raises(UsageError, match=f"mine.json5: mode: {mode} must be router here"):
+            router_connection(None, None, file(mode=mode), HERE)
+
+
+class Answering(ManualClock):
+    """A clock on which a router comes, or a signal, after a number of sleeps."""
+
+    def __init__(self, endpoints: list[str], comes_after: int = 0, stops_after: int = 0) -> None:
+        super().__init__()
+        self.sleeps = 0
+        self.router: ZenohBus | None = None
+        self._endpoints, self._comes_after, self._stops_after = endpoints, comes_after, stops_after
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        super().sleep_until(deadline_ns)
+        self.sleeps += 1
+        if self.sleeps == self._comes_after:
+            self.router = ZenohBus(self._endpoints, mode="router")
+
+    def stopped(self) -> bool:
+        return 0 < self._stops_after <= self.sleeps
+
+
+def test_a_router_that_comes_later_is_waited_for() -> None:
+    endpoints = free_endpoints(1)
+    clock, said = Answering(endpoints, comes_after=3), []
+    bus = open_bus(Connection((), endpoints, "client"), clock, clock.stopped, 5.0, said.append)
+    assert bus is not None
+    bus.close()
+    assert clock.router is not None
+    clock.router.close()
+    assert clock.sleeps == 3
+    assert said == [f"no router answers at {endpoints[0]} yet; trying again"]
+
+
+def test_a_router_that_never_comes_is_said_and_a_signal_ends_the_waiting() -> None:
+    endpoints = free_endpoints(2)
+    clock = Answering(endpoints)
+    connection = Connection((), endpoints, "client")
+    with pytest.raises(SessionError, match=f"no router answers at {', '.join(endpoints)} within 1 s"):
+        open_bus(connection, clock, clock.stopped, 1.0, lambda _: None)
+    clock = Answering(endpoints, stops_after=4)
+    assert open_bus(connection, clock, clock.stopped, None, lambda _: None) is None
+    assert clock.sleeps == 4
+
+
+def test_a_peer_waits_for_nobody() -> None:
+    endpoints = free_endpoints(2)
+    clock = Answering(endpoints)
+    bus = open_bus(Connection(endpoints[:1], endpoints[1:]), clock, clock.stopped, 0.0, lambda _: None)
+    assert bus is not None
+    bus.close()
+    assert clock.sleeps == 0

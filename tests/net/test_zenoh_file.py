@@ -1,0 +1,242 @@
+"""What a person's own Zenoh configuration may say, and what it may not."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.errors import UsageError
+from trilat_net.net.zenoh_bus import MAX_DEPTH, read_zenoh_file
+from trilat_net.net.zenoh_config import configuration
+from trilat_net.net.zenoh_file import NEEDS, ZenohFile, understood
+
+SOURCE = "mine.json5"
+
+
+def nested(path: str, value: object) -> Any:
+    """The configuration that states one key."""
+    for key in reversed(path.split("/")):
+        value = {key: value}
+    return value
+
+
+def found(settings: Mapping[str, Any], path: str) -> object:
+    value: Any = settings
+    for key in path.split("/"):
+        value = value[key]
+    return value
+
+
+def checked(stated: object) -> ZenohFile:
+    """What is in a file, checked, with a Zenoh that takes everything."""
+    return understood(SOURCE, stated, lambda _: "")
+
+
+WRONG = {
+    "connect/timeout_ms": 0,
+    "connect/exit_on_failure": True,
+    "listen/timeout_ms": -1,
+    "listen/exit_on_failure": {"peer": False},
+    "scouting/multicast/enabled": True,
+    "scouting/gossip/enabled": True,
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 1000,
+    "transport/link/tx/queue/batching/enabled": False,
+    "transport/link/tx/batch_size": 1400,
+    "transport/link/tx/lease": 500,
+    "transport/unicast/lowlatency": True,
+    "transport/shared_memory/enabled": True,
+    "qos/publication": [{"key_exprs": ["**"], "config": {"congestion_control": "block"}}],
+    "qos/network": [{"messages": ["put"], "flows": ["egress"], "overwrite": {"express": True}}],
+    "downsampling": [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "**", "freq": 1}]}],
+    "low_pass_filter": [{"messages": ["put"], "flows": ["egress"], "key_exprs": ["**"], "size_limit": 1}],
+    **{path: 2 for path in NEEDS if "/queue/size/" in path},
+}
+
+
+def test_there_is_a_wrong_value_for_every_need() -> None:
+    assert set(WRONG) == set(NEEDS)
+
+
+@pytest.mark.parametrize("path", NEEDS)
+def test_what_contradicts_a_need_is_refused_with_key_value_and_what_it_must_be(path: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        checked(nested(path, WRONG[path]))
+    assert str(refused.value).startswith(f"{SOURCE}: {path}: ")
+    assert f" must be {NEEDS[path].must}" in str(refused.value)
+
+
+@given(data=st.data())
+def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject) -> None:
+    """Whatever a file states: it is refused, or the needs hold in the configuration that comes of it."""
+    stated: dict[str, Any] = {}
+    for path in data.draw(st.lists(st.sampled_from(sorted(NEEDS)), max_size=4)):
+        value = data.draw(
+            st.sampled_from([WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"])
+        )
+        merge(stated, nested(path, value))
+    try:
+        file = checked(stated)
+    except UsageError:
+        return
+    settings = configuration([], [], "peer", file.settings)
+    plain = configuration([], [])
+    for path, need in NEEDS.items():
+        try:
+            value = found(settings, path)
+        except KeyError:
+            continue  # neither stated nor set: Zenoh's default is what is needed
+        assert need.holds(value) or value == found(plain, path), path
+
+
+def merge(into: dict[str, Any], more: Mapping[str, Any]) -> None:
+    for key, value in more.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            merge(into[key], value)
+        else:
+            into[key] = value
+
+
+def test_what_a_session_does_not_need_is_taken_as_it_is() -> None:
+    own = checked(
+        {
+            "transport": {
+                "link": {"tx": {"lease": 9_000, "keep_alive": 3}, "protocols": ["tls"]},
+                "unicast": {"open_timeout": 700},
+                "auth": {"usrpwd": {"user": "u", "password": "p"}},
+            },
+            "connect": {"retry": {"period_max_ms": 900}},
+            "access_control": {"enabled": False},
+        }
+    ).settings
+    settings = configuration(["tcp/a:1"], ["tcp/b:1"], "peer", own)
+    assert found(settings, "transport/link/tx/lease") == 9_000
+    assert found(settings, "transport/link/protocols") == ["tls"]
+    assert found(settings, "transport/unicast/open_timeout") == 700
+    assert found(settings, "transport/unicast/accept_timeout") == 2_000
+    assert found(settings, "transport/auth/usrpwd/password") == "p"
+    assert found(settings, "connect/retry") == {
+        "period_init_ms": 100,
+        "period_max_ms": 900,
+        "period_increase_factor": 1.5,
+    }
+    assert found(settings, "connect/endpoints") == ["tcp/b:1"]
+    assert found(settings, "access_control/enabled") is False
+
+
+def test_null_says_nothing() -> None:
+    assert checked({"id": None, "transport": {"link": {"tx": {"lease": None}}}}).settings == {
+        "transport": {"link": {"tx": {}}}
+    }
+
+
+def test_endpoints_and_mode_are_apart_and_may_depend_on_the_mode() -> None:
+    file = checked(
+        {
+            "mode": "client",
+            "connect": {"endpoints": ["tcp/a:1"]},
+            "listen": {"endpoints": {"router": ["tcp/b:1"], "peer": "tcp/c:1"}},
+        }
+    )
+    assert file.mode == "client"
+    assert file.settings == {"connect": {}, "listen": {}}
+    assert file.endpoints("connect", "peer") == ["tcp/a:1"]
+    assert file.endpoints("listen", "router") == ["tcp/b:1"]
+    assert file.endpoints("listen", "peer") == ["tcp/c:1"]
+    assert file.endpoints("listen", "client") is None
+    assert ZenohFile("").endpoints("listen", "peer") is None
+
+
+def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path: Path) -> None:
+    key = "transport/link/tls/root_ca_certificate"
+    with pytest.raises(UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"):
+        checked(nested(key, f"{tmp_path}/none.pem"))
+    with pytest.raises(UsageError, match="dictionary_file"):
+        checked(nested("transport/auth/usrpwd/dictionary_file", str(tmp_path)))
+    (tmp_path / "ca.pem").write_text("")
+    assert checked(nested(key, f"{tmp_path}/ca.pem")).settings
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "a Zenoh configuration is one object in braces; here are 0"),
+        ("// only a comment", "here are 0"),
+        ("{}, {}", "here are 2"),
+        ("[1]", r"a Zenoh configuration is one object in braces, not \[1\]"),
+        ("3", "not 3"),
+        ("{\n  mode: 'peer',\n  a: [1\n}", "line 3, column 7: no JSON5: expected"),
+        ("{mode:", "line 2, column 1: no JSON5: expected"),
+        ("[" * 100_000, f"no JSON5: nested deeper than {MAX_DEPTH}"),
+        ("{foo: 1}", "foo: no key of Zenoh's; there are id, metadata, mode"),
+        ("{mod: 'peer'}", r"mod: no key of Zenoh's; did you mean mode\?"),
+        (
+            "{transport: {link: {tls: {root_ca_cert: 'x'}, tx: {lease: 9000}}}}",
+            r"transport/link/tls/root_ca_cert: no key of Zenoh's; did you mean root_ca_certificate\?",
+        ),
+        (
+            "{transport: {link: {tx: {keep_alive: 'x'}}}}",
+            "transport/link/tx/keep_alive: error parsing number",
+        ),
+        ("{transport: 3}", "transport: invalid type"),
+        ("{mode: 'pear'}", "mode: unknown variant `pear`, expected one of `router`, `peer`, `client`"),
+        ("{connect: {endpoints: {pear: []}}}", r"connect/endpoints/pear: no key .*did you mean peer\?"),
+        ("{connect: {endpoints: ['nope']}}", "connect/endpoints: Endpoints must be of the form <protocol>"),
+        ("{access_control: {rules: [{id: 'x'}]}}", "access_control/rules: missing field `key_exprs`"),
+        ("{transport: {link: {tx: {lease: 500}}}}", "transport/link/tx/lease: 500 must be 5000 or more"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line_that_names_file_and_place(
+    text: str, problem: str, tmp_path: Path
+) -> None:
+    path = tmp_path / SOURCE
+    path.write_text(text)
+    with pytest.raises(UsageError, match=problem) as refused:
+        read_zenoh_file(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+    assert "/root/" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"), [(None, "No such file"), (b"\xff\xfe{}", "no text in UTF-8"), (b"", "here are 0")]
+)
+def test_a_file_that_cannot_be_read_is_named(content: bytes | None, problem: str, tmp_path: Path) -> None:
+    path = tmp_path / SOURCE
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UsageError, match=f"{path}: .*{problem}"):
+        read_zenoh_file(path)
+    with pytest.raises(UsageError, match="Is a directory"):
+        read_zenoh_file(tmp_path)
+
+
+def test_json5_is_read_as_zenoh_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / SOURCE
+    path.write_text(
+        "\ufeff{ // comment\n 'mode': \"client\", transport: {link: {tx: {lease: 0x1f40,},},}, }\n//"
+    )
+    file = read_zenoh_file(path)
+    assert (file.source, file.mode) == (str(path), "client")
+    assert file.settings == {"transport": {"link": {"tx": {"lease": 8000}}}}
+
+
+def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
+    """A configuration of ours is one of Zenoh's: all its keys exist there."""
+    path = tmp_path / SOURCE
+    for mode in ("peer", "client", "router"):
+        settings = configuration([], [], mode)
+        for side in ("listen", "connect"):
+            settings[side] = {
+                key: settings[side][key] for key in settings[side] if key in ("endpoints", "retry")
+            }
+        path.write_text(str(settings).replace("True", "true").replace("False", "false"))
+        assert read_zenoh_file(path).mode == mode
+
+
+def test_nothing_is_found_that_was_not_named() -> None:
+    settings = configuration(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
+    assert settings["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    assert settings["transport"]["shared_memory"] == {"enabled": False}

@@ -1,0 +1,55 @@
+"""The offset in force: what turns another clock's stamps into own ones while a session runs.
+
+Law: it never steps. It is continuous and piecewise linear: towards each new estimate it goes in BEND_NS, and
+from there along the estimate's drift. Its bound is that of the estimate around the value in force, so it is
+honest on the way too.
+"""
+
+from ..core.grid import NS_PER_S
+from .offset import Estimate
+
+BEND_NS = 1_000_000_000
+"""How long it takes to reach a new estimate."""
+
+
+class Course:
+    """An offset over time, the other clock minus the own one.
+
+    Args:
+        estimate: what it begins with.
+
+    Attributes:
+        estimate: what it goes by.
+        bound_ns: how far it is from the offset at most, from its last bend on for BEND_NS; then it grows.
+    """
+
+    def __init__(self, estimate: Estimate) -> None:
+        self.estimate = estimate
+        self._follow(estimate.at_ns, estimate.offset_ns, estimate)
+
+    def bend(self, at_ns: int, estimate: Estimate) -> None:
+        """Goes by a new estimate from an instant of the own clock on."""
+        self._follow(at_ns, self.at(at_ns), estimate)
+
+    def _follow(self, at_ns: int, offset_ns: int, estimate: Estimate) -> None:
+        self.estimate = estimate
+        self._joined_ns = at_ns + BEND_NS
+        self._joined_offset_ns = estimate.offset_at(self._joined_ns)
+        self._approach = (self._joined_offset_ns - offset_ns) / BEND_NS
+        self._drift = estimate.drift / NS_PER_S
+        self.bound_ns = max(
+            estimate.bound_at(at_ns, offset_ns),
+            estimate.bound_at(self._joined_ns, self._joined_offset_ns),
+        )
+
+    def at(self, at_ns: int) -> int:
+        """Returns the offset in force at an instant of the own clock, ns."""
+        passed_ns = at_ns - self._joined_ns
+        slope = self._approach if passed_ns < 0 else self._drift
+        return self._joined_offset_ns + int(passed_ns * slope)
+
+    def bound_at(self, at_ns: int) -> int:
+        """Returns how far the offset in force can be from the true one at an instant, ns."""
+        if at_ns <= self._joined_ns:
+            return self.bound_ns
+        return self.estimate.bound_at(at_ns, self.at(at_ns))

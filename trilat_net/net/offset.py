@@ -1,0 +1,206 @@
+"""Where another clock stands: its offset and drift, from stamps that crossed a network.
+
+Law: every bound is proved by stamps, whatever the delays were and however unequal the two ways. A message is
+never received before it was sent, so that with offset = other clock - own clock
+
+    offset <= (their reading on receiving) - (own reading on sending): a ceiling, when the own clock sent;
+    offset >= (their reading on sending) - (own reading on receiving): a floor, when the own clock received.
+
+A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their middle is its
+offset, their distance its round trip, half of that its bound. Of each window the lowest ceiling and the
+highest floor are kept; they need not be of one exchange, so the bound is half the smallest way there plus
+half the smallest way back. Over the windows the offset is a line; lines through all ceilings and floors are
+the ones that may be, and what they span now is the bound. Assumed of the clocks: they drift apart by less
+than DRIFT_LIMIT, and over the windows kept along a line up to WANDER.
+"""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.grid import NS_PER_S
+
+WINDOWS = 60
+"""Windows that are kept."""
+DRIFT_LIMIT = 500_000.0
+"""Largest drift of one clock against another, ns/s."""
+WANDER = 1_000.0
+"""How far the drift may be from its mean over the windows kept, ns/s."""
+_NOISE_NS = 3_000.0
+_PRIOR = 100_000.0  # of the drift, ns/s: decides only while the windows span less than a second
+_ROUNDS = 3
+
+Array = NDArray[np.float64]
+
+
+class Limit(NamedTuple):
+    """What an offset is at most (a ceiling) or at least (a floor).
+
+    Attributes:
+        at_ns: when, on the own clock.
+        offset_ns: the limit.
+    """
+
+    at_ns: int
+    offset_ns: int
+
+
+class Estimate(NamedTuple):
+    """What is known of an offset at an instant.
+
+    Attributes:
+        at_ns: that instant, on the own clock.
+        offset_ns: the other clock minus the own one.
+        drift: by how much it grows, ns/s.
+        low_ns: what the offset is at least.
+        high_ns: what it is at most.
+        drift_low: what the drift is at least, ns/s.
+        drift_high: what it is at most, ns/s.
+    """
+
+    at_ns: int
+    offset_ns: int
+    drift: float
+    low_ns: int
+    high_ns: int
+    drift_low: float
+    drift_high: float
+
+    def offset_at(self, at_ns: int) -> int:
+        """Returns the offset at another instant, ns."""
+        return self.offset_ns + round((at_ns - self.at_ns) * self.drift / NS_PER_S)
+
+    def including(self, *limits: Limit | None) -> "Estimate":
+        """Returns the same with limits that contradict it inside what is possible."""
+        offsets = [limit.offset_ns for limit in limits if limit is not None]
+        return self._replace(low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets]))
+
+    def bound_at(self, at_ns: int, offset_ns: int) -> int:
+        """Returns how far the offset can be from a value at another instant, ns."""
+        passed_s = (at_ns - self.at_ns) / NS_PER_S
+        up, down = self.drift_high, self.drift_low
+        if passed_s < 0.0:
+            up, down = down, up
+        above = self.high_ns - offset_ns + passed_s * up
+        below = offset_ns - self.low_ns - passed_s * down
+        return max(0, math.ceil(max(above, below)))
+
+
+def known(offset_ns: int) -> Estimate:
+    """Returns the estimate where both clocks are one: exact, and for ever."""
+    return Estimate(0, offset_ns, 0.0, offset_ns, offset_ns, 0.0, 0.0)
+
+
+def offset_text(offset_ns: int, bound_ns: int) -> str:
+    """Returns an offset and its bound for people."""
+    return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
+
+
+class OffsetEstimator:
+    """The ceilings and floors of one clock, and the line between them.
+
+    Attributes:
+        broken: how often the limits contradicted each other, so that old ones had to go: a clock stepped,
+            or was slewed harder than DRIFT_LIMIT.
+    """
+
+    def __init__(self) -> None:
+        self.broken = 0
+        self._ceilings: deque[Limit] = deque(maxlen=WINDOWS)
+        self._floors: deque[Limit] = deque(maxlen=WINDOWS)
+
+    def add(self, ceiling: Limit | None, floor: Limit | None) -> None:
+        """Takes what one window says; None where nothing came on that way."""
+        if ceiling is not None:
+            self._ceilings.append(ceiling)
+        if floor is not None:
+            self._floors.append(floor)
+
+    def estimate(self, now_ns: int) -> Estimate | None:
+        """Returns what is known now, or None where one of the ways has said nothing yet.
+
+        Args:
+            now_ns: the own clock, at or after every window.
+        """
+        while self._ceilings and self._floors:
+            lines = _Lines(self._ceilings, self._floors, now_ns)
+            if lines.possible:
+                return lines.estimate()
+            self.broken += 1
+            self._forget()
+        return None
+
+    def _forget(self) -> None:
+        """Drops the older half of the limits, or all that are left."""
+        kept = max(len(self._ceilings), len(self._floors)) // 2
+        for limits in (self._ceilings, self._floors):
+            while len(limits) > kept:
+                limits.popleft()
+
+
+class _Lines:
+    """All lines under every ceiling and over every floor; times are s from now, values ns from a base."""
+
+    def __init__(self, ceilings: deque[Limit], floors: deque[Limit], now_ns: int) -> None:
+        self._now_ns, self._base_ns = now_ns, ceilings[-1].offset_ns
+        self._above_s, self._above = self._columns(ceilings)
+        self._below_s, self._below = self._columns(floors)
+        self._widest = self._above - WANDER * self._above_s
+        self._lowest = self._below + WANDER * self._below_s
+        apart_s = self._above_s[:, None] - self._below_s[None, :]
+        room = self._widest[:, None] - self._lowest[None, :]
+        slopes = np.divide(room, apart_s, out=np.zeros_like(room), where=apart_s != 0.0)
+        self.steepest = float(np.min(slopes, where=apart_s > 0.0, initial=DRIFT_LIMIT))
+        self.flattest = float(np.max(slopes, where=apart_s < 0.0, initial=-DRIFT_LIMIT))
+        touching = np.min(room, where=apart_s == 0.0, initial=0.0)
+        self.possible = bool(touching >= 0.0 and self.flattest <= self.steepest)
+
+    def _columns(self, limits: deque[Limit]) -> tuple[Array, Array]:
+        times = np.array([min(0, limit.at_ns - self._now_ns) for limit in limits], dtype=np.float64)
+        values = np.array([limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64)
+        return times / NS_PER_S, values
+
+    def estimate(self) -> Estimate:
+        """Returns the line in the middle, and what all lines span now."""
+        slope = min(max(self._slope(), self.flattest), self.steepest)
+        middle = 0.5 * (
+            np.min(self._widest - slope * self._above_s) + np.max(self._lowest - slope * self._below_s)
+        )
+        # now lies behind every limit: the highest value is the steepest line's, the lowest the flattest's
+        high = np.min(self._widest - self.steepest * self._above_s)
+        low = np.max(self._lowest - self.flattest * self._below_s)
+        return Estimate(
+            self._now_ns,
+            self._base_ns + round(middle),
+            slope,
+            self._base_ns + int(np.floor(low)),
+            self._base_ns + int(np.ceil(high)),
+            self.flattest - WANDER,
+            self.steepest + WANDER,
+        )
+
+    def _slope(self) -> float:
+        """Returns the drift: least squares of one slope for ceilings and floors.
+
+        A window in which nothing came through quickly says little: it weighs by how far it is from the
+        best, which depends on the slope, hence some rounds.
+        """
+        slope, drift_weight = 0.0, _PRIOR**-2
+        for n in range(_ROUNDS):
+            numerator, denominator = 0.0, drift_weight
+            for times, values, side in (
+                (self._above_s, self._above, 1.0),
+                (self._below_s, self._below, -1.0),
+            ):
+                level = side * (values - slope * times)
+                excess = (level - level.min()) if n else np.zeros_like(level)
+                weights = (excess + _NOISE_NS) ** -2.0
+                total = weights.sum()
+                from_mean = times - (weights * times).sum() / total
+                numerator += float((weights * from_mean * values).sum())
+                denominator += float((weights * from_mean**2).sum())
+            slope = numerator / denominator
+        return slope

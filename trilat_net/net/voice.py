@@ -1,0 +1,51 @@
+"""One start of a member: its boot, its token, and what it says of itself."""
+
+import secrets
+
+import msgspec
+
+from . import topics
+from .bus import Bus
+from .messages import Event, Info
+from .wire import encode
+
+
+def new_boot() -> int:
+    """Returns a random number that names one start of one process."""
+    return secrets.randbits(64)
+
+
+def token(session: str, member: str, boot: int) -> str:
+    """Returns the liveliness token of one start of a member."""
+    return topics.key(session, member, topics.ALIVE) + f"/{boot}"
+
+
+class Voice:
+    """A member's own events and answers.
+
+    Args:
+        bus: its connection.
+        session: the session's name.
+        info: what it answers when asked who it is.
+
+    Attributes:
+        info: what it answers when asked who it is.
+    """
+
+    def __init__(self, bus: Bus, session: str, info: Info) -> None:
+        self.info = info
+        self._publish = bus.publisher(topics.key(session, info.member, topics.EVENT))
+        self._questions = bus.questions(topics.key(session, info.member, topics.INFO))
+
+    def say(self, kind: str, text: str, **facts: object) -> Event:
+        """Publishes an event and returns it."""
+        event = msgspec.convert(
+            {"member": self.info.member, "boot": self.info.boot, "kind": kind, "text": text, **facts}, Event
+        )
+        self._publish(encode(event))
+        return event
+
+    def answer(self) -> None:
+        """Answers who asks who this is."""
+        while (question := self._questions.poll()) is not None:
+            question.answer(encode(self.info))
