@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from ..errors import RunFailed, UsageError
+from ..errors import UsageError
 from .options import ConnectOption, RouterOption, ZenohConfigOption, chosen_connection, out
 
 app = typer.Typer(no_args_is_help=True)
@@ -116,5 +116,5 @@ def _place(context: typer.Context, site: str, order: dict[str, Any]) -> None:
         connection, SystemClock(), session, site, Order(**order), lambda text: parse(text, session).names
     )
     if not reply.accepted:
-        raise RunFailed(f"refused: {reply.text}")
+        raise UsageError(f"refused: {reply.text}")
     out.print(escape(reply.text), soft_wrap=True)

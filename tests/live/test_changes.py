@@ -1,0 +1,56 @@
+"""Changes while a session runs: by its scenario's timeline and by `trilat set`; the run is reproduced bit for bit."""
+
+from tests.cli.running import trilat
+from trilat_net.core.tick import Mode
+
+from .processes import Session, Stage, connections, equal_to_virtual_time, executed_again, whole
+
+PAPER = ("m1", "m2", "s")
+SCRIPT = """
+timeline=[
+{at_s=0.5, link="m1->s", to={delay_ms=250.0, loss=0.1}},
+{at_s=1.0, dominance="s", to={m1=0.9, m2=0.1}, ramp_s=1.0},
+{at_s=1.5, link="s->m1", to={model="gamma", delay_ms=200.0, deviation_ms=20.0, playout_ms=150.0}},
+{at_s=2.0, link="m2->m1", to={model="ar1", delay_ms=200.0, deviation_ms=10.0, correlation=0.99}},
+{at_s=2.5, dominance="m1", to={m2=0.2, s=0.8}, ramp_s=0.5},
+{at_s=2.7, dominance="m1", to={m2=1.0}},
+{at_s=3.0, link="m1->s", to={loss=0.2, loss_burst=50.0, loss_bad=0.99}},
+{at_s=3.5, link="s->m2", to={model="sine", delay_ms=300.0, amplitude_ms=100.0, period_s=0.5}},
+{at_s=4.0, link="m1->m2", to={duplicate=0.5, order="in_order"}},
+{at_s=4.5, link="m1->s", to={model="constant", delay_ms=200.0, loss=1.0}},
+]"""
+
+
+def test_a_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
+    """With a stale peer at the end, that a site holds for."""
+    options = ("--set", SCRIPT.strip().replace("\n", ""), "--set", "on_stale.action=hold", "--duration", "6")
+    session = Session(stage, "paper", PAPER, *options)
+    session.all()
+    assert set(session.codes().values()) == {0}
+    log = whole(session.log)
+    assert len(log.scenario.timeline) == 10
+    assert {state.mode for state in log["s"].states} == {Mode.RUN.name.lower(), Mode.HOLD.name.lower()}
+    executed_again(log)
+    equal_to_virtual_time(log)
+
+
+def test_what_is_set_while_it_runs_is_answered_recorded_and_reproduced(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "10")
+    session.all()
+    session.begun()
+    session.recording()
+    to = ("set", "--session", "t", *connections(session.endpoints))
+    link = trilat(*to, "link", "m1->s", "--delay", "350ms", "--loss", "5%", cwd=stage.folder).succeeds()
+    shares = trilat(*to, "dominance", "s", "m1=0.9", "m2=0.1", "--ramp", "0.5s", cwd=stage.folder).succeeds()
+    assert "it holds from tick" in link and "it holds from tick" in shares
+    trilat(*to, "link", "m1->x", "--loss", "5%", cwd=stage.folder).refuses("m1, m2, s")
+    trilat(*to, "link", "x->s", "--loss", "5%", cwd=stage.folder).refuses("did you mean")
+    trilat(*to, "dominance", "s", "m1=0.9", "m2=0.2", cwd=stage.folder).refuses("sum to 1")
+    assert set(session.codes().values()) == {0}
+    log = whole(session.log)
+    taken = {tick: text for tick, texts in log.changes("s").items() for text in texts}
+    assert len(taken) == 2 and not log.changes("m1") and not log.changes("m2")
+    said = [event.command for event in log.events if event.kind == "change"]
+    assert said == [taken[tick] for tick in sorted(taken)]
+    executed_again(log)
+    equal_to_virtual_time(log)
