@@ -10,18 +10,21 @@ One `Site.step`, three drivers: live over a network, in virtual time, and again 
 gives the same numbers bit for bit.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .experiment import open_log, simulate, verify
+    from .trial.running import check
+    from .trial.trial import trials
 
-__all__ = ["open_log", "simulate", "verify"]
+__all__ = ["check", "open_log", "simulate", "trials", "verify"]
+
+_MODULES = {"check": "trial.running", "trials": "trial.trial"}
 
 
 def __getattr__(name: str) -> Any:
     """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
     if name in __all__:
-        from . import experiment
-
-        return getattr(experiment, name)
+        return getattr(import_module(f".{_MODULES.get(name, 'experiment')}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -83,6 +83,16 @@ COMMANDS = {
         ["join-timeout"],
     ),
     "a negative wait": (["record", "--session", "x", "--join-timeout", "-1"], ["join-timeout"]),
+    "a clock that is nowhere": (
+        ["site", "m1", "--scenario", "paper", "--clock-offset-s", "nan"],
+        ["--clock-offset-s", "seconds"],
+    ),
+    "a clock that runs away": (
+        ["record", "--session", "x", "--clock-drift-ppm", "201"],
+        ["--clock-drift-ppm", "-200 to 200"],
+    ),
+    "a ping of no session": (["ping", "--session", "a/*"], ["session", "a/*"]),
+    "too few pings": (["ping", "--count", "0"], ["--count", "5 to 10000"]),
     "a log that is not there": (["verify", "none.mcap"], ["none.mcap", "No such file"]),
     "a directory as a log": (["verify", "."], ["directory"]),
     "a report of nothing": (["report", "none.mcap"], ["none.mcap", "No such file"]),

@@ -10,6 +10,7 @@ COMMANDS = [
     ["demo"],
     ["site"],
     ["record"],
+    ["ping"],
     ["router"],
     ["sim"],
     ["test"],

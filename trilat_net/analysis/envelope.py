@@ -7,12 +7,15 @@ window counts with its largest |e|, not less than `FLOOR_RAD`. A straight line i
 these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of freedom).
 
 GROWS: the lower bound is positive; the maxima of the four quarters of the half rise, each by 1 % or more;
-and the rise does not die away: the last step, in logarithms, is at least three quarters of the first. (A
-disturbance late in the run jumps and falls, a slow step response rises less and less: neither is growth.)
+and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first; or
+at least 0.45 of it where the maxima rise to more than 8/5 in all, as nothing does that begins at zero with
+the run and rises ever more slowly. (A disturbance late in the run jumps and falls, a slow step response dies
+away: neither is growth. A steady drift is, as long as one looks.)
 
-DECAYS: the upper bound is negative, or nothing in the half exceeds `FLOOR_RAD`. STEADY: the upper bound
-excludes that the envelope doubles within the half. Both need that the last quarter of the half does not
-exceed twice the one before. A sustained oscillation of whatever size is steady: bounded, and no more.
+DECAYS: the upper bound is negative and the line falls by 4 % or more over the half, or nothing in the half
+exceeds `FLOOR_RAD`. STEADY: the upper bound excludes that the envelope doubles within the half. Both need
+that the last quarter of the half does not exceed twice the one before. A sustained oscillation of whatever
+size is steady: bounded, and no more.
 
 UNDECIDED: everything else: too short, too irregular, growing but ever more slowly.
 
@@ -36,7 +39,7 @@ _T_QUANTILES = {16: 2.977, 8: 3.707}
 
 _RISE = math.log(1.01)
 _DOUBLE = math.log(2.0)
-_LASTING = 0.75
+_FROM_ZERO = math.log(8.0 / 5.0)
 
 
 class Trend(StrEnum):
@@ -103,17 +106,24 @@ def _judged(maxima: Array, window_s: float) -> Envelope:
     steps = np.diff(quarters)
     if maxima.max() <= FLOOR_RAD:
         trend = Trend.DECAYS
-    elif slope - bound > 0.0 and steps.min() >= _RISE and steps[-1] >= _LASTING * steps[0]:
+    elif slope - bound > 0.0 and steps.min() >= _RISE and _lasts(steps):
         trend = Trend.GROWS
     elif steps[-1] > _DOUBLE:
         trend = Trend.UNDECIDED
-    elif slope + bound < 0.0:
+    elif slope + bound < 0.0 and slope * n <= -4.0 * _RISE:
         trend = Trend.DECAYS
     elif (slope + bound) * n <= _DOUBLE:
         trend = Trend.STEADY
     else:
         trend = Trend.UNDECIDED
     return Envelope(trend, float(slope / window_s))
+
+
+def _lasts(steps: Array) -> bool:
+    """True where a rise, in three steps, is no dying one."""
+    if steps[-1] >= 0.75 * steps[0]:
+        return True
+    return bool(steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0])
 
 
 def _line(values: Array) -> tuple[float, float]:

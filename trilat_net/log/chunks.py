@@ -43,7 +43,7 @@ class Walk:
     Attributes:
         metadata: metadata records seen so far, by name.
         attachments: attachments seen so far, by name.
-        complete: True once the end mark was reached: the file was finished.
+        complete: True once all was read, to the end mark's last byte: the file was finished.
     """
 
     def __init__(self, stream: BinaryIO, name: str) -> None:
@@ -61,6 +61,7 @@ class Walk:
             LogError: the file is no MCAP file, or a chunk is damaged.
         """
         records = StreamReader(self._stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT).records
+        finished = False
         while True:
             try:
                 record = next(records, None)
@@ -69,6 +70,7 @@ class Walk:
                     raise LogError(f"{self._name}: is no MCAP file ({type(error).__name__})") from None
                 return  # torn: what came before is whole
             if record is None:
+                self.complete = finished
                 return
             if isinstance(record, Chunk):
                 data = self._uncompressed(record)
@@ -85,7 +87,7 @@ class Walk:
             elif isinstance(record, Attachment):
                 self.attachments[record.name] = record.data
             elif isinstance(record, Footer):
-                self.complete = True
+                finished = True
 
     def _uncompressed(self, chunk: Chunk) -> bytes:
         """Returns a chunk's records.

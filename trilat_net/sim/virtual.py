@@ -51,7 +51,9 @@ def run(scenario: Scenario, network: Network | None = None, commands: Commands =
     pending = [(0, index, 0) for index in range(len(sites))]  # (t_ns, order, k) of each site's next tick
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
-        place = next((n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0)
+        place = 0
+        if not joined.ready(sites[pending[0][1]].name, pending[0][2]):
+            place = next((n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0)
         t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = joined.deliver(site.name, k)

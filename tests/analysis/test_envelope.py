@@ -1,0 +1,97 @@
+"""The trend of an envelope: of signals whose trend is known by construction, and of none that has none."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trilat_net.analysis.envelope import FLOOR_RAD, Trend, envelope
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.05
+T_S = np.arange(800) * STEP_S
+
+rates = st.floats(0.02, 0.6)
+scales = st.floats(1e-3, 1e3)
+quick = st.floats(3.0, 40.0)  # rad/s: a peak in every window
+phases = st.floats(0.0, 2.0 * math.pi)
+
+
+def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.0) -> Array:
+    """The largest |scale exp(rate t) cos(omega t + phase)| of every step, as a run keeps it."""
+    t_s = np.arange(len(T_S) * 25) * (STEP_S / 25)
+    error = scale * np.exp(rate_per_s * (t_s - 20.0)) * np.abs(np.cos(omega * t_s + phase))
+    largest: Array = error.reshape(len(T_S), -1).max(axis=1)
+    return largest
+
+
+@given(rate=rates, omega=quick, phase=phases)
+def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, phase: float) -> None:
+    found = envelope(T_S, oscillation(rate, omega, phase))
+    assert found.trend is Trend.GROWS
+    assert found.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
+
+
+@given(rate=rates, omega=quick, phase=phases)
+def test_exponential_decay_is_decay(rate: float, omega: float, phase: float) -> None:
+    assert envelope(T_S, oscillation(-rate, omega, phase)).trend is Trend.DECAYS
+
+
+@given(omega=quick, phase=phases, scale=scales)
+def test_a_sustained_oscillation_of_whatever_size_is_steady(omega: float, phase: float, scale: float) -> None:
+    assert envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is Trend.STEADY
+
+
+@given(rate=st.floats(-0.3, 0.3), omega=st.floats(0.0, 40.0), phase=phases, scale=scales)
+def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: float, scale: float) -> None:
+    error = np.maximum(oscillation(rate, omega, phase), 1e-3)
+    found = envelope(T_S, error)
+    larger, slower = envelope(T_S, scale * error), envelope(60.0 * T_S, error)
+    assert larger.trend is slower.trend is found.trend
+    assert larger.rate_per_s == pytest.approx(found.rate_per_s, rel=1e-6, abs=1e-9)
+    assert slower.rate_per_s == pytest.approx(found.rate_per_s / 60.0, rel=1e-6, abs=1e-9)
+
+
+@given(rate=st.floats(-1.0, 1.0), omega=st.floats(0.0, 40.0), phase=phases)
+def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> None:
+    error = oscillation(rate, omega, phase)
+    assert Trend.GROWS not in {envelope(T_S, error).trend} & {envelope(T_S, error[::-1]).trend}
+
+
+@given(at_s=st.floats(20.0, 39.0), height=st.floats(10.0, 1e4), decay=st.floats(0.1, 5.0))
+def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float, decay: float) -> None:
+    since_s = np.maximum(0.0, T_S - at_s)
+    kick = np.where(since_s > 0.0, height * np.exp(-decay * since_s), 0.0)
+    assert envelope(T_S, 1e-3 * (1.0 + kick)).trend is not Trend.GROWS
+
+
+@given(time_constant_s=st.floats(0.5, 1e3))
+def test_a_response_that_settles_is_not_growth(time_constant_s: float) -> None:
+    assert envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not Trend.GROWS
+
+
+def test_what_has_converged_decays_whatever_noise_is_left() -> None:
+    noise = np.random.default_rng(1).uniform(0.0, FLOOR_RAD, len(T_S))
+    assert envelope(T_S, noise).trend is Trend.DECAYS
+    assert envelope(T_S, np.where(T_S < 10.0, 1.0, noise)).trend is Trend.DECAYS
+
+
+def test_of_stationary_noise_next_to_nothing_is_called_growth() -> None:
+    trends = [
+        envelope(T_S, np.exp(0.3 * np.random.default_rng(seed).standard_normal(len(T_S)))).trend
+        for seed in range(300)
+    ]
+    assert trends.count(Trend.GROWS) <= 3
+    assert trends.count(Trend.STEADY) + trends.count(Trend.DECAYS) >= 270
+
+
+@pytest.mark.parametrize("points", [0, 1, 2, 15, 30])
+def test_a_short_run_is_undecided(points: int) -> None:
+    found = envelope(T_S[:points], np.exp(T_S[:points]))
+    assert found.trend is Trend.UNDECIDED
+    assert math.isnan(found.rate_per_s)
+    assert "record longer" in found.trend

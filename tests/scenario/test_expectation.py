@@ -1,0 +1,75 @@
+"""The table [expect]: what may stand in it, what is refused, and that it is part of the scenario's text."""
+
+from typing import Any
+
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Expect, load, parse, template_text
+from trilat_net.scenario.expectation import fault
+
+
+def with_expect(**keys: Any) -> Expect:
+    return load("free", {f"expect.{key}": value for key, value in keys.items()}).expect
+
+
+def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
+    assert not Expect().asks
+    assert not Expect(synchronised_rad=0.5, end_pose_within_rad=0.5).asks
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"stable": True},
+        {"stable": False},
+        {"synchronised_by_s": 0.0},
+        {"late_samples_max": 0},
+        {"no_gaps": True},
+    ],
+    ids=str,
+)
+def test_every_other_key_asks_something_also_where_its_value_is_nothing(keys: dict[str, Any]) -> None:
+    assert Expect(**keys).asks
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "facts"),
+    [
+        ("stabel", True, ["expect.stabel", "did you mean 'stable'"]),
+        ("stable", 1, ["expect.stable", "expected bool"]),
+        ("rms_error_max_rad", -0.1, ["expect.rms_error_max_rad"]),
+        ("rms_error_max_rad", float("nan"), ["expect.rms_error_max_rad", "finite"]),
+        ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
+        ("late_samples_max", 1.5, ["expect.late_samples_max"]),
+        ("end_pose_rad", {"x": [0.0, 0.0]}, ["expect.end_pose_rad.x", "m1, m2, s"]),
+        ("end_pose_rad", {"s": [0.0]}, ["expect.end_pose_rad.s"]),
+        ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
+        ("peak_error_min_rad", 3.0, ["expect.peak_error_min_rad", "peak_error_max_rad"]),
+    ],
+)
+def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, facts: list[str]) -> None:
+    with pytest.raises(ScenarioError) as error:
+        with_expect(**{"peak_error_max_rad": 2.0, key: value})
+    for fact in facts:
+        assert fact in str(error.value)
+
+
+def test_a_pair_of_limits_must_leave_room() -> None:
+    assert fault(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), ["m"]) is None
+    assert fault(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), ["m"]) is not None
+
+
+def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
+    scenario = load("free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False})
+    assert parse(scenario.text).expect == scenario.expect
+    assert scenario.sha256 != load("free").sha256
+
+
+def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
+    commented = template_text().partition("# [expect]")[2].splitlines()[1:]
+    text = template_text() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
+    written = parse(text).expect
+    named = {line.removeprefix("# ").split(" = ")[0] for line in commented if line.startswith("# ")}
+    assert named == set(Expect.__struct_fields__)
+    assert written.asks
