@@ -1,7 +1,7 @@
 """The recorder as one process: from its arguments to its exit code."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ def record_session(
     join_timeout_s: float | None,
     clock: Clock,
     say: Callable[[str], None],
+    afterwards: Callable[[], None] = lambda: None,
 ) -> int:
     """Records one session, as a process of its own.
 
@@ -33,6 +34,8 @@ def record_session(
         join_timeout_s: how long to wait for the session to begin, s, or None.
         clock: the time.
         say: tells a person what happens.
+        afterwards: what to do with the finished log of a session that nobody interrupted. The recorder is a
+            member of the session until that is done: sites that shall stay wait for it.
 
     Returns:
         The exit code: 0, or 128 and the number of the signal that ended it.
@@ -61,7 +64,10 @@ def record_session(
             say("recorder: ended before the session began; nothing was written")
             return interrupt.exit_code
         recording = recorder.record(epoch)
-    say("\n".join(recording.summary()))
+        say("\n".join(recording.summary()))
+        if not interrupt.requested():
+            with suppress(KeyboardInterrupt), interrupt.raising():
+                afterwards()
     if interrupt.requested():
         return interrupt.exit_code
     if problem := recording.problem():

@@ -17,6 +17,7 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import Info
+from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.voice import Voice
 from trilat_net.scenario import parse
@@ -115,6 +116,8 @@ class Recorder:
         with new_file(self._path) as stream:
             recording = Recording(stream, scenario, self._session, epoch, self._voice)
             self._say(f"recorder: the session begins, writing {self._path}")
+            for text in clock_texts(self._joining.pinger, epoch.boots, epoch.mono_ns):
+                self._say(f"recorder: {text}")
             try:
                 self._run(recording)
             finally:

@@ -19,7 +19,11 @@ from trilat_net.scenario import Scenario
 from .tap import Arrived, Tap
 
 SETTLE_NS = 1_000_000_000
-"""How long to wait for what may still be under way once every site has ended or is gone."""
+"""How long to wait for what may still be under way of a site that has ended and is gone."""
+AWAY_NS = 15_000_000_000
+"""How long to wait for a site that is gone without a word: a link that is cut may heal."""
+LAST_NS = 6_000_000_000
+"""How long after the last tick that is due there may still be a site: it stays for 5 s at most."""
 
 
 class Recording:
@@ -41,7 +45,7 @@ class Recording:
         self._ends: dict[str, int] = {}
         self._stored: set[str] = set()
         self._gone: set[str] = set()
-        self._over_since_ns: int | None = None
+        self._gone_since_ns: dict[str, int] = {}
         self._overflowed = 0
         self.dropped: Counter[str] = Counter()
 
@@ -97,16 +101,23 @@ class Recording:
         (self._gone.discard if alive else self._gone.add)(where.member)
 
     def over(self, now_ns: int) -> bool:
-        """True once every site has ended with all its records here, or is gone, and nothing more comes."""
-        sites = set(self._scenario.names)
-        if sites <= self._stored:
+        """True once every site has ended with all its records here, or is gone for good."""
+        left = [self._left(site, now_ns) for site in self._scenario.names]
+        return all(left)
+
+    def _left(self, site: str, now_ns: int) -> bool:
+        """True once nothing more of a site will come."""
+        if site in self._stored:
             return True
-        if not sites <= self._gone | self._stored:
-            self._over_since_ns = None
+        if site not in self._gone:
+            self._gone_since_ns.pop(site, None)
             return False
-        if self._over_since_ns is None:
-            self._over_since_ns = now_ns
-        return now_ns - self._over_since_ns > SETTLE_NS
+        since_ns = self._gone_since_ns.setdefault(site, now_ns)
+        patience_ns = SETTLE_NS
+        if site not in self._ends:
+            end_ns = self._epoch.mono_ns + round(self._scenario.duration_s * 1e9) + LAST_NS
+            patience_ns = max(SETTLE_NS, min(AWAY_NS, end_ns - since_ns))
+        return now_ns - since_ns > patience_ns
 
     def flush(self) -> None:
         """Hands everything so far to the operating system."""

@@ -1,8 +1,5 @@
-"""What a site knows of its peers' clocks when the session begins, and how it says so."""
+"""What a site knows of its peers' clocks when the session begins."""
 
-from collections.abc import Sequence
-
-from trilat_net.net.offset import offset_text
 from trilat_net.net.pinging import Pinger
 from trilat_net.net.session import Epoch
 from trilat_net.net.timing import Peer
@@ -21,14 +18,3 @@ def peers_of(scenario: Scenario, name: str, epoch: Epoch, pinger: Pinger) -> lis
         )
         for peer in scenario.peers(name)
     ]
-
-
-def clock_texts(peers: Sequence[Peer], at_ns: int) -> list[str]:
-    """Returns a sentence for every peer whose clock is another one, as of an instant of the own clock."""
-    texts = []
-    for peer in peers:
-        if peer.estimator is not None:
-            offset_ns = peer.estimate.offset_at(at_ns)
-            bound_ns = peer.estimate.bound_at(at_ns, offset_ns)
-            texts.append(f"clock of {peer.name}: another one, {offset_text(offset_ns, bound_ns)}")
-    return texts

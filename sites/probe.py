@@ -112,7 +112,8 @@ class Probe:
             trips = self.pinger.trips.get(info.boot)
             rtts = tuple(trips.rtts_ns) if trips else ()
             shared = info.clock == own
-            reached.append(Reach(info, rtts, shared, known(0) if shared else trips and trips.latest))
+            estimate = known(0) if shared else trips.latest if trips else None
+            reached.append(Reach(info, rtts, shared, estimate))
         return reached
 
 

@@ -20,6 +20,7 @@ from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock, system_clock
 from trilat_net.net.connection import Connection, open_bus
 from trilat_net.net.messages import Event, Info
+from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.stats import LoopStats
 from trilat_net.net.timing import Timing
@@ -29,7 +30,7 @@ from trilat_net.scenario import Scenario
 
 from . import realtime
 from .changes import Changes
-from .clocks import clock_texts, peers_of
+from .clocks import peers_of
 from .intake import Intake
 from .loop import Ports, run_loop
 from .warming import warm_up
@@ -37,6 +38,7 @@ from .warming import warm_up
 LINGER_S = 5
 POLL_NS = 5_000_000
 LAST_WORD_NS = 100_000_000
+PARTING_NS = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class Options:
         join_timeout_s: how long to wait for the others, s.
         needs_recorder: whether a recorder must be there.
         cpu: the processor to stay on, or None.
+        stay_s: how long to stay afterwards, until the recorder has left, s at most.
         clock_offset_s: injected: how far the clock is ahead of the machine's, s.
         clock_drift_ppm: injected: by how much it runs faster, ppm.
     """
@@ -58,6 +61,7 @@ class Options:
     join_timeout_s: float = 60.0
     needs_recorder: bool = False
     cpu: int | None = None
+    stay_s: float = 0.0
     clock_offset_s: float = 0.0
     clock_drift_ppm: float = 0.0
 
@@ -156,7 +160,7 @@ class Member:
         self._epoch = epoch
         peers = peers_of(self._scenario, self._name, epoch, self._joining.pinger)
         self._timing = Timing(epoch.mono_ns, self._site.rate_hz, peers, self._scenario.names[0])
-        clocks = clock_texts(peers, epoch.mono_ns)
+        clocks = clock_texts(self._joining.pinger, epoch.boots, epoch.mono_ns)
         self._intake.admit([epoch.boots[peer] for peer in self._site.peers], self._timing.meters)
         self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
         obtained = realtime.prepare(self._options.cpu)
@@ -254,6 +258,7 @@ class Member:
         if output is not None and diverged:
             self._voice.say("diverged", diverged_text(self._name, output), t_ns=t_ns, ticks=ticks)
         self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
+        code = self._interrupt.exit_code if self._interrupt.requested() else 0  # later signals end the wait
         if topics.RECORDER in self._epoch.boots:
             self._await_recorder(ticks, t_ns)
         dropped = ", ".join(f"{count} {reason}" for reason, count in self._stats.dropped.items())
@@ -265,21 +270,22 @@ class Member:
             raise RunFailed(diverged_text(self._name, output))
         if self._ended_by:
             raise RunFailed(f"{self._name} ended because {self._ended_by}")
-        return self._interrupt.exit_code if self._interrupt.requested() else 0
+        return code
 
     def _await_recorder(self, ticks: int, t_ns: int) -> None:
         """Waits for the recorder's word that it has every record, at most `LINGER_S`, while it is there."""
         clock = self._clock
         give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-        while clock.monotonic_ns() < give_up_ns:
+        stored = False
+        while clock.monotonic_ns() < give_up_ns and not (stored and self._interrupt.requested()):
             self._voice.answer()
             self._watch(t_ns)
-            if topics.RECORDER in self._gone:  # its last word may still be under way
-                give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_WORD_NS)
-                self._gone.discard(topics.RECORDER)
+            if topics.RECORDER in self._gone:  # its last word may still be under way; or its process ends
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + (PARTING_NS if stored else LAST_WORD_NS))
             for event in _events(self._recorder_events):
                 if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
-                    return
+                    stored = True
+                    give_up_ns = clock.monotonic_ns() + int(self._options.stay_s * 1e9)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
 

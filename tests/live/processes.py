@@ -18,14 +18,14 @@ PATIENCE_S = 60.0
 
 
 class Process:
-    """One process, with what it prints in a file."""
+    """One process, with what it prints in a file; `before` are words before its command."""
 
-    def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
+    def __init__(self, name: str, arguments: Sequence[str], folder: Path, before: Sequence[str] = ()) -> None:
         self.name = name
         self._printed = folder / f"{name}.printed"
         with self._printed.open("wb") as sink:
             self._process = subprocess.Popen(
-                [*COMMAND, *arguments],
+                [*before, *COMMAND, *arguments],
                 cwd=folder,
                 env=PLAIN,
                 stdin=subprocess.DEVNULL,
@@ -95,8 +95,8 @@ class Stage:
         self.folder = folder
         self._started: list[Process] = []
 
-    def start(self, name: str, *arguments: str) -> Process:
-        process = Process(name, arguments, self.folder)
+    def start(self, name: str, *arguments: str, before: Sequence[str] = ()) -> Process:
+        process = Process(name, arguments, self.folder, before)
         self._started.append(process)
         return process
 

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from contextlib import suppress
 
+import msgspec
+
 from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
@@ -50,12 +52,7 @@ class Member:
         if self.epoch is None:
             self.epoch = self.joining.poll()
             if self.epoch is not None:
-                self.voice.info = told(
-                    self.info.member,
-                    self.info.boot,
-                    scenario_sha256=self.info.scenario_sha256,
-                    running=True,
-                )
+                self.voice.info = msgspec.structs.replace(self.info, running=True)
         else:
             self.voice.answer()
 

@@ -1,14 +1,21 @@
-"""One contract for the machine's clocks and for the one that a test moves."""
+"""One contract for the machine's clocks, the one that a test moves, and one that runs beside another."""
 
 import signal
 import subprocess
 import sys
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from trilat_net.net.clock import Clock, ManualClock, SystemClock
+from trilat_net.net.clock import Clock, ManualClock, SkewedClock, SystemClock, system_clock
 
-CLOCKS = {"system": SystemClock, "manual": lambda: ManualClock(5, 1_700_000_000_000_000_000)}
+CLOCKS = {
+    "system": SystemClock,
+    "manual": lambda: ManualClock(5, 1_700_000_000_000_000_000),
+    "skewed system": lambda: SkewedClock(SystemClock(), 3_000_000_000, 100_000),
+    "skewed manual": lambda: SkewedClock(ManualClock(5, 1_700_000_000_000_000_000), -7, -100_000),
+}
 
 
 @pytest.fixture(params=list(CLOCKS))
@@ -51,7 +58,12 @@ def test_the_wall_clock_shows_the_present(clock: Clock) -> None:
 
 def test_identity_is_the_same_every_time(clock: Clock) -> None:
     assert clock.identity()
-    assert clock.identity() == type(clock)().identity()
+    assert clock.identity() == clock.identity()
+
+
+@pytest.mark.parametrize("kind", [SystemClock, ManualClock])
+def test_equal_identities_are_one_clock(kind: type[SystemClock] | type[ManualClock]) -> None:
+    assert kind().identity() == kind().identity()
 
 
 def test_a_manual_clock_moves_only_by_sleeping() -> None:
@@ -79,3 +91,45 @@ def test_processes_of_one_machine_share_their_clock() -> None:
     program = "from trilat_net.net.clock import SystemClock; print(SystemClock().identity())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == SystemClock().identity()
+
+
+skews = st.tuples(st.integers(-(10**16), 10**16), st.integers(-200_000, 200_000))
+
+
+@given(st.integers(0, 10**16), skews, st.integers(0, 10**13))
+def test_a_skewed_clock_is_ahead_by_its_offset_and_runs_faster_by_its_drift(
+    start_ns: int, skew: tuple[int, int], passed_ns: int
+) -> None:
+    true = ManualClock(start_ns)
+    clock = SkewedClock(true, *skew)
+    assert clock.monotonic_ns() == start_ns + skew[0]
+    true.sleep_until(start_ns + passed_ns)
+    ahead_ns = clock.monotonic_ns() - true.monotonic_ns()
+    assert abs(ahead_ns - skew[0] - passed_ns * skew[1] / 1e9) <= 2
+
+
+@given(skews, st.integers(1, 10**12))
+def test_sleeping_on_a_skewed_clock_ends_at_its_deadline_to_the_nanosecond(
+    skew: tuple[int, int], ahead_ns: int
+) -> None:
+    true = ManualClock(10**9)
+    clock = SkewedClock(true, *skew)
+    deadline_ns = clock.monotonic_ns() + ahead_ns
+    clock.sleep_until(deadline_ns)
+    assert 0 <= clock.monotonic_ns() - deadline_ns <= 1
+
+
+def test_a_skewed_clock_says_how_it_is_skewed_and_is_no_other_clock() -> None:
+    true = ManualClock(40)
+    clocks = [SkewedClock(true, 0, 0), SkewedClock(true, 1, 0), SkewedClock(true, 0, 1)]
+    true.sleep_until(41)
+    clocks.append(SkewedClock(true, 0, 0))
+    assert len({true.identity(), *(clock.identity() for clock in clocks)}) == 5
+    assert clocks[1].identity() == "manual, skewed by 1 ns and 0 ns/s since 40 ns"
+    assert {clock.unix_ns() for clock in clocks} == {true.unix_ns()}
+
+
+def test_the_machines_clock_is_skewed_only_where_it_is_asked_for() -> None:
+    assert type(system_clock()) is SystemClock
+    clock = system_clock(1.5, -20.5)
+    assert "skewed by 1500000000 ns and -20500 ns/s since" in clock.identity()

@@ -13,10 +13,23 @@ from hypothesis import strategies as st
 
 from trilat_net.core.tick import Arrival, Mode, Output
 from trilat_net.errors import WireError
-from trilat_net.net.messages import STATE_VECTORS, VERSION, Event, Info, LinkStats, Sample, State, json_schema
+from trilat_net.net.messages import (
+    READABLE,
+    STATE_VECTORS,
+    VERSION,
+    Event,
+    Info,
+    LinkStats,
+    Order,
+    Pong,
+    Reply,
+    Sample,
+    State,
+    json_schema,
+)
 from trilat_net.net.wire import MAX_BYTES, MAX_INFO_BYTES, decode, encode, encode_state
 
-KINDS = (State, Sample, LinkStats, Event, Info)
+KINDS = (State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
 PEERS = ("m2", "s")
 LIMITS = [0.0, -0.0, 5e-324, -2.2e-308, math.pi, 1.7976931348623157e308, -1.7976931348623157e308]
 
@@ -78,6 +91,32 @@ def test_a_record_comes_back_bit_for_bit(
     assert (sample.site, sample.boot, sample.tick) == ("m1", boot, output.tick)
 
 
+instants = st.integers(-(2**59), 2**59 - 1)
+
+
+@given(output=outputs, sent_ns=instants, echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)))
+def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
+    output: Output, sent_ns: int, echo: list[tuple[int, int, int]]
+) -> None:
+    data = encode_state("m1", 1, PEERS, output, [], 0, 0, sent_ns, echo)
+    for kind in (State, Sample):
+        message = decode(data, kind)
+        assert message.sent_ns == sent_ns
+        assert [tuple(entry) for entry in message.echo] == echo
+    virtual = decode(encode_state("m1", 1, PEERS, output, [], 0, 0), State)
+    assert (virtual.sent_ns, virtual.echo) == (output.t_ns, [])
+
+
+def test_a_record_of_the_first_version_is_read_in_files_and_refused_live() -> None:
+    record = msgpack.unpackb(payload(v=1))
+    first = msgpack.packb({name: record[name] for name in record if name not in ("sent_ns", "echo")})
+    assert decode(first, State, READABLE) == msgspec.structs.replace(decode(payload(sent_ns=0), State), v=1)
+    with pytest.raises(WireError) as refused:
+        decode(first, State)
+    assert refused.value.reason == "version"
+    assert VERSION in READABLE
+
+
 @given(output=outputs, came=arrivals)
 def test_msgspec_writes_what_is_read_just_so(output: Output, came: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
@@ -133,6 +172,9 @@ def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
         ({"rx": [[0, 1, 2, 3]]}, "malformed"),
         ({"used": {"m2": 0.5}}, "malformed"),
         ({"stranger": 1}, "malformed"),
+        ({"sent_ns": 2**59}, "malformed"),
+        ({"echo": [[0, 1, 2**60]]}, "malformed"),
+        ({"echo": [[0, 1]]}, "malformed"),
     ],
 )
 def test_what_is_no_record_of_ours_is_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
@@ -239,6 +281,11 @@ def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick:
         late_max_us=1,
         busy_max_us=2,
         overruns=3,
+        offset_us=counts,
+        bound_us=counts,
+        delay_us=counts,
+        grid_error_us=-4,
+        slew_ppb=5,
     )
     assert decode(encode(stats), LinkStats) == stats
     info = Info(

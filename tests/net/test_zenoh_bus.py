@@ -8,7 +8,7 @@ import pytest
 from trilat_net.errors import UsageError
 from trilat_net.net.bus import Bus
 from trilat_net.net.endpoints import free_endpoints
-from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 
 from .networks import Routed, encrypted, meet
 from .waiting import received, until
@@ -53,6 +53,60 @@ def test_a_stranger_without_a_certificate_of_the_authority_does_not_get_in(tmp_p
         router.close()
 
 
+ACCESS = """{
+    transport: { auth: { usrpwd: { user: "router", password: "r", dictionary_file: "USERS" } } },
+    access_control: {
+        enabled: true,
+        default_permission: "deny",
+        rules: [{
+            id: "lab",
+            permission: "allow",
+            flows: ["ingress", "egress"],
+            messages: ["put", "declare_subscriber", "query", "reply", "declare_queryable",
+                       "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"],
+            key_exprs: ["trilat/lab/**"],
+        }],
+        subjects: [{ id: "everybody" }],
+        policies: [{ rules: ["lab"], subjects: ["everybody"] }],
+    },
+}"""
+
+
+def test_a_router_lets_in_who_has_the_password_and_through_what_is_allowed(tmp_path: Path) -> None:
+    users, file = tmp_path / "users.txt", tmp_path / "router.json5"
+    users.write_text("lab:secret\n")
+    file.write_text(ACCESS.replace("USERS", str(users)))
+    endpoints = free_endpoints(1)
+    router = ZenohBus(endpoints, mode="router", own=read_zenoh_file(file).settings)
+    members: list[ZenohBus] = []
+
+    def enter(password: str) -> ZenohBus:
+        member = tmp_path / "member.json5"
+        member.write_text(f"{{transport: {{auth: {{usrpwd: {{user: 'lab', password: '{password}'}}}}}}}}")
+        members.append(ZenohBus([], endpoints, "client", read_zenoh_file(member).settings))
+        return members[-1]
+
+    try:
+        with pytest.raises(RouterSilent, match="or none lets this member in"):
+            enter("guessed")
+        with pytest.raises(RouterSilent):
+            ZenohBus([], endpoints, "client")
+        one, other = enter("secret"), enter("secret")
+        one.announce("trilat/lab/one/alive/1")
+        one.respond("trilat/lab/one/ping", lambda sent: sent)
+        assert until(other.presence("trilat/lab/*/alive/*").poll) == ("trilat/lab/one/alive/1", True)
+        assert until(lambda: answered(other, "trilat/lab/*/ping")) == ("trilat/lab/one/ping", b"?")
+        elsewhere, publish = other.inbox("trilat/elsewhere/state"), one.publisher("trilat/elsewhere/state")
+        publish(b"not allowed")
+        meet(one.publisher("trilat/lab/one/state"), other, "trilat/lab/one/state")
+        publish(b"nor this")
+        meet(one.publisher("trilat/lab/one/event"), other, "trilat/lab/one/event")
+        assert elsewhere.poll() is None
+    finally:
+        for bus in (*members, router):
+            bus.close()
+
+
 def test_messages_go_over_quic_too(tmp_path: Path) -> None:
     network = encrypted("quic", tmp_path)
     try:
@@ -90,11 +144,11 @@ def test_members_meet_again_through_a_router_that_was_started_again(routed: Rout
         return inbox.poll() is not None
 
     until(heard)
-    assert until(lambda: answered(other)) == ("t/one/ping", b"?")
+    assert until(lambda: answered(other, "t/*/ping")) == ("t/one/ping", b"?")
 
 
-def answered(asker: Bus) -> tuple[str, bytes] | None:
-    replies = asker.ask("t/*/ping", b"?")
+def answered(asker: Bus, key: str) -> tuple[str, bytes] | None:
+    replies = asker.ask(key, b"?")
     try:
         return until(replies.poll, timeout_s=0.3)
     except AssertionError:

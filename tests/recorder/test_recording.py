@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from recorder import tap as tap_module
 from recorder.recorder import Recorder
-from recorder.recording import SETTLE_NS, Recording
+from recorder.recording import AWAY_NS, LAST_NS, SETTLE_NS, Recording
 from recorder.tap import Tap
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site import Site
@@ -25,7 +25,7 @@ from trilat_net.net.session import Epoch
 from trilat_net.net.stats import LoopStats
 from trilat_net.net.voice import Voice
 from trilat_net.net.wire import Event, Info, decode, encode, encode_state
-from trilat_net.scenario import load
+from trilat_net.scenario import Scenario, load
 
 SESSION = "t"
 MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
@@ -55,7 +55,7 @@ def end(name: str, ticks: int = TICKS, boot: int | None = None) -> bytes:
 class Desk:
     """A recording into memory, with a clock that the test moves."""
 
-    def __init__(self) -> None:
+    def __init__(self, scenario: Scenario = SCENARIO) -> None:
         self.clock = ManualClock(MONO_NS)
         network = LocalNetwork()
         bus, listener = network.join(), network.join()
@@ -71,7 +71,7 @@ class Desk:
         )
         self.stream = io.BytesIO()
         self.tap = Tap(self.clock)
-        self.recording = Recording(self.stream, SCENARIO, SESSION, EPOCH, Voice(bus, SESSION, info))
+        self.recording = Recording(self.stream, scenario, SESSION, EPOCH, Voice(bus, SESSION, info))
 
     def take(self, name: str, channel: str, *payloads: bytes) -> None:
         """Messages come in, a millisecond after each other, and are written."""
@@ -267,7 +267,9 @@ def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> No
     desk.take("s", topics.STATE, *states("s")[:20])
     desk.recording.presence(alive("s", BOOTS["s"]), False)
     assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + SETTLE_NS + 1)
+    desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)  # a site stays no longer after its last tick
+    assert not desk.over()
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
     assert desk.over()
     assert desk.recording.problem() == "s disappeared after 20 records"
     assert "20 records of a number that it never said" in desk.recording.summary()[1]
@@ -284,6 +286,27 @@ def test_a_site_that_comes_back_in_time_goes_on() -> None:
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
     assert not desk.over()
     desk.whole("s")
+    assert desk.over()
+
+
+@pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, SETTLE_NS), (False, AWAY_NS)])
+def test_a_site_that_is_cut_off_in_a_long_session_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
+    """Even if it is the recorder that is cut off: then all sites are gone at once."""
+    desk = Desk(load("two_sites", {"duration_s": 100.0}))
+    if said_its_end:
+        for name in ("m", "s"):
+            desk.take(name, topics.EVENT, end(name, 1))
+    for name in ("m", "s", "m"):
+        desk.recording.presence(alive(name, BOOTS[name]), False)
+        assert not desk.over()
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns)
+    assert not desk.over()
+    desk.recording.presence(alive("m", BOOTS["m"]), True)
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    assert not desk.over()
+    desk.recording.presence(alive("m", BOOTS["m"]), False)
+    assert not desk.over()
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns + 1)
     assert desk.over()
 
 

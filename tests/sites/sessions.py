@@ -11,6 +11,7 @@ from sites.process import Member, Options
 from trilat_net.interrupt import Interrupt
 from trilat_net.log.reader import Log, open_log
 from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.clock import Clock, SkewedClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State
 from trilat_net.net.wire import decode, encode_state
@@ -35,6 +36,8 @@ class Session:
     interrupts: dict[str, Interrupt] = field(default_factory=dict)
     clocks: dict[str, RelayClock] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
+    skews: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Of members on clocks of their own: how far ahead (ns), and how much faster (ns/s)."""
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
         """Adds a site."""
@@ -47,11 +50,15 @@ class Session:
         """A site's life, from its connection to its exit code."""
         options = Options(SESSION, Connection(), 10.0, needs_recorder)
         interrupt = self.interrupts.get(name, Interrupt())
+        own = self._own(name, clock)
         bus = self.network.join()
         try:
-            return Member(self.scenario, name, options, bus, clock, interrupt, self.said.append).live()
+            return Member(self.scenario, name, options, bus, own, interrupt, self.said.append).live()
         finally:
             bus.close()
+
+    def _own(self, name: str, clock: RelayClock) -> Clock:
+        return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
 
     def recorder(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Adds the recorder."""
@@ -59,7 +66,8 @@ class Session:
         def run(clock: RelayClock) -> Sequence[str]:
             bus = self.network.join()
             try:
-                recorder = Recorder(bus, clock, SESSION, RECORDER_BOOT, self.path, stopped, self.said.append)
+                own = self._own("recorder", clock)
+                recorder = Recorder(bus, own, SESSION, RECORDER_BOOT, self.path, stopped, self.said.append)
                 epoch = recorder.join(30.0)
                 assert epoch is not None
                 recording = recorder.record(epoch)

@@ -57,14 +57,19 @@ def verify(
     ] = False,
 ) -> None:
     """Executes every site again from a log, and compares every computed field of every record."""
+    from ..analysis.notes import run_lines
     from ..conclusion import check_lines
+    from ..experiment import open_log
 
+    log = open_log(file)
     passed = True
-    for line in check_lines(file, virtual=virtual):
+    for line in check_lines(log, virtual=virtual):
         passed &= line.passed
         (out if line.passed else err).print(escape(f"{line.label}: {line.text}"), soft_wrap=True)
     if not passed:
         raise typer.Exit(1)
+    for note in run_lines(log):
+        out.print(escape(note), soft_wrap=True)
 
 
 @app.command(epilog="Example: trilat report run.mcap -o report")

@@ -56,6 +56,13 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def session_name(name: str) -> str:
+    """Refuses what cannot stand in a key."""
+    if not name or not all(c.isalnum() or c in "_-." for c in name):
+        raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
+    return name
+
+
 def finite_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
     """Refuses what is no time to wait."""
     if value is not None and not 0.0 <= value <= 86_400.0:

@@ -18,6 +18,7 @@ from .options import (
     finite_seconds,
     out,
     say,
+    session_name,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def ping(
     connection = chosen_connection(None, connect, router, zenoh_config, [], None)
     clock = system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
-        probe = look(connection, clock, session, count, timeout, interrupt.requested)
+        probe = look(connection, clock, session_name(session), count, timeout, interrupt.requested)
         if probe is None:
             raise typer.Exit(interrupt.exit_code)
     members, links = [_member(reach) for reach in probe.reached()], _links(probe)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from ..errors import UsageError
+from ..errors import RunFailed, UsageError
 from .options import (
     ClockDriftOption,
     ClockOffsetOption,
@@ -26,6 +26,7 @@ from .options import (
     finite_seconds,
     out,
     say,
+    session_name,
 )
 from .show import show_conclusion
 
@@ -92,6 +93,12 @@ def site(
         bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
     ] = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Stay on this processor.")] = None,
+    stay: Annotated[
+        float,
+        typer.Option(
+            "--stay", metavar="S", help="Let the recorder leave first: s at most.", callback=finite_seconds
+        ),
+    ] = 0.0,
     clock_offset: ClockOffsetOption = 0.0,
     clock_drift: ClockDriftOption = 0.0,
     duration: DurationOption = None,
@@ -110,7 +117,7 @@ def site(
 
     chosen = chosen_scenario(scenario, overrides, duration, seed)
     site_named(chosen, name)
-    identity = _session_name(session or chosen.name)
+    identity = session_name(session or chosen.name)
     places = default_endpoints(identity, chosen.names)
     before = chosen.names[: chosen.names.index(name)]
     options = Options(
@@ -121,6 +128,7 @@ def site(
         join_timeout_s=join_timeout,
         needs_recorder=needs_recorder,
         cpu=cpu,
+        stay_s=stay,
         clock_offset_s=clock_offset,
         clock_drift_ppm=clock_drift,
     )
@@ -149,6 +157,9 @@ def record(
     ] = None,
     clock_offset: ClockOffsetOption = 0.0,
     clock_drift: ClockDriftOption = 0.0,
+    concluded: Annotated[
+        bool, typer.Option("--conclude", help="Verify and report it afterwards, in the folder of the log.")
+    ] = False,
     force: ForceOption = False,
 ) -> None:
     """Records one session, from its epoch to its end or to Ctrl-C.
@@ -160,19 +171,31 @@ def record(
     from ..net.clock import system_clock
 
     connection = chosen_connection(listen, connect, router, zenoh_config, [], None)
-    path = output if output is not None else Path(f"{_session_name(session)}.mcap")
+    path = output if output is not None else Path(f"{session_name(session)}.mcap")
     if path.exists() and (not force or path.is_dir()):
         raise UsageError(f"{path}: exists; choose another name, or replace a file with --force")
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
+    page = path.parent / "report.html"
+    if concluded and page.exists() and not force:
+        raise UsageError(f"{page}: exists; give the log a folder of its own, or use --force")
     path.unlink(missing_ok=True)
     clock = system_clock(clock_offset, clock_drift)
-    code = record_session(_session_name(session), path, connection, join_timeout, clock, say)
+    then = (lambda: _conclude(path)) if concluded else lambda: None
+    code = record_session(session_name(session), path, connection, join_timeout, clock, say, then)
     raise typer.Exit(code)
 
 
-def _session_name(name: str) -> str:
-    """Refuses what cannot stand in a key."""
-    if not name or not all(c.isalnum() or c in "_-." for c in name):
-        raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
-    return name
+def _conclude(path: Path) -> None:
+    """Verifies and reports a log, into its own folder."""
+    from ..conclusion import conclude
+    from ..experiment import open_log
+
+    out.print("checking the log and drawing ...")
+    log = open_log(path)
+    conclusion = conclude(log, path.parent)
+    show_conclusion(conclusion)
+    if not conclusion.passed:
+        raise RunFailed(f"{path}: failed a check")
+    if diverged := next((event for event in log.events if event.kind == "diverged"), None):
+        raise RunFailed(f"{path}: {diverged.text}")

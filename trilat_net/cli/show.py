@@ -1,4 +1,4 @@
-"""Prints a conclusion: the table, what was checked, the files."""
+"""Prints a conclusion: the table, what links did, what was checked, the files."""
 
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,8 @@ def show_conclusion(conclusion: "Conclusion") -> None:
     for row in conclusion.rows:
         table.add_row(*row)
     out.print(table)
+    for note in conclusion.notes:
+        out.print(escape(note), soft_wrap=True)
     for line in conclusion.lines:
         mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
         out.print(f"{mark} {escape(line.label)}: {escape(line.text)}", soft_wrap=True)

@@ -3,11 +3,12 @@
 Law (L1): whoever needs the time gets a clock as an argument; integer nanoseconds, never a float.
 """
 
+import platform
 import time
 from pathlib import Path
 from typing import Protocol
 
-from ..core.grid import NS_PER_S
+NS_PER_S = 1_000_000_000  # `core.grid` has it too, but brings the compiler along: a router needs none
 
 
 class Clock(Protocol):
@@ -44,12 +45,12 @@ class SystemClock:
             time.sleep(rest_ns * 1e-9)
 
     def identity(self) -> str:
-        """See `Clock`. On Linux: the boot of the kernel and the time namespace of the process."""
+        """See `Clock`. On Linux: boot of the kernel and time namespace; elsewhere the machine's name."""
         try:
             boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
             namespace = Path("/proc/self/ns/time").readlink().name
         except OSError:
-            return f"process-{time.get_clock_info('monotonic').implementation}"
+            return f"{platform.node()}/{time.get_clock_info('monotonic').implementation}"
         return f"{boot}/{namespace}"
 
 

@@ -103,7 +103,7 @@ class Meter:
         if delay_ns < self._back_ns:
             self._back_ns = delay_ns
             self._floor = Limit(arrived_ns, sent_ns - arrived_ns)
-        if delay_ns < -self.course.bound_ns and delay_ns < -self.course.bound_at(arrived_ns):
+        if delay_ns < 0 and delay_ns < -self.course.bound_at(arrived_ns):
             self.faults += 1
             self.worst_ns = max(self.worst_ns, -delay_ns)
         if self.news is None or sample.tick > self.news[0]:

@@ -5,7 +5,7 @@ that clock stands, to half the round trip, however much the two clocks differ.
 """
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from ..core.grid import NS_PER_S
 from ..errors import WireError
@@ -14,7 +14,7 @@ from .asking import Asking
 from .bus import Bus
 from .clock import Clock
 from .messages import Info, Pong
-from .offset import Estimate, Limit, OffsetEstimator, known
+from .offset import Estimate, Limit, OffsetEstimator, known, offset_text
 from .wire import decode, encode
 
 PINGS = 20
@@ -170,3 +170,15 @@ class Pinger:
         """Returns how long to wait before the next poll, ns: short while answers are under way."""
         under_way = self._clock.monotonic_ns() < self._glance_until_ns
         return min(GLANCE_NS, otherwise_ns) if under_way else otherwise_ns
+
+
+def clock_texts(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> list[str]:
+    """Returns a sentence for every member whose clock is another one, as of an instant of the own clock."""
+    texts = []
+    for name, boot in boots.items():
+        if boot in pinger.trips:
+            estimate = pinger.estimate(boot)
+            offset_ns = estimate.offset_at(at_ns)
+            known_text = offset_text(offset_ns, estimate.bound_at(at_ns, offset_ns))
+            texts.append(f"clock of {name}: another one, {known_text}")
+    return texts

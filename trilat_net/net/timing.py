@@ -63,6 +63,7 @@ class Timing:
             Meter(peer.epoch_ns, peer.place, self._sent, Course(peer.estimate), peer.estimator)
             for peer in peers
         ]
+        self._turn = 0
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
         self._followed: Meter | None = None
         self._leader_epoch_ns = 0
@@ -95,12 +96,10 @@ class Timing:
         Returns:
             What a log should say of it.
         """
-        news = []
+        news: list[News] = []
         due_ns = self.grid.deadline(k)
+        self._estimate(k, now_ns, due_ns, news)
         for n, (name, meter) in enumerate(zip(self._names, self.meters, strict=True)):
-            estimate = meter.close(now_ns, due_ns)
-            if estimate is not None:
-                news.append(_estimated(name, k, due_ns, meter.course))
             if now_ns - self._faults_ns[n] >= FAULT_EVERY_NS and (before_ns := meter.faulty()):
                 self._faults_ns[n] = now_ns
                 news.append(_fault(name, before_ns, meter.course.bound_ns))
@@ -109,6 +108,15 @@ class Timing:
             leader_ns = due_ns + course.at(due_ns) - self._leader_epoch_ns
             self.grid.steer(k, leader_ns - self.grid.nominal(k), course.estimate.drift)
         return news
+
+    def _estimate(self, k: int, now_ns: int, due_ns: int, news: list[News]) -> None:
+        """Lets one peer at a time be estimated anew, in turn, because that takes a part of a tick."""
+        for _ in self.meters:
+            self._turn = (self._turn + 1) % len(self.meters)
+            meter = self.meters[self._turn]
+            if meter.close(now_ns, due_ns) is not None:
+                news.append(_estimated(self._names[self._turn], k, due_ns, meter.course))
+                return
 
     def measured(self, now_ns: int) -> dict[str, Any]:
         """Returns what `LinkStats` says of time, by field, and begins anew."""

@@ -123,7 +123,8 @@ class ZenohBus:
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
             if mode == "client" and "Unable to connect" in str(error):
-                raise RouterSilent(f"no router answers at {_places(connect)}") from None
+                refused = ", or none lets this member in" if own else ""
+                raise RouterSilent(f"no router answers at {_places(connect)}{refused}") from None
             raise UsageError(_open_problem(error, listen, connect)) from None
         self._kept: list[Any] = []
         self._tokens: set[str] = set()

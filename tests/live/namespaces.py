@@ -1,0 +1,144 @@
+"""Machines that are none: network namespaces with addresses of their own, joined by virtual cables.
+
+Law: nothing stays. Every namespace of a test has a name of its own and is removed at the end, whatever
+happens; the machine's own network is not touched.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from itertools import combinations, count
+
+_numbers = count()
+
+
+class NoNamespaces(Exception):  # noqa: N818 - it names a reason
+    """Why there can be none here."""
+
+
+def ip(*words: str) -> None:
+    """Runs the tool `ip`."""
+    done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=30)
+    if done.returncode:
+        raise NoNamespaces(f"ip {' '.join(words)}: {done.stderr.strip()}")
+
+
+class Machines:
+    """Namespaces by the names of their machines.
+
+    Attributes:
+        address: of each machine.
+        centre: the address at which a machine of a star reaches the one in its centre.
+    """
+
+    def __init__(self) -> None:
+        self.address: dict[str, str] = {}
+        self.centre: dict[str, str] = {}
+        self._spaces: dict[str, str] = {}
+
+    def add(self, name: str) -> None:
+        """Adds a machine with no cable in it."""
+        space = f"trilat-{os.getpid()}-{next(_numbers)}"
+        ip("netns", "add", space)
+        self._spaces[name] = space
+        self.ip(name, "link", "set", "lo", "up")
+
+    def ip(self, name: str, *words: str) -> None:
+        """Runs `ip` on a machine."""
+        ip("-n", self._spaces[name], *words)
+
+    def cable(self, one: str, other: str) -> tuple[str, str]:
+        """Joins two machines; returns the names of both ends."""
+        number = next(_numbers)
+        ends = f"t{number}a", f"t{number}b"
+        there = ("netns", self._spaces[other])
+        self.ip(one, "link", "add", ends[0], "type", "veth", "peer", "name", ends[1], *there)
+        return ends
+
+    def on(self, name: str) -> tuple[str, ...]:
+        """The words before a command that is to run on a machine."""
+        return ("ip", "netns", "exec", self._spaces[name])
+
+    def part(self, one: str, other: str) -> None:
+        """Cuts the way between two machines, both directions; the others see nothing of it."""
+        for here, there in ((one, other), (other, one)):
+            self.ip(here, "route", "add", "blackhole", self.address[there])
+
+    def mend(self, one: str, other: str) -> None:
+        """Ends `part`."""
+        for here, there in ((one, other), (other, one)):
+            self.ip(here, "route", "del", "blackhole", self.address[there])
+
+    def remove(self) -> None:
+        """Removes all; cables go with their machines."""
+        for space in self._spaces.values():
+            with suppress(NoNamespaces):
+                ip("netns", "del", space)
+
+
+@contextmanager
+def machines() -> Iterator[Machines]:
+    """Machines that are gone at the end.
+
+    Raises:
+        NoNamespaces: there can be none here.
+    """
+    if shutil.which("ip") is None:
+        raise NoNamespaces("there is no `ip` (iproute2)")
+    if os.geteuid() != 0:
+        raise NoNamespaces("network namespaces need root")
+    made = Machines()
+    try:
+        for name in ("probe", "other probe"):  # as in a container, where root may not
+            made.add(name)
+        made.cable("probe", "other probe")
+        made.ip("probe", "link", "add", "bridge", "type", "bridge")
+        yield made
+    finally:
+        made.remove()
+
+
+def bridged(made: Machines, names: Sequence[str]) -> None:
+    """Machines at one switch, which is a machine too; everybody reaches everybody."""
+    made.add("switch")
+    made.ip("switch", "link", "add", "bridge", "type", "bridge")
+    made.ip("switch", "link", "set", "bridge", "up")
+    for number, name in enumerate(names, 1):
+        made.add(name)
+        port, end = made.cable("switch", name)
+        made.ip("switch", "link", "set", port, "master", "bridge", "up")
+        _number(made, name, end, f"10.77.0.{number}")
+
+
+def starred(made: Machines, centre: str, names: Sequence[str]) -> None:
+    """Machines that reach the one in the centre and nobody else: each is in a network of its own."""
+    made.add(centre)
+    for number, name in enumerate(names, 1):
+        made.add(name)
+        port, end = made.cable(centre, name)
+        made.centre[name] = f"10.77.{number}.254"
+        _number(made, centre, port, made.centre[name])
+        _number(made, name, end, f"10.77.{number}.1")
+
+
+def _number(made: Machines, name: str, end: str, address: str) -> None:
+    made.ip(name, "address", "add", f"{address}/24", "dev", end)
+    made.ip(name, "link", "set", end, "up")
+    made.address[name] = address
+
+
+def reaches(made: Machines, name: str, address: str) -> bool:
+    """Whether a machine has a way to an address: a refused connection is an answer."""
+    program = f"import socket; socket.create_connection(({address!r}, 1), 1)"
+    knock = [*made.on(name), sys.executable, "-c", program]
+    done = subprocess.run(knock, capture_output=True, text=True, timeout=10)
+    assert "unreachable" in done.stderr or "refused" in done.stderr, done.stderr
+    return "refused" in done.stderr
+
+
+def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """All pairs, both ways."""
+    return [pair for two in combinations(names, 2) for pair in (two, two[::-1])]

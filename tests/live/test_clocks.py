@@ -1,0 +1,74 @@
+"""Measured delays against the truth: members on clocks that are seconds apart and drift, on one machine.
+
+All clocks are one underneath, so that the true delay of every sample is known to the nanosecond.
+"""
+
+import json
+
+import numpy as np
+
+from tests.cli.running import trilat
+from tests.truth import judged, offset_errors
+
+from .processes import Session, Stage, connections, equal_to_virtual_time, executed_again, whole
+
+PAPER = ("m1", "m2", "s")
+SKEWS = {
+    "m2": ("--clock-offset-s", "3", "--clock-drift-ppm", "100"),
+    "s": ("--clock-offset-s", "-2", "--clock-drift-ppm", "-50"),
+    "recorder": ("--clock-offset-s", "86400", "--clock-drift-ppm", "-100"),
+}
+IDLE_US = 200.0
+"""A bound that a machine with nothing else to do reaches; then the estimates must be as good as promised."""
+
+
+def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "12")
+    session.recorder(*SKEWS["recorder"])
+    for name in ("s", "m2", "m1"):  # the leader comes last
+        session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
+    session.begun()
+    seen = trilat("ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder)
+    assert set(session.codes().values()) == {0}
+    log = whole(session.log)
+    executed_again(log)
+    equal_to_virtual_time(log)
+    for site in PAPER:
+        for peer in log.scenario.peers(site):
+            samples = judged(log, site, peer)
+            assert len(samples.tick) > 6_000
+            assert samples.inside >= 0.999
+            assert samples.delay_us.min() > 0.0
+            errors = offset_errors(log, site, peer)
+            if np.median(samples.bound_us) <= IDLE_US:
+                assert np.abs(errors[errors[:, 0] >= 10.0, 1]).max() <= 100.0
+                assert np.abs(errors[errors[:, 0] >= 10.0, 2]).max() <= 20.0
+    assert "clock of m2: another one, offset 3.00" in session.processes["m1"].text()
+    assert "clock of m1: another one, offset -86399.99" in session.processes["recorder"].text()
+    told = json.loads(seen.succeeds())
+    clocks = {member["member"]: member for member in told["members"]}
+    assert set(clocks) == {*PAPER}
+    assert clocks["m1"]["same_clock"]
+    assert abs(clocks["m2"]["offset_ns"] - 3_000_000_000) <= 20_000_000
+    assert clocks["m2"]["rtt_us"]["min"] > 0
+    assert {(link["from"], link["to"]) for link in told["links"]} == {
+        (peer, site) for site in PAPER for peer in log.scenario.peers(site)
+    }
+
+
+def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
+    waiting = session.site("s")
+    waiting.prints("waiting for")
+    to = connections(session.endpoints)
+    seen = trilat("ping", "--session", "t", "--count", "10", *to, cwd=stage.folder).succeeds()
+    assert "session t waits for its members" in seen
+    assert "the same clock" in seen
+    assert "between the sites" not in seen
+    session.site("m")
+    assert session.codes() == {"s": 0, "m": 0}
+
+
+def test_a_ping_that_nobody_answers_says_where_it_looked(stage: Stage) -> None:
+    done = trilat("ping", "--session", "nobody-here", "--timeout", "0.5", cwd=stage.folder)
+    done.refuses("nobody of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1)

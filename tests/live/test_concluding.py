@@ -1,0 +1,51 @@
+"""`trilat record --conclude`: the recorder judges its log, draws it, and says so with its exit code."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import recorder.process
+from tests.cli.running import trilat
+from trilat_net.experiment import record_virtual
+from trilat_net.scenario import load
+
+from .processes import Session, Stage
+
+
+def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5", "--stay", "60")
+    session.recorder("--conclude")
+    for name in session.sites:
+        session.site(name, "--needs-recorder")
+    assert session.codes() == {"recorder": 0, "m": 0, "s": 0}
+    printed = session.processes["recorder"].text()
+    assert "ok   records: 1000/1000 in the file" in printed
+    assert "1000/1000 records identical" in printed
+    checks = json.loads((stage.folder / "summary.json").read_text(encoding="utf-8"))["checks"]
+    assert all(check["passed"] for check in checks)
+    assert (stage.folder / "report.html").exists()
+
+
+def test_a_run_that_diverged_fails_though_its_log_is_sound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def recorded(_session: str, path: Path, *others: object) -> int:
+        assert not record_virtual(load("two_sites", {"limits.qd_limit_rad_s": 0.01}), path)
+        *_, afterwards = others
+        assert isinstance(afterwards, Callable)
+        afterwards()
+        return 0
+
+    monkeypatch.setattr(recorder.process, "record_session", recorded)
+    done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
+    assert "FAIL" not in done.out
+    done.refuses("x.mcap", "diverged at t = ", code=1)
+
+
+def test_the_report_of_another_log_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("another's", encoding="utf-8")
+    done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
+    done.refuses("report.html", "--force")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == "another's"

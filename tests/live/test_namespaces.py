@@ -1,0 +1,199 @@
+"""Separate machines: the README's recipes, as written, in network namespaces with addresses of their own."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import pytest
+
+from tests.truth import judged, members, offset_errors
+from trilat_net.experiment import compare_with_virtual
+from trilat_net.log.reader import Log
+from trilat_net.net.clock import SystemClock
+
+from .namespaces import Machines, NoNamespaces, bridged, machines, pairs, reaches, starred
+from .processes import BEGUN, Stage, equal_to_virtual_time, executed_again, whole
+
+SITES = ("m1", "m2", "s")
+ALL = (*SITES, "recorder")
+WELL = dict.fromkeys(ALL, 0)
+PORT = "tcp/0.0.0.0:7447"
+CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
+"""How far each clock is ahead, s, and by how much it runs faster, ppm."""
+
+
+@pytest.fixture
+def apart() -> Iterator[Machines]:
+    """Machines; none of them, and no cable, outlives the test."""
+    try:
+        with machines() as made:
+            yield made
+    except NoNamespaces as reason:
+        pytest.skip(str(reason))
+
+
+class Session:
+    """Three sites and a recorder, each on its machine.
+
+    Args:
+        stage: where they run.
+        apart: the machines.
+        options: what every site is given.
+    """
+
+    def __init__(self, stage: Stage, apart: Machines, *options: str) -> None:
+        self._stage, self._apart, self._options = stage, apart, options
+        self.log = stage.folder / "run.mcap"
+        self.processes = {}
+
+    def start(self, name: str) -> None:
+        offset_s, drift_ppm = CLOCKS[name]
+        clock = ("--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm))
+        if name == "recorder":
+            words = ("record", "--session", "paper", "-o", str(self.log), *self._ways(name, SITES))
+        else:
+            ways = self._ways(name, SITES[: SITES.index(name)])
+            words = ("site", name, "--scenario", "paper", "--needs-recorder", *self._options, *ways)
+        self.processes[name] = self._stage.start(name, *words, *clock, before=self._apart.on(name))
+
+    def _ways(self, name: str, others: tuple[str, ...]) -> tuple[str, ...]:
+        """How the README says it: through a router, or by who listens where the others reach it."""
+        if name in self._apart.centre:
+            return ("--router", f"tcp/{self._apart.centre[name]}:7447")
+        ends = [f"tcp/{self._apart.address[other]}:7447" for other in others]
+        listen = () if name == "recorder" else ("--listen", PORT)
+        return (*listen, *(word for end in ends for word in ("--connect", end)))
+
+    def codes(self) -> dict[str, int]:
+        return {name: process.code() for name, process in self.processes.items()}
+
+
+def clocks_as_injected(log: Log) -> None:
+    """Every estimate that was logged is the injected one within its bound, and so is every sample's delay."""
+    clocks = members(log)
+    for name, (offset_s, drift_ppm) in CLOCKS.items():
+        assert clocks[name].offset_ns == offset_s * 1e9
+        assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
+    for site, peer in pairs(SITES):
+        link = judged(log, site, peer)
+        assert link.inside >= 0.999
+        assert link.tick.size >= 0.5 * len(log[site])
+        assert link.delay_us.min() > 0.0
+        t_s, offset_us, drift_ppm = offset_errors(log, site, peer).T
+        assert t_s.size > 0
+        assert abs(offset_us[-1]) < 1000.0
+        assert abs(drift_ppm[-1]) < 100.0
+
+
+@pytest.mark.parametrize(
+    "order", [ALL, ("recorder", "s", "m2", "m1"), ("m2", "recorder", "m1", "s")], ids=" ".join
+)
+def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: Stage, apart: Machines) -> None:
+    bridged(apart, ALL)
+    session = Session(stage, apart, "--duration", "3")
+    for name in order:
+        session.start(name)
+    assert session.codes() == WELL
+    log = whole(session.log)
+    executed_again(log)
+    equal_to_virtual_time(log)
+    clocks_as_injected(log)
+
+
+def test_machines_that_cannot_reach_each_other_meet_at_a_router(stage: Stage, apart: Machines) -> None:
+    starred(apart, "centre", ALL)
+    assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
+    assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
+    session = Session(stage, apart, "--duration", "3")
+    for name in ("m1", "recorder"):
+        session.start(name)
+        session.processes[name].prints("no router answers at tcp/10.77.")
+    router = stage.start("router", "router", "--listen", PORT, "--until-idle", "1", before=apart.on("centre"))
+    for name in ("s", "m2"):
+        session.start(name)
+    assert session.codes() == WELL
+    assert router.code() == 0
+    for name in ALL:
+        assert f"router: session paper: {name} is here" in router.text()
+        assert f"router: session paper: {name} has left" in router.text()
+    log = whole(session.log)
+    executed_again(log)
+    equal_to_virtual_time(log)
+    clocks_as_injected(log)
+
+
+@dataclass
+class Heard:
+    """What one site heard of one peer, tick by tick.
+
+    Attributes:
+        arrivals: (tick that took it in, tick of the sample).
+        age: ticks from the stamp of the sample in use, per tick.
+        outages: (last tick before, first tick after) of every second without an arrival.
+    """
+
+    arrivals: list[tuple[int, int]]
+    age: list[int]
+    outages: list[tuple[int, int]]
+
+
+def heard(log: Log, site: str, peer: str) -> Heard:
+    states, place = log[site].states, log.scenario.peers(site).index(peer)
+    arrivals = [(state.tick, tick) for state in states for index, tick, _ in state.rx if index == place]
+    ticks = sorted({tick for tick, _ in arrivals})
+    outages = [(before, after) for before, after in pairwise(ticks) if after - before > 1000]
+    return Heard(arrivals, [state.tick - state.used[peer] for state in states], outages)
+
+
+def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: Machines) -> None:
+    """Once for less than Zenoh's lease, so that what waited comes in a burst, and once for longer.
+
+    One direction measures, the other delays by 200 ms.
+    """
+    bridged(apart, ALL)
+    session = Session(stage, apart, "--duration", "13", "--set", 'links.m2->m1.model="measured"')
+    for name in ALL:
+        session.start(name)
+    for name in SITES:
+        session.processes[name].prints(BEGUN)
+    clock = SystemClock()
+    begun_ns = clock.monotonic_ns()
+    for begins_s, ends_s in ((1.0, 2.1), (5.0, 10.7)):
+        clock.sleep_until(begun_ns + round(begins_s * 1e9))
+        apart.part("m1", "m2")
+        clock.sleep_until(begun_ns + round(ends_s * 1e9))
+        apart.mend("m1", "m2")
+    assert session.codes() == WELL
+    log = whole(session.log)
+    executed_again(log)
+    fed = compare_with_virtual(log).fed
+    assert fed.first is None
+    assert fed.identical == fed.records == 39_000
+    for site, peer in pairs(SITES):
+        used = [state.used[peer] for state in log[site].states]
+        assert used == sorted(used)
+    lost = [(event.member, event.about) for event in log.events if event.kind == "lost"]
+    assert sorted(lost) == [("m1", "m2"), ("m2", "m1")]
+    back_to_nominal(log, "m1", "m2", delay=0, nominal=5)
+    back_to_nominal(log, "m2", "m1", delay=200, nominal=202)
+    counted = log.link_stats("m2")[-1]
+    late = [tick for tick, sample in heard(log, "m2", "m1").arrivals if tick > sample + 200]
+    assert len(late) > 300
+    assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
+
+
+def back_to_nominal(log: Log, site: str, peer: str, delay: int, nominal: int) -> None:
+    """While the way is cut the age grows, by record and by statistics; then it is nominal within two ticks
+    of the first fresh arrival, or of when that one is due."""
+    link = heard(log, site, peer)
+    assert len(link.outages) == 2
+    for before, after in link.outages:
+        assert max(link.age[before:after]) >= after - before
+        ages = [
+            stats.age_us[peer] for stats in log.link_stats(site) if before + delay + 100 < stats.tick < after
+        ]
+        assert len(ages) >= (after - before - delay) // 100 - 2
+        assert ages == sorted(set(ages))
+        tick, sample = next((t, s) for t, s in link.arrivals if t >= after and t - s <= nominal)
+        ready = max(tick, sample + delay)
+        assert min(link.age[ready : ready + 3]) <= nominal, link.age[ready : ready + 10]

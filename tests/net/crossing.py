@@ -1,0 +1,55 @@
+"""Two clocks and a network between them that a test makes up: what each reads is known, so the truth is."""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from trilat_net.net.offset import Limit
+
+S = 1_000_000_000
+Delay = Callable[[random.Random], int]
+
+
+def queueing(floor_us: float, mean_us: float) -> Delay:
+    """A way that takes at least so long, and waits in queues besides."""
+    return lambda rnd: int(1000 * (floor_us + rnd.expovariate(1.0 / mean_us)))
+
+
+@dataclass
+class Other:
+    """Another clock: what it reads when the own one reads t is t + offset + drift (t - 0) + wander."""
+
+    offset_ns: int
+    drift_ppb: float
+    wander: Callable[[int], float] = field(default=lambda _: 0.0)
+
+    def offset(self, own_ns: int) -> float:
+        """How far it is ahead at a reading of the own clock, ns."""
+        return self.offset_ns + own_ns * self.drift_ppb / S + self.wander(own_ns)
+
+    def reads(self, own_ns: int) -> int:
+        """What it reads when the own clock reads `own_ns`."""
+        return round(own_ns + self.offset(own_ns))
+
+
+def ceiling(other: Other, sent_ns: int, delay_ns: int) -> Limit:
+    """What a message from here says that took so long."""
+    return Limit(sent_ns, other.reads(sent_ns + delay_ns) - sent_ns)
+
+
+def floor(other: Other, sent_ns: int, delay_ns: int) -> Limit:
+    """What a message from there says that was sent at an instant of the own clock and took so long."""
+    return Limit(sent_ns + delay_ns, other.reads(sent_ns) - sent_ns - delay_ns)
+
+
+def second(
+    other: Other, begin_ns: int, there: Delay, back: Delay, rnd: random.Random, messages: int = 50
+) -> tuple[Limit, Limit]:
+    """The tightest of a second of messages both ways, all of which have come before it is over."""
+    ceilings, floors = [], []
+    for n in range(messages):
+        at_ns = begin_ns + n * (S // 2) // messages
+        ceilings.append(ceiling(other, at_ns, there(rnd)))
+        floors.append(floor(other, at_ns, back(rnd)))
+    level = lambda limit: limit.offset_ns - other.drift_ppb * limit.at_ns / S  # noqa: E731
+    return min(ceilings, key=level), max(floors, key=level)

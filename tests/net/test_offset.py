@@ -1,0 +1,187 @@
+"""The true offset is inside the bound, whatever the delays were; and in the middle where they are alike."""
+
+import math
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.net.offset import WINDOWS, Limit, OffsetEstimator, known, offset_text
+
+from .crossing import Other, S, ceiling, floor, queueing, second
+
+DAY = 86_400 * S
+
+others = st.builds(Other, st.integers(-3 * DAY, 3 * DAY), st.floats(-200_000, 200_000))
+delays = st.one_of(st.integers(0, 2_000_000), st.integers(0, 3 * S))
+messages = st.lists(
+    st.tuples(st.integers(0, 5 * S), st.booleans(), delays), min_size=1, max_size=80
+)  # (pause before it, whether it goes there, how long it takes)
+
+
+@given(others, messages, st.integers(0, 100 * S))
+@settings(max_examples=300)
+def test_the_true_offset_and_drift_are_inside_whatever_the_delays_were(
+    other: Other, crossings: list[tuple[int, bool, int]], silence_ns: int
+) -> None:
+    """Delays as unequal as one likes, pauses, ways that say nothing, and a silence afterwards."""
+    estimator = OffsetEstimator()
+    now_ns = latest_ns = 0
+    for pause_ns, there, delay_ns in crossings:
+        now_ns += pause_ns
+        if there:
+            estimator.add(ceiling(other, now_ns, delay_ns), None)
+        else:
+            estimator.add(None, floor(other, now_ns, delay_ns))
+        latest_ns = max(latest_ns, now_ns + delay_ns)
+    estimate = estimator.estimate(latest_ns)
+    assert estimator.broken == 0
+    if estimate is None:
+        assert len({there for _, there, _ in crossings}) == 1
+        return
+    for later_ns in (0, silence_ns):
+        at_ns = latest_ns + later_ns
+        truth = other.offset(at_ns)
+        for value in (estimate.offset_at(at_ns), estimate.offset_ns + 5_000_000):
+            assert abs(truth - value) <= estimate.bound_at(at_ns, value) + 2
+    assert estimate.low_ns - 2 <= estimate.offset_ns <= estimate.high_ns + 2
+    assert estimate.drift_low <= other.drift_ppb <= estimate.drift_high
+
+
+@given(others, delays, delays)
+def test_one_exchange_gives_the_classical_offset_and_half_its_round_trip(
+    other: Other, there_ns: int, back_ns: int
+) -> None:
+    """Four stamps of one instant: (t1 + t2 - t3 - t4)/2 within (t4 - t1 - (t3 - t2))/2, and drift besides."""
+    sent = ceiling(other, 0, there_ns)
+    came = floor(other, there_ns, back_ns)
+    estimator = OffsetEstimator()
+    estimator.add(sent, came)
+    estimate = estimator.estimate(there_ns + back_ns)
+    assert estimate is not None
+    trip_ns = there_ns + back_ns
+    classical = (sent.offset_ns + came.offset_ns) / 2
+    spread_ns = 600e-6 * trip_ns + 2
+    assert abs(estimate.offset_ns - classical) <= spread_ns
+    bound_ns = estimate.bound_at(estimate.at_ns, estimate.offset_ns)
+    assert trip_ns / 2 - spread_ns <= bound_ns <= trip_ns / 2 + spread_ns
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("offset_ns", "drift_ppb"), [(3 * S, 100_000), (-2 * DAY, -100_000), (5, 0)])
+def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: int) -> None:
+    """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, of ways as they are on one busy machine."""
+    other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
+    for n in range(60):
+        estimator.add(*second(other, n * S, queueing(90, 200), queueing(120, 300), rnd))
+        at_ns = (n + 1) * S
+        estimate = estimator.estimate(at_ns)
+        assert estimate is not None
+        if n >= 9:
+            assert abs(estimate.offset_ns - other.offset(at_ns)) <= 40_000
+            assert abs(estimate.drift - drift_ppb) <= 20_000
+            assert estimate.bound_at(at_ns, estimate.offset_ns) <= 200_000
+    assert abs(estimate.drift - drift_ppb) <= 5_000
+    assert estimate.drift_high - estimate.drift_low <= 20_000
+
+
+def test_ways_that_are_unlike_bias_the_estimate_and_the_bound_says_so() -> None:
+    other, rnd, estimator = Other(S, 20_000), random.Random(1), OffsetEstimator()
+    for n in range(20):
+        estimator.add(*second(other, n * S, queueing(500, 50), queueing(100, 50), rnd))
+    estimate = estimator.estimate(20 * S)
+    assert estimate is not None
+    error_ns = estimate.offset_ns - other.offset(20 * S)
+    assert error_ns == pytest.approx(200_000, abs=20_000)  # half of what the ways differ by
+    assert abs(error_ns) <= estimate.bound_at(20 * S, estimate.offset_ns) <= 350_000
+
+
+def test_the_bound_is_of_the_quickest_messages_each_way_not_of_one_round_trip() -> None:
+    other, estimator = Other(7, 0), OffsetEstimator()
+    estimator.add(ceiling(other, 0, 10_000), floor(other, 1_000_000, 900_000))
+    estimator.add(ceiling(other, 2_000_000, 900_000), floor(other, 3_000_000, 20_000))
+    estimate = estimator.estimate(4_000_000)
+    assert estimate is not None
+    assert estimate.bound_at(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
+
+
+def test_a_bad_minute_among_good_ones_does_not_move_the_drift() -> None:
+    other, rnd, estimator = Other(S, 50_000), random.Random(2), OffsetEstimator()
+    for n in range(40):
+        bad = 15 <= n < 25
+        there = queueing(5_000, 5_000) if bad else queueing(100, 50)
+        estimator.add(*second(other, n * S, there, queueing(100, 50), rnd))
+    estimate = estimator.estimate(40 * S)
+    assert estimate is not None
+    assert estimate.drift == pytest.approx(50_000, abs=1_000)
+    assert abs(estimate.offset_ns - other.offset(40 * S)) < 30_000
+
+
+@given(st.floats(1.0, 100.0), st.floats(0.0, 2 * math.pi), st.integers(0, 2**32))
+@settings(max_examples=30, deadline=None)
+def test_a_drift_that_wanders_as_far_as_it_may_stays_inside(period_s: float, phase: float, seed: int) -> None:
+    """The offset's rate swings by a quarter of a part per million, so over any stretch within WANDER."""
+    size = 250.0 * period_s / (2 * math.pi)
+
+    def wander(own_ns: int) -> float:
+        return size * math.sin(2 * math.pi * own_ns / S / period_s + phase)
+
+    other, rnd, estimator = Other(S, 40_000, wander), random.Random(seed), OffsetEstimator()
+    for n in range(70):
+        estimator.add(*second(other, n * S, queueing(1, 1), queueing(1, 1), rnd, 10))
+        estimate = estimator.estimate((n + 1) * S)
+        assert estimate is not None
+        assert estimate.low_ns - 2 <= other.offset((n + 1) * S) <= estimate.high_ns + 2
+    assert estimator.broken == 0
+
+
+@pytest.mark.parametrize("step_ns", [S, -S, 2_000_000, -2_000_000])
+def test_a_clock_that_stepped_is_noticed_and_found_again(step_ns: int) -> None:
+    rnd, estimator = random.Random(3), OffsetEstimator()
+    before, after = Other(S, 30_000), Other(S + step_ns, 30_000)
+    for n in range(30):
+        estimator.add(*second(before, n * S, queueing(100, 50), queueing(100, 50), rnd))
+        assert estimator.estimate((n + 1) * S) is not None
+    assert estimator.broken == 0
+    for n in range(30, 34):
+        estimator.add(*second(after, n * S, queueing(100, 50), queueing(100, 50), rnd))
+        estimate = estimator.estimate((n + 1) * S)
+    assert estimator.broken > 0
+    assert estimate is not None
+    assert estimate.low_ns <= after.offset(34 * S) <= estimate.high_ns
+
+
+def test_limits_that_contradict_each_other_alone_leave_nothing() -> None:
+    estimator = OffsetEstimator()
+    estimator.add(Limit(0, 10), Limit(0, 20_000_000))
+    assert estimator.estimate(S) is None
+    assert estimator.broken == 1
+    estimator.add(Limit(S, 30), Limit(S, 10))
+    assert estimator.estimate(S) is not None
+
+
+def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
+    other, estimator = Other(S, 0), OffsetEstimator()
+    for n in range(3 * WINDOWS):
+        estimator.add(ceiling(other, n * S, 1000), floor(other, n * S, 1000))
+    assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {WINDOWS}
+    assert estimator._ceilings[0].at_ns == 2 * WINDOWS * S
+
+
+def test_one_clock_needs_no_estimate() -> None:
+    one = known(0)
+    assert [one.offset_at(at_ns) for at_ns in (0, 10**15)] == [0, 0]
+    assert one.bound_at(10**15, 0) == 0
+    assert one.bound_at(10**15, 7) == 7
+
+
+def test_what_contradicts_an_estimate_widens_it() -> None:
+    one = known(5)
+    wider = one.including(Limit(0, -100), None)
+    assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
+    assert one.including(None, None) == one
+
+
+def test_people_read_seconds_and_microseconds() -> None:
+    assert offset_text(3_000_012_345, 84_001) == "offset 3.000012 s +- 85 us"

@@ -1,0 +1,195 @@
+"""Who is pinged answers at once; who pings learns where the other clock stands, to half a round trip."""
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.net import topics
+from trilat_net.net.asking import CAPACITY, Asking
+from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.clock import ManualClock, SkewedClock
+from trilat_net.net.messages import VERSION, Pong
+from trilat_net.net.offset import known
+from trilat_net.net.pinging import GLANCE_NS, PACE_NS, PINGS, REST_NS, WINDOW, Pinger, Trips, answer_pings
+from trilat_net.net.wire import encode
+
+from .parties import SESSION, told
+
+S = 1_000_000_000
+STEP_NS = 1_000_000
+
+
+class Slow:
+    """A bus whose questions reach those who answer later, and whose answers come back later still."""
+
+    def __init__(self, bus: Bus, clock: ManualClock, there_ns: int, back_ns: int) -> None:
+        self._bus, self._clock, self._there_ns, self._back_ns = bus, clock, there_ns, back_ns
+        self.asked = 0
+
+    def ask(self, key: str, payload: bytes = b"") -> "Slow.Late":
+        self.asked += 1
+        return Slow.Late(self, key, payload, self._clock.monotonic_ns())
+
+    class Late:
+        """Answers under way."""
+
+        def __init__(self, slow: "Slow", key: str, payload: bytes, asked_ns: int) -> None:
+            self._slow, self._key, self._payload, self._asked_ns = slow, key, payload, asked_ns
+            self._replies, self._answered_ns = None, 0
+
+        def poll(self) -> tuple[str, bytes] | None:
+            now_ns = self._slow._clock.monotonic_ns()
+            if self._replies is None and now_ns >= self._asked_ns + self._slow._there_ns:
+                self._replies = self._slow._bus.ask(self._key, self._payload)
+                self._answered_ns = now_ns
+            if self._replies is None or now_ns < self._answered_ns + self._slow._back_ns:
+                return None
+            return self._replies.poll()
+
+
+class World:
+    """One who pings, and members on clocks of their own."""
+
+    def __init__(self, there_ns: int = 0, back_ns: int = 0) -> None:
+        self.clock = ManualClock(10 * S)
+        self.network = LocalNetwork()
+        self.bus = Slow(self.network.join(), self.clock, there_ns, back_ns)
+        self.pinger = Pinger(self.bus, self.clock, SESSION)
+
+    def member(self, name: str, boot: int, offset_ns: int = 0, drift_ppb: int = 0) -> SkewedClock:
+        clock = SkewedClock(self.clock, offset_ns, drift_ppb)
+        answer_pings(self.network.join(), clock, SESSION, told(name, boot, clock=clock.identity()))
+        return clock
+
+    def wait(self, passed_ns: int, *wanted: int) -> None:
+        """Polls every millisecond for a time."""
+        for _ in range(passed_ns // STEP_NS):
+            self.pinger.poll(wanted)
+            self.clock.sleep_until(self.clock.monotonic_ns() + STEP_NS)
+
+
+@given(
+    st.integers(-(10**15), 10**15),
+    st.integers(-200_000, 200_000),
+    st.integers(0, 40),
+    st.integers(0, 40),
+    st.integers(0, 5 * S),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_clock_is_known_to_half_a_round_trip_and_what_it_may_have_drifted(
+    offset_ns: int, drift_ppb: int, there_ms: int, back_ms: int, later_ns: int
+) -> None:
+    world = World(there_ms * STEP_NS, back_ms * STEP_NS)
+    clock = world.member("s", 7, offset_ns, drift_ppb)
+    world.wait(400_000_000, 7)
+    assert world.pinger.know([7])
+    estimate = world.pinger.estimate(7)
+    world.clock.sleep_until(world.clock.monotonic_ns() + later_ns)
+    now_ns = world.clock.monotonic_ns()
+    truth, value = clock.monotonic_ns() - now_ns, estimate.offset_at(now_ns)
+    assert abs(truth - value) <= estimate.bound_at(now_ns, value) + 2
+    trip_ns = world.pinger.trips[7].shortest_ns
+    assert trip_ns // STEP_NS in (there_ms + back_ms, there_ms + back_ms + 1, there_ms + back_ms + 2)
+    assert estimate.bound_at(estimate.at_ns, estimate.offset_ns) <= trip_ns / 2 + 0.4 * S * 600e-6
+
+
+def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
+    world = World()
+    world.member("m2", 5, S)
+    world.member("s", 7, 2 * S)
+    world.wait(100_000_000, 5)
+    assert world.bus.asked == 100_000_000 // PACE_NS
+    assert not world.pinger.know([5])
+    world.wait(200_000_000, 5, 7)
+    assert world.pinger.know([5, 7])
+    asked = world.bus.asked
+    world.wait(5 * S, 5, 7)
+    assert world.bus.asked - asked == pytest.approx(5 * S / REST_NS, abs=1)
+
+
+def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
+    world = World()
+    world.wait(S)
+    assert world.bus.asked == 0
+    assert world.pinger.know([])
+    assert world.pinger.estimate(99) == known(0)
+    assert world.pinger.estimator(99) is None
+
+
+def test_a_poll_is_hurried_only_while_an_answer_is_under_way() -> None:
+    world = World()
+    world.member("s", 7)
+    assert world.pinger.pause_ns(5_000_000) == 5_000_000
+    world.pinger.poll([7])
+    assert world.pinger.pause_ns(5_000_000) == GLANCE_NS
+    assert world.pinger.pause_ns(10) == 10
+    world.clock.sleep_until(world.clock.monotonic_ns() + S)
+    assert world.pinger.pause_ns(5_000_000) == 5_000_000
+
+
+def pong(**facts: object) -> Pong:
+    return Pong(**{"member": "s", "boot": 7, "clock": "c", "came_ns": 0, "left_ns": 0, **facts})
+
+
+STRANGERS = {
+    "garbage": b"\xc1",
+    "of another boot": encode(pong(boot=8)),
+    "of another member": encode(pong(member="m2")),
+    "of another version": encode(pong(v=VERSION + 1)),
+    "left before it came": encode(pong(came_ns=5, left_ns=4)),
+    "held longer than it was away": encode(pong(came_ns=0, left_ns=10**15)),
+    "beyond any clock": msgspec.msgpack.encode({**msgspec.structs.asdict(pong()), "came_ns": 2**62}),
+}
+
+
+@pytest.mark.parametrize("payload", STRANGERS.values(), ids=STRANGERS.keys())
+def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
+    world = World()
+    world.network.join().respond(topics.key(SESSION, "s", topics.PING), lambda _: payload)
+    world.wait(S, 7)
+    assert not world.pinger.know([7])
+    assert all(not trips.rtts_ns for trips in world.pinger.trips.values())
+
+
+def test_a_clock_that_steps_meanwhile_is_not_known_until_enough_agree_again() -> None:
+    trips = Trips(pong(), PINGS)
+    for n in range(PINGS):
+        trips.take(n * STEP_NS, pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50), n * STEP_NS + 100)
+    assert trips.known
+    before = trips.latest
+    far_ns = 10 * S
+    for n in range(PINGS, PINGS + WINDOW):
+        at_ns = n * STEP_NS
+        came_ns = at_ns + 50 + far_ns * (n % 2)
+        trips.take(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
+    assert not trips.known
+    assert trips.latest == before
+
+
+def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
+    clock, network = ManualClock(S), LocalNetwork()
+    questions = network.join().questions("t/a")
+    asking = Asking(network.join(), clock, "t/*")
+    asked = []
+    for _ in range(3):
+        asked.append(asking.ask())
+        clock.sleep_until(clock.monotonic_ns() + S)
+    waiting = [questions.poll() for _ in asked]
+    for n in (2, 0, 1):
+        waiting[n].answer(bytes([n]))
+    answers = [asking.poll() for _ in asked]
+    assert sorted((answer.asked_ns, answer.key, answer.payload) for answer in answers) == [
+        (asked[n], "t/a", bytes([n])) for n in range(3)
+    ]
+    assert asking.poll() is None
+
+
+def test_questions_that_are_too_old_are_forgotten() -> None:
+    network = LocalNetwork()
+    questions = network.join().questions("t/a")
+    asking = Asking(network.join(), ManualClock(), "t/a")
+    for _ in range(CAPACITY + 1):
+        asking.ask()
+    questions.poll().answer(b"late")
+    assert asking.poll() is None

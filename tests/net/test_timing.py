@@ -1,0 +1,259 @@
+"""Sites on clocks of their own measure delays within the bound they state, and tick as the leader does."""
+
+import heapq
+import random
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.net.clock import ManualClock, SkewedClock
+from trilat_net.net.course import Course
+from trilat_net.net.grid import SLEW_LIMIT
+from trilat_net.net.messages import VERSION, LinkStats, Sample
+from trilat_net.net.meter import FIRST_WINDOW_NS, FIRST_WINDOWS, Meter, Sent
+from trilat_net.net.offset import Estimate, OffsetEstimator, known
+from trilat_net.net.timing import FAULT_EVERY_NS, News, Peer, Timing
+
+from .crossing import Delay, S, queueing
+
+RATE_HZ = 200
+NAMES = ("a", "b")
+
+
+def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> Sample:
+    return Sample(
+        v=VERSION, site="x", boot=1, tick=tick, q=[0, 0], qd=[0, 0], sent_ns=sent_ns, echo=echo or []
+    )
+
+
+@dataclass
+class Site:
+    """One site of a simulated session: its clock, its time, and what it logged."""
+
+    clock: SkewedClock
+    timing: Timing
+    errors_ns: list[tuple[int, int, int]] = field(default_factory=list)
+    news: list[News] = field(default_factory=list)
+    stats: list[dict[str, object]] = field(default_factory=list)
+    ticked_ns: list[int] = field(default_factory=list)
+
+
+class Session:
+    """Two sites, a leads; messages take as long as the ways say, in true time."""
+
+    def __init__(self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]) -> None:
+        self.true = ManualClock(10**12)
+        self.ways, self.rnd = ways, random.Random(5)
+        clocks = [SkewedClock(self.true, *skew) for skew in skews]
+        epochs = [clock.monotonic_ns() + S for clock in clocks]
+        epochs[1] += 300_000  # b converted it wrong by so much
+        self.step = {0: 0, 1: 0}
+        self.sites = []
+        for own, other in ((0, 1), (1, 0)):
+            ahead = clocks[other].monotonic_ns() - clocks[own].monotonic_ns()
+            now_ns = clocks[own].monotonic_ns()
+            first = Estimate(now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5)
+            peer = Peer(NAMES[other], epochs[other], 0, first, OffsetEstimator())
+            self.sites.append(Site(clocks[own], Timing(epochs[own], RATE_HZ, [peer], "a")))
+
+    def run(self, seconds: float, cut: range = range(0)) -> None:
+        """Lets both tick; what is sent in the ticks of `cut` is lost."""
+        queue: list[tuple[int, int, int, int, Sample | None]] = []
+        order = iter(range(10**9))
+        for n in (0, 1):
+            heapq.heappush(queue, (self._due(n, 0), next(order), n, 0, None))
+        while queue:
+            true_ns, _, n, k, message = heapq.heappop(queue)
+            self.true.sleep_until(true_ns)
+            if message is not None:
+                self._take(n, message, true_ns)
+                continue
+            sent = self._tick(n, k)
+            if k not in cut:
+                at_ns = true_ns + self.ways[n](self.rnd)
+                heapq.heappush(queue, (at_ns, next(order), 1 - n, k, sent))
+            if k + 1 < seconds * RATE_HZ:
+                heapq.heappush(queue, (self._due(n, k + 1), next(order), n, k + 1, None))
+
+    def _due(self, n: int, k: int) -> int:
+        """When a tick is due, in true time."""
+        site = self.sites[n]
+        ahead_ns = site.timing.grid.deadline(k) - site.clock.monotonic_ns()
+        return self.true.monotonic_ns() + round(ahead_ns / (1 + site.clock._drift_ppb / S)) + 1
+
+    def _tick(self, n: int, k: int) -> Sample:
+        site = self.sites[n]
+        site.ticked_ns.append(self.true.monotonic_ns())
+        now_ns = site.clock.monotonic_ns() + self.step[n]
+        echo = [list(entry) for entry in site.timing.echo()]
+        sent = sample(k, site.timing.sent(k, now_ns), echo)
+        if k % (RATE_HZ // 10) == 0:
+            site.stats.append(site.timing.measured(now_ns))
+            site.news += site.timing.settle(k + 1, now_ns)
+        return sent
+
+    def _take(self, n: int, message: Sample, true_ns: int) -> None:
+        site, other = self.sites[n], self.sites[1 - n]
+        arrived_ns = site.clock.monotonic_ns() + self.step[n]
+        (meter,) = site.timing.meters
+        bound_ns = meter.course.bound_at(arrived_ns)
+        delay_ns = meter.take(message, arrived_ns)
+        true_delay_ns = true_ns - other.ticked_ns[message.tick]
+        site.errors_ns.append((message.tick, delay_ns - true_delay_ns, bound_ns))
+
+
+LAN = queueing(80, 60)
+
+
+@pytest.mark.parametrize("skew", [(3 * S, 100_000), (-2 * S, -100_000), (86_400 * S, 30_000)])
+def test_delays_are_inside_their_bound_and_the_grid_follows_the_leader(skew: tuple[int, int]) -> None:
+    session = Session(((0, 0), skew), (LAN, queueing(140, 90)))
+    session.run(20.0)
+    for site in session.sites:
+        assert len(site.errors_ns) == 20 * RATE_HZ
+        assert all(abs(error_ns) <= bound_ns + 50 for _, error_ns, bound_ns in site.errors_ns)
+        assert sorted(bound for _, _, bound in site.errors_ns)[2000] <= 200_000
+        assert max(abs(error) for tick, error, _ in site.errors_ns if tick > 10 * RATE_HZ) <= 100_000
+    leader, follower = session.sites
+    late_ns = [b - a for a, b in zip(leader.ticked_ns, follower.ticked_ns, strict=True)]
+    assert abs(late_ns[0] - 300_000) <= 101_000
+    assert max(map(abs, late_ns[10 * RATE_HZ :])) <= 60_000  # the ways are unlike by 60 us
+    assert leader.timing.grid.slew == 0.0
+    assert abs(follower.timing.grid.slew - skew[1]) <= 10_000
+    assert all(abs(stats["slew_ppb"]) <= SLEW_LIMIT for stats in follower.stats)
+
+
+def test_what_is_logged_is_true() -> None:
+    session = Session(((0, 0), (3 * S, 100_000)), (LAN, LAN))
+    session.run(12.0)
+    site, start_ns = session.sites[0], 10**12
+    told = [news for news in site.news if news.kind == "clock"]
+    assert len(told) >= 12
+    for news in told:
+        assert news.facts["about"] == "b"
+        at_ns = start_ns + S + news.facts["ticks"] * S // RATE_HZ
+        truth = 3 * S + (at_ns - start_ns) // 10_000
+        assert abs(news.facts["offset_ns"] - truth) <= news.facts["bound_ns"] + 50
+        assert abs(news.facts["drift_ppb"] - 100_000) <= news.facts["drift_bound_ppb"]
+    last = told[-1]
+    assert abs(last.facts["drift_ppb"] - 100_000) <= 5_000
+    assert "offset 3.00" in last.text
+    assert "ppm" in last.text
+    (stats,) = site.stats[-1:]
+    assert 80 <= stats["delay_us"]["b"] <= stats["delay_max_us"]["b"] <= 1000
+    assert 160 <= stats["rtt_us"]["b"] <= 600
+    assert stats["clock_faults"] == {"b": 0}
+    assert set(stats) <= set(LinkStats.__struct_fields__)
+
+
+@given(
+    st.tuples(st.integers(-10 * S, 10 * S), st.integers(-100_000, 100_000)),
+    st.tuples(st.integers(-10 * S, 10 * S), st.integers(-100_000, 100_000)),
+    st.tuples(st.floats(0, 5000), st.floats(1, 5000)),
+    st.tuples(st.floats(0, 5000), st.floats(1, 5000)),
+    st.integers(0, 600),
+    st.integers(0, 600),
+)
+@settings(max_examples=15, deadline=None)
+def test_bounds_hold_whatever_the_clocks_the_ways_and_the_outage(
+    one: tuple[int, int],
+    two: tuple[int, int],
+    there: tuple[float, float],
+    back: tuple[float, float],
+    begin: int,
+    ticks: int,
+) -> None:
+    session = Session((one, two), (queueing(*there), queueing(*back)))
+    session.run(4.0, range(begin, begin + ticks))
+    for site in session.sites:
+        for _, error_ns, bound_ns in site.errors_ns:
+            assert abs(error_ns) <= bound_ns + 100
+
+
+def test_a_clock_that_steps_is_a_fault_once_a_second_and_found_again() -> None:
+    session = Session(((0, 0), (3 * S, 0)), (LAN, LAN))
+    session.run(3.0)
+    site = session.sites[0]
+    site.news.clear()
+    (meter,) = site.timing.meters
+    true_ns = session.true.monotonic_ns()
+    stepped = sample(600, true_ns - 10**12 - S + 2 * S)
+    for n in range(3 * RATE_HZ):
+        at_ns = true_ns + n * S // RATE_HZ
+        meter.take(sample(600 + n, stepped.sent_ns + n * S // RATE_HZ), at_ns)
+        if n % 20 == 0:
+            site.news += site.timing.settle(600 + n, at_ns)
+    faults = [news for news in site.news if news.kind == "clock fault"]
+    assert 1 <= len(faults) <= 3 * S // FAULT_EVERY_NS
+    assert "before it was sent" in faults[0].text
+    assert faults[0].facts["offset_ns"] > S
+    assert site.timing.measured(at_ns)["clock_faults"]["b"] > 0
+
+
+def meter(course: Course | None = None, estimator: OffsetEstimator | None = None) -> tuple[Meter, Sent]:
+    sent = Sent(8)
+    return Meter(1000, 3, sent, course or Course(known(0)), estimator), sent
+
+
+def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
+    link, sent = meter()
+    sent.put(7, 5_000)
+    assert link.take(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
+    assert link.figures() == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
+    assert link.close(10**12, 10**12) is None
+    assert link.course.bound_ns == 0
+
+
+def test_an_echo_of_what_is_not_known_any_more_says_nothing() -> None:
+    link, sent = meter()
+    for tick in range(20):
+        sent.put(tick, tick)
+    link.take(sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
+    assert link.figures().rtt_us == -1
+    assert sent.at(12) == 12
+    assert sent.at(11) is None
+
+
+def test_figures_are_of_what_came_since_the_last_and_faults_since_the_start() -> None:
+    link, _ = meter()
+    for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
+        link.take(sample(n, 0), 1000 + delay_ns)
+    assert link.figures() == (3, 900, -1, 1)
+    assert link.figures() == (-1, -1, -1, 1)
+    assert link.faulty() == 5_000
+    assert link.faulty() == 0
+
+
+def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:
+    timing = Timing(0, 1000, [Peer("b", 0, 0, known(0), None), Peer("c", 0, 0, known(0), None)], "a")
+    one, two = timing.meters
+    for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
+        one.take(sample(tick, 0), at_ns)
+    two.take(sample(9, 0), 80)
+    assert timing.echo() == [(0, 6, 60), (1, 9, 80)]
+    assert timing.echo() == []
+
+
+def test_the_first_windows_are_short() -> None:
+    estimator = OffsetEstimator()
+    link, sent = meter(Course(known(0)), estimator)
+    closed = []
+    for n in range(400):
+        now_ns = n * 10_000_000
+        sent.put(n, now_ns)
+        link.take(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
+        if link.close(now_ns + 600, now_ns + 600):
+            closed.append(now_ns)
+    assert closed[:FIRST_WINDOWS] == [FIRST_WINDOW_NS * (n + 1) for n in range(FIRST_WINDOWS)]
+    assert closed[FIRST_WINDOWS] - closed[FIRST_WINDOWS - 1] == S
+
+
+def test_who_shares_the_leaders_clock_is_not_steered() -> None:
+    timing = Timing(5, 1000, [Peer("a", 5, 0, known(0), None)], "a")
+    for k in range(0, 5000, 100):
+        timing.meters[0].take(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
+        assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []
+    assert timing.grid.deadline(10_000) == 5 + 10 * S
+    assert timing.grid.slew == 0.0

@@ -1,0 +1,146 @@
+"""Members on clocks of their own make the same run, and know where they stand; wall clocks decide nothing."""
+
+from pathlib import Path
+
+import pytest
+
+from sites import realtime
+from tests.truth import judged, members, offset_errors
+from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.log.reader import Log
+from trilat_net.scenario import load
+
+from .relay import Relay
+from .sessions import Session, in_log, in_virtual_time
+
+S = 1_000_000_000
+SKEWS = {"m2": (3 * S, 100_000), "s": (-500_000_000, -100_000), "recorder": (86_400 * S, 37_000)}
+
+
+def run(
+    folder: Path, skews: dict[str, tuple[int, int]], duration_s: float, relay: Relay | None = None
+) -> tuple[Session, Log]:
+    """A session of `asymmetric` in which members are on clocks of their own."""
+    session = Session(load("asymmetric", {"duration_s": duration_s}), folder / "run.mcap", relay or Relay())
+    session.skews = skews
+    session.recorder()
+    for name in session.scenario.names:
+        session.site(name)
+    return session, session.run()
+
+
+@pytest.fixture(scope="module")
+def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Log]:
+    """A session of all members on clocks of their own but the leader."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(realtime, "prepare", lambda _cpu: {"scheduling": "as it was", "memory": "as it was"})
+        return run(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
+
+
+def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log]) -> None:
+    session, log = skewed
+    assert log.complete
+    assert in_log(log) == in_virtual_time(session.scenario)
+    assert verify(log).passed
+    assert not compare_with_virtual(log).late
+
+
+@pytest.mark.usefixtures("unprepared")
+@pytest.mark.parametrize("names", [("m2",), ("m1", "recorder")])
+def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Path) -> None:
+    skews = {**SKEWS, "m1": (7 * S, 60_000)}
+    session, log = run(tmp_path, {name: skews[name] for name in names}, 0.3)
+    assert log.complete
+    assert in_log(log) == in_virtual_time(session.scenario)
+    clocks = members(log)
+    begun_ns = {name: clock.true_ns(0) for name, clock in clocks.items()}
+    assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000  # one instant, but for drift since
+
+
+def test_delays_and_offsets_in_the_log_are_true_within_the_bound(skewed: tuple[Session, Log]) -> None:
+    """Here messages take no time: the bound is what the clocks can have drifted, soon microseconds."""
+    _, log = skewed
+    for site in log.sites:
+        for peer in log.scenario.peers(site):
+            samples = judged(log, site, peer)
+            assert len(samples.tick) > 2000
+            assert samples.inside == 1.0
+            assert samples.bound_us[-1] < 50.0
+            errors = offset_errors(log, site, peer)
+            assert abs(errors[-1, 1]) < 10.0
+            assert abs(errors[-1, 2]) < 2.0
+
+
+def test_grids_follow_the_leaders_and_the_log_says_how(skewed: tuple[Session, Log]) -> None:
+    _, log = skewed
+    clocks = members(log)
+    for site, drift_ppb in (("m1", 0), ("m2", 100_000), ("s", -100_000)):
+        stats = log.link_stats(site)
+        assert all(abs(one.grid_error_us) <= 150 for one in stats)
+        assert abs(stats[-1].slew_ppb) <= 200_000
+        assert stats[-1].slew_ppb == pytest.approx(drift_ppb, abs=30_000)
+        last = log[site].states[-1]
+        late_ns = clocks[site].true_ns(last.sent_ns) - clocks["m1"].true_ns(last.t_ns)
+        assert abs(late_ns) <= 60_000
+
+
+def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log]) -> None:
+    session, log = skewed
+    told = [text for text in session.said if "another one" in text]
+    assert any(text.startswith("m1: clock of m2: another one, offset 3.0000") for text in told)
+    assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in told)
+    setups = {event.member: event for event in log.events if event.kind == "setup"}
+    assert "clock of m2: another one" in setups["s"].text
+    assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns
+    assert "skewed by 3000000000 ns" in setups["m2"].clock
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) -> None:
+    session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.5)
+    assert not any(event.kind == "clock" for event in log.events)
+    for site in log.sites:
+        for stats in log.link_stats(site):
+            assert set(stats.offset_us.values()) == set(stats.bound_us.values()) == {0}
+            assert (stats.grid_error_us, stats.slew_ppb) == (0, 0)
+    assert not any("another one" in text for text in session.said if not text.startswith("recorder"))
+
+
+class Stepping(Relay):
+    """Time whose wall clock jumps by hours, back and forth, at every reading."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.readings = 0
+
+    def unix_ns(self) -> int:
+        self.readings += 1
+        return super().unix_ns() + (-1) ** self.readings * self.readings * 3600 * S
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: Path) -> None:
+    (tmp_path / "steady").mkdir()
+    _, steady = run(tmp_path / "steady", SKEWS, 0.7)
+    session, log = run(tmp_path, SKEWS, 0.7, Stepping())
+    assert session.relay.readings > 0
+    assert in_log(log) == in_log(steady)
+    for site in log.sites:
+        assert [state.rx for state in log[site].states] == [state.rx for state in steady[site].states]
+        assert [state.sent_ns for state in log[site].states] == [s.sent_ns for s in steady[site].states]
+        assert log.link_stats(site)[-1].offset_us == steady.link_stats(site)[-1].offset_us
+    assert log.session["epoch_unix_ns"] != steady.session["epoch_unix_ns"]
+
+
+@pytest.mark.usefixtures("unprepared")
+@pytest.mark.parametrize("at_ns", [1_050_000_000, 1_250_000_000])
+def test_a_member_on_another_clock_that_hangs_while_joining_is_waited_for(at_ns: int, tmp_path: Path) -> None:
+    session = Session(load("two_sites", {"duration_s": 0.3}), tmp_path / "run.mcap")
+    session.skews = {"s": (S, 50_000)}
+    session.recorder()
+    for name in session.scenario.names:
+        session.site(name)
+    session.clocks["s"].stall(at_ns, 900_000_000)
+    log = session.run()
+    assert log.complete
+    assert in_log(log) == in_virtual_time(session.scenario)

@@ -1,0 +1,130 @@
+"""A visitor sees who is there and where their clocks stand; nobody sees the visitor."""
+
+from sites.probe import GATHER_NS, Probe
+from tests.net.parties import SESSION, Member, Party, told
+from trilat_net.net import topics
+from trilat_net.net.clock import SkewedClock
+from trilat_net.net.messages import VERSION, LinkStats
+from trilat_net.net.wire import encode
+
+S = 1_000_000_000
+
+
+class Visit:
+    """A probe of a party, on the party's clock."""
+
+    def __init__(self, party: Party, count: int = 10) -> None:
+        self._party = party
+        self.begun_ns = party.clock.monotonic_ns()
+        self.probe = Probe(party.network.join(), party.clock, SESSION, count)
+
+    def look(self, timeout_ns: int = S) -> Probe:
+        """Looks until it is over, while the members do what they do."""
+        for n in range(2_000_000_000):
+            if self.probe.over(timeout_ns, self.begun_ns):
+                break
+            self.probe.poll()
+            if n % 10 == 0:
+                for member in self._party.members.values():
+                    member.poll()
+            self._party.clock.sleep_until(self._party.clock.monotonic_ns() + 2_000_000)
+        return self.probe
+
+
+def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
+    party = Party(("m", "s"))
+    party.start("m", "recorder")
+    reached = Visit(party).look().reached()
+    assert [reach.info.member for reach in reached] == ["m", "recorder"]
+    assert all(len(reach.rtts_ns) >= 10 for reach in reached)
+    assert all(reach.shared and reach.estimate.bound_at(10**15, 0) == 0 for reach in reached)
+    assert party.members["m"].joining.meeting.missing() == ["s"]
+    party.start("s")
+    party.agreed()
+
+
+def test_a_clock_that_is_another_one_is_found() -> None:
+    party = Party(("m", "s"))
+    away = SkewedClock(party.clock, 3 * S, 50_000)
+    party.start("m")
+    party.start("s", on_clock=away)
+    (_, reach) = Visit(party).look().reached()
+    assert not reach.shared
+    now_ns = party.clock.monotonic_ns()
+    truth = away.monotonic_ns() - now_ns
+    value = reach.estimate.offset_at(now_ns)
+    assert abs(truth - value) <= reach.estimate.bound_at(now_ns, value) + 2
+
+
+def test_who_answers_no_ping_is_shown_without_any() -> None:
+    party = Party(("m", "s"))
+    party.start("m")
+    questions = party.stranger.questions(topics.key(SESSION, "s", topics.INFO))
+    visit = Visit(party)
+    for _ in range(20):
+        visit.probe.poll()
+        while (question := questions.poll()) is not None:
+            question.answer(encode(told("s", 9, clock="far away")))
+        party.clock.sleep_until(party.clock.monotonic_ns() + S // 10)
+    reach = visit.look().reached()[-1]
+    assert (reach.info.member, reach.rtts_ns, reach.estimate) == ("s", (), None)
+
+
+def test_nobody_there_is_over_after_the_time_that_it_was_given() -> None:
+    party = Party(("m", "s"))
+    probe = Visit(party).look(2 * S)
+    assert probe.reached() == []
+    assert 0 <= party.clock.monotonic_ns() - 10**9 - 2 * S <= S // 10
+
+
+def test_sites_that_run_say_how_their_links_are() -> None:
+    party = Party(("m", "s"))
+    party.start("m")
+    visit = Visit(party)
+    stats = LinkStats(
+        v=VERSION,
+        site="m",
+        boot=1,
+        tick=5,
+        t_ns=5,
+        mode="run",
+        overruns=0,
+        **{name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")},
+        late_max_us=0,
+        busy_max_us=0,
+        delay_us={"s": 120},
+    )
+    for junk in (b"", b"\xc1", bytes(70_000)):
+        party.say("m", junk, topics.LINK)
+        party.say("m", junk, topics.INFO)
+    party.say("m", encode(stats), topics.LINK)
+    assert visit.look().links == {"m": stats}
+
+
+def test_an_answer_under_the_key_of_another_is_nobodys() -> None:
+    party = Party(("m", "s"))
+    party.start("m")
+    questions = party.stranger.questions(topics.key(SESSION, "nobody", topics.INFO))
+    visit = Visit(party)
+    for _ in range(20):
+        visit.probe.poll()
+        while (question := questions.poll()) is not None:
+            question.answer(encode(told("s", 9)))
+        party.clock.sleep_until(party.clock.monotonic_ns() + S // 100)
+    assert [reach.info.member for reach in visit.look().reached()] == ["m"]
+
+
+def test_it_waits_a_little_for_the_others() -> None:
+    party = Party(("m", "s"))
+    party.start("m")
+    visit = Visit(party, count=5)
+    member: Member | None = None
+    while not visit.probe.over(S, visit.begun_ns):
+        visit.probe.poll()
+        for present in (party.members["m"], member):
+            if present is not None:
+                present.poll()
+        party.clock.sleep_until(party.clock.monotonic_ns() + 2_000_000)
+        if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHER_NS // 3:
+            member = party.member("s")
+    assert {reach.info.member for reach in visit.probe.reached()} == {"m", "s"}

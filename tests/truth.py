@@ -1,0 +1,127 @@
+"""The true one-way delay of every sample of a log whose clocks were skewed on one machine.
+
+All clocks there are one clock underneath, and a skewed clock's identity says how it was skewed: undoing it
+puts every raw stamp, the sender's `sent_ns` and the receiver's `echo`, onto that one clock.
+"""
+
+import re
+from bisect import bisect_right
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.core.grid import NS_PER_S
+from trilat_net.log.reader import Log
+from trilat_net.net.course import BEND_NS
+from trilat_net.net.messages import Event
+
+SKEWED = re.compile(r"skewed by (-?\d+) ns and (-?\d+) ns/s since (-?\d+) ns$")
+Ints = NDArray[np.int64]
+
+
+@dataclass
+class Member:
+    """A member's clock: what it reads is start + offset + (true - start) (1 + drift)."""
+
+    epoch_ns: int
+    start_ns: int
+    offset_ns: int
+    rate: Fraction
+
+    def true_ns(self, since_epoch_ns: int) -> int:
+        """Returns a reading since the epoch on the clock underneath."""
+        passed_ns = self.epoch_ns + since_epoch_ns - self.start_ns - self.offset_ns
+        return self.start_ns + round(passed_ns / self.rate)
+
+    def reading_ns(self, true_ns: int) -> int:
+        """Returns what it reads at an instant of the clock underneath."""
+        return self.start_ns + self.offset_ns + round((true_ns - self.start_ns) * self.rate)
+
+
+def members(log: Log) -> dict[str, Member]:
+    """The clocks of a log's members."""
+    started = next(event for event in log.events if event.kind == "start")
+    announced = next(e for e in log.events if e.kind == "epoch" and e.attempt == started.attempt)
+    clocks = {}
+    for name, identity in announced.clocks.items():
+        skew = SKEWED.search(identity)
+        offset_ns, drift_ppb, start_ns = map(int, skew.groups()) if skew else (0, 0, 0)
+        clocks[name] = Member(started.epochs[name], start_ns, offset_ns, 1 + Fraction(drift_ppb, NS_PER_S))
+    return clocks
+
+
+@dataclass
+class Judged:
+    """One link's samples: how wrong the logged delay of each was, and what was said of that at most.
+
+    Attributes:
+        tick: the receiver's tick that took the sample in.
+        delay_us: the true one-way delay, us.
+        error_us: logged minus true, us.
+        bound_us: the bound in force, us.
+    """
+
+    tick: Ints
+    delay_us: NDArray[np.float64]
+    error_us: NDArray[np.float64]
+    bound_us: NDArray[np.float64]
+
+    @property
+    def inside(self) -> float:
+        """Share of the samples whose error is inside the bound; a logged delay is whole microseconds."""
+        return float(np.mean(np.abs(self.error_us) <= self.bound_us + 1.0))
+
+
+class Bound:
+    """What a site's log says of the clock of one peer over time."""
+
+    def __init__(self, log: Log, site: str, peer: str) -> None:
+        self.events: list[Event] = [
+            e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)
+        ]
+        self._ticks = [event.ticks for event in self.events]
+
+    def at(self, tick: int, t_ns: int) -> float | None:
+        """The bound of an offset at a tick, us; None before the first that was logged."""
+        place = bisect_right(self._ticks, tick) - 1
+        if place < 0:
+            return None
+        event = self.events[place]
+        later_ns = max(0, t_ns - event.t_ns - BEND_NS)
+        return (event.bound_ns + later_ns * event.drift_bound_ppb / NS_PER_S) / 1000
+
+
+def judged(log: Log, site: str, peer: str) -> Judged:
+    """Every sample of a link that its receiver echoed, against the truth."""
+    clocks = members(log)
+    place = log.scenario.peers(site).index(peer)
+    sent = {state.tick: state.sent_ns for state in log[peer].states}
+    bound = Bound(log, site, peer)
+    shared = clocks[site] == clocks[peer]
+    rows = []
+    for state in log[site].states:
+        logged = {tick: delay_us for index, tick, delay_us in state.rx if index == place}
+        for index, tick, arrived_ns in state.echo:
+            limit_us = 0.0 if shared else bound.at(state.tick, state.t_ns)
+            if index == place and limit_us is not None:
+                true_ns = clocks[site].true_ns(arrived_ns) - clocks[peer].true_ns(sent[tick])
+                rows.append((state.tick, true_ns / 1000, logged[tick] - true_ns / 1000, limit_us))
+    ticks, delay, error, limit = np.array(rows).T
+    return Judged(ticks.astype(np.int64), delay, error, limit)
+
+
+def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
+    """Every logged estimate against the truth: t (s), error of the offset (us) and of the drift (ppm)."""
+    clocks = members(log)
+    own, other = clocks[site], clocks[peer]
+    drift_ppm = float(other.rate / own.rate - 1) * 1e6
+    rows = []
+    for event in Bound(log, site, peer).events:
+        true_ns = own.true_ns(event.t_ns)
+        offset_ns = other.reading_ns(true_ns) - own.reading_ns(true_ns)
+        rows.append(
+            (event.t_ns / NS_PER_S, (event.offset_ns - offset_ns) / 1000, event.drift_ppb / 1000 - drift_ppm)
+        )
+    return np.array(rows).reshape(-1, 3)
