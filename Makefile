@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo setup test pytest live lint bench lock clean
+.PHONY: help demo setup test pytest live containers lint bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -44,6 +44,9 @@ live: setup
 	rm -rf runs/check
 	$(BIN)/trilat demo paper --duration 10 --out runs/check
 	$(BIN)/trilat verify --virtual runs/check/run.mcap
+
+containers: setup
+	.ci/compose
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -1,0 +1,140 @@
+"""The first program of a container: who owns the results, and what it does where it may not."""
+
+import os
+import runpy
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+ENTRY = Path(__file__).parents[2] / "containers" / "entry.py"
+entry = SimpleNamespace(**runpy.run_path(str(ENTRY)))
+Owner = entry.Owner
+SOMEBODY = Owner(4321, 4322)
+
+needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+
+
+@pytest.fixture
+def mark(tmp_path: Path) -> Path:
+    """A file of the person who starts the containers."""
+    path = tmp_path / "compose.yaml"
+    path.touch()
+    return path
+
+
+def user_map(folder: Path, text: str) -> Path:
+    path = folder / "uid_map"
+    path.write_text(text, encoding="ascii")
+    return path
+
+
+def owner(path: Path) -> object:
+    facts = path.lstat()
+    return Owner(facts.st_uid, facts.st_gid)
+
+
+@needs_root
+def test_the_results_go_to_the_owner_of_the_mark(mark: Path) -> None:
+    os.chown(mark, *SOMEBODY)
+    assert entry.heir(mark) == SOMEBODY
+
+
+@needs_root
+def test_the_command_never_runs_as_root_of_the_host(mark: Path, tmp_path: Path) -> None:
+    nowhere = user_map(tmp_path, "         0          0 4294967295\n")
+    assert entry.heir(mark, nowhere) == Owner(entry.SERVANT, entry.SERVANT)
+
+
+@needs_root
+def test_root_of_a_rootless_engine_is_the_person_who_started_it(mark: Path, tmp_path: Path) -> None:
+    rootless = user_map(tmp_path, "0 1000 1\n1 100000 65536\n")
+    assert entry.heir(mark, rootless) == Owner(0, 0)
+
+
+@needs_root
+@pytest.mark.parametrize("exists", [False, True])
+def test_what_the_engine_made_is_given_with_the_folder_above(tmp_path: Path, exists: bool) -> None:
+    results = tmp_path / "runs" / "compose"
+    results.parent.mkdir()
+    if exists:
+        results.mkdir()
+        (results / "report.html").touch()
+    entry.give(results, SOMEBODY)
+    assert {owner(path) for path in (results.parent, results, *results.iterdir())} == {SOMEBODY}
+
+
+@needs_root
+def test_roots_own_folder_above_stays_roots(tmp_path: Path) -> None:
+    results = tmp_path / "runs" / "compose"
+    results.parent.mkdir()
+    entry.give(results, Owner(entry.SERVANT, entry.SERVANT))
+    assert owner(results.parent) == Owner(0, 0)
+    assert owner(results) == Owner(entry.SERVANT, entry.SERVANT)
+
+
+@needs_root
+def test_nobody_is_deprived(tmp_path: Path) -> None:
+    """Neither of a folder nor of what lies in one; and a link is given, not what it leads to."""
+    theirs, results = tmp_path / "theirs", tmp_path / "runs" / "compose"
+    results.mkdir(parents=True)
+    secret, link, kept = tmp_path / "secret", results / "link", results / "kept"
+    secret.touch()
+    kept.touch()
+    link.symlink_to(secret)
+    os.chown(kept, 99, 99)
+    entry.give(results, SOMEBODY)
+    assert (owner(secret), owner(kept), owner(link)) == (Owner(0, 0), Owner(99, 99), SOMEBODY)
+    theirs.mkdir()
+    (theirs / "kept").touch()
+    os.chown(theirs, 99, 99)
+    entry.give(theirs, SOMEBODY)
+    assert (owner(theirs), owner(theirs / "kept")) == (Owner(99, 99), Owner(0, 0))
+
+
+def test_who_may_not_write_is_told_who_and_where(
+    tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 1234)
+    monkeypatch.setattr(os, "getgid", lambda: 1235)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(SystemExit) as end:
+        entry.hand_over(tmp_path, mark)
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: user 1234:1235 cannot write into {tmp_path}: ")
+    assert f"sudo chown -R 1234:1235 {tmp_path}" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_mark_that_is_not_there_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    with pytest.raises(SystemExit):
+        entry.hand_over(tmp_path, tmp_path / "missing")
+    assert "No such file" in capsys.readouterr().err
+
+
+def test_a_cache_is_copied_and_a_missing_one_is_no_failure(tmp_path: Path) -> None:
+    held, own = tmp_path / "held", tmp_path / "own"
+    entry.warm(held, own)
+    assert not own.exists()
+    (held / "deep").mkdir(parents=True)
+    (held / "deep" / "code").write_bytes(b"compiled")
+    for _ in range(2):  # a container that is started again has it already
+        entry.warm(held, own)
+        assert (own / "deep" / "code").read_bytes() == b"compiled"
+
+
+def test_it_becomes_the_command(tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    became: list[Sequence[str]] = []
+    monkeypatch.setattr(os, "getuid", lambda: 1234)
+    monkeypatch.setattr(os, "execvp", lambda _file, words: became.append(words))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    results = tmp_path / "runs"
+    entry.main(["--results", str(results), "--heir", str(mark), "trilat", "record", "--session", "x"])
+    entry.main(["trilat", "sim", "-o", "x.mcap"])
+    assert became == [["trilat", "record", "--session", "x"], ["trilat", "sim", "-o", "x.mcap"]]
+    assert results.is_dir()
