@@ -2,10 +2,10 @@
 
 import sys
 
-from . import machine, presets, tick, virtual
+from . import clocks, machine, presets, tick, virtual
 
 BENCHMARKS = {"tick": tick.run, "virtual": virtual.run}
-LONG = {"presets": presets.run}
+LONG = {"clocks": clocks.run, "presets": presets.run}
 """Only when they are named."""
 
 

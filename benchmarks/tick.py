@@ -8,30 +8,58 @@ from trilat_net.core.kernel import site_tick
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Arrival, Tick
 from trilat_net.net.messages import Sample
+from trilat_net.net.offset import OffsetEstimator, known
+from trilat_net.net.timing import Peer, Timing
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import load
 
 from .stopwatch import each_us
+
+AT_NS = 10_000_000_000
+DELAY_NS = 300_000
 
 
 def run() -> list[str]:
     scenario = load("paper")
     site = Site(scenario.setup("m1"))
     record = site.step(Tick(0))
-    payloads = [encode_state(peer, 7, ("m1", "s"), record, [], 0, 0) for peer in site.peers]
+    echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
+    payloads = [encode_state(p, 7, ("m1", "s"), record, [], 0, 0, AT_NS - DELAY_NS, echo) for p in site.peers]
+    peers = [Peer(peer, 0, 0, known(0), OffsetEstimator()) for peer in site.peers]
+    timing = Timing(0, site.rate_hz, peers, "m2")
+    timing.sent(0, AT_NS - 2 * DELAY_NS)
     counter = iter(range(1, 10_000_000))
 
-    def arrivals() -> list[Arrival]:
-        samples = [decode(payload, Sample) for payload in payloads]
-        return [Arrival(j, s.tick, s.q, s.qd) for j, s in enumerate(samples)]
+    def decoded() -> list[Sample]:
+        return [decode(payload, Sample) for payload in payloads]
 
-    came = arrivals()
+    def arrivals(samples: list[Sample]) -> list[Arrival]:
+        pairs = zip(timing.meters, samples, strict=True)
+        delays = [meter.take(sample, AT_NS) for meter, sample in pairs]
+        return [Arrival(j, s.tick, s.q, s.qd, delays[j] // 1000) for j, s in enumerate(samples)]
+
+    def stamps() -> None:
+        k = next(counter)
+        timing.grid.deadline(k)
+        arrivals(samples)
+        timing.sent(k, AT_NS)
+        timing.echo()
+        if k % 100 == 0:
+            timing.measured(AT_NS)
+
+    samples = decoded()
+    came = arrivals(samples)
     output = site.step(Tick(next(counter), came))
 
     def whole() -> bytes:
-        taken = arrivals()
-        done = site.step(Tick(next(counter), taken))
-        return encode_state("m1", 7, site.peers, done, taken, 0, 0)
+        k = next(counter)
+        timing.grid.deadline(k)
+        taken = arrivals(decoded())
+        done = site.step(Tick(k, taken))
+        sent_ns, echoed = timing.sent(k, AT_NS), timing.echo()
+        if k % 100 == 0:
+            timing.measured(AT_NS)
+        return encode_state("m1", 7, site.peers, done, taken, 0, 0, sent_ns, echoed)
 
     def leaf() -> None:
         site_tick(
@@ -52,10 +80,13 @@ def run() -> list[str]:
     gc.disable()
     total = each_us(whole)
     parts = {
-        "decode two payloads": each_us(arrivals),
+        "decode two payloads": each_us(decoded),
+        "stamps: deadline, two delays, sending, echo": each_us(stamps),
         "Site.step": each_us(lambda: site.step(Tick(next(counter), came))),
         "  of it the compiled leaf": each_us(leaf),
-        "encode the record": each_us(lambda: encode_state("m1", 7, site.peers, output, came, 0, 0)),
+        "encode the record": each_us(
+            lambda: encode_state("m1", 7, site.peers, output, came, 0, 0, AT_NS, echo)
+        ),
     }
     gc.enable()
     p50, p99 = np.percentile(total, (50, 99))

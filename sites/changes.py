@@ -11,8 +11,8 @@ from trilat_net.core.grid import first_tick_at, tick_ns
 from trilat_net.core.site import MAX_COMMANDS
 from trilat_net.core.tick import Command
 from trilat_net.errors import ScenarioError, WireError
+from trilat_net.net.answers import Order, Reply
 from trilat_net.net.bus import Question, Questions
-from trilat_net.net.messages import Order, Reply
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario, command, later_tables, owner, present_links, resolve_change
 

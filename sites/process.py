@@ -5,7 +5,7 @@ epoch its arm is braked; at the end it stays until the recorder has every record
 """
 
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import msgspec
@@ -13,19 +13,18 @@ import msgspec
 from trilat_net.core.fingerprint import fingerprint
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Mode, Output, diverged_text, mode_text
-from trilat_net.errors import RunFailed, SessionError, WireError
+from trilat_net.errors import RunFailed, SessionError
 from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Inbox
+from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, system_clock
 from trilat_net.net.connection import Connection, open_bus
-from trilat_net.net.messages import Event, Info
+from trilat_net.net.messages import Info
 from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.stats import LoopStats
-from trilat_net.net.timing import Timing
-from trilat_net.net.voice import Voice, new_boot
-from trilat_net.net.wire import decode
+from trilat_net.net.timing import News, Timing
+from trilat_net.net.voice import Voice, new_boot, said
 from trilat_net.scenario import Scenario
 
 from . import realtime
@@ -171,6 +170,7 @@ class Member:
             clock=self._clock.identity(),
         )
         self._say(f"{self._name}: the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
+        self._report(self._timing.opening(), 0)
         for sentence in clocks:
             self._say(f"{self._name}: {sentence}")
         ports = Ports(
@@ -215,9 +215,13 @@ class Member:
         """Ten times a second: answers questions, follows the leader's grid, and says who is gone."""
         self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
         self._voice.answer()
-        for news in self._timing.settle(k + 1, self._clock.monotonic_ns()):
-            self._voice.say(news.kind, news.text, t_ns=t_ns, **news.facts)
+        self._report(self._timing.settle(k + 1, self._clock.monotonic_ns()), t_ns)
         self._watch(t_ns)
+
+    def _report(self, clocks: Iterable[News], t_ns: int) -> None:
+        """Says what is new of the peers' clocks."""
+        for news in clocks:
+            self._voice.say(news.kind, news.text, t_ns=t_ns, **news.facts)
 
     def _tell(self, output: Output) -> None:
         """Says what a tick changed."""
@@ -231,7 +235,7 @@ class Member:
     def _hear(self) -> None:
         """Takes what the peers say of their own end."""
         for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):
-            for event in _events(inbox):
+            for event in said(inbox):
                 if event.boot != self._epoch.boots[peer]:
                     continue
                 if event.kind == "diverged":
@@ -282,17 +286,8 @@ class Member:
             self._watch(t_ns)
             if topics.RECORDER in self._gone:  # its last word may still be under way; or its process ends
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + (PARTING_NS if stored else LAST_WORD_NS))
-            for event in _events(self._recorder_events):
+            for event in said(self._recorder_events):
                 if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
                     stored = True
                     give_up_ns = clock.monotonic_ns() + int(self._options.stay_s * 1e9)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-
-
-def _events(inbox: Inbox) -> Iterator[Event]:
-    """Yields the events that wait; what is none of ours is passed over."""
-    while (message := inbox.poll()) is not None:
-        try:
-            yield decode(message[1], Event)
-        except WireError:
-            continue

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .analysis.notes import run_lines
 from .analysis.tables import VerdictLine
 from .errors import UsageError
 from .experiment import compare_with_virtual, twin_without_hands
@@ -28,12 +29,14 @@ class Conclusion(NamedTuple):
     Attributes:
         columns: heads of the table.
         rows: a row per site.
+        notes: what links did and what happened, a line each.
         lines: what was checked and how it came out.
         paths: the files that were made.
     """
 
     columns: tuple[str, ...]
     rows: list[tuple[str, ...]]
+    notes: list[str]
     lines: list[VerdictLine]
     paths: list[Path]
 
@@ -64,6 +67,7 @@ def conclude(log: Log, folder: Path) -> Conclusion:
     with _worker() as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(_check_file, log.source)
         twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
+        notes = run_lines(log)
 
         def verdicts() -> Iterator[VerdictLine]:
             lines.extend(checking.result())
@@ -71,7 +75,7 @@ def conclude(log: Log, folder: Path) -> Conclusion:
 
         made = write_report(log, folder, twin=twin, verdicts=verdicts())
     rows = [_row(log, site) for site in log.sites]
-    return Conclusion(_COLUMNS, rows, lines, [Path(log.source), *made])
+    return Conclusion(_COLUMNS, rows, notes, lines, [Path(log.source), *made])
 
 
 def _worker() -> ProcessPoolExecutor:
@@ -84,17 +88,17 @@ def _check_file(source: str) -> list[VerdictLine]:
     return list(_checks(open_log(source), virtual=True))
 
 
-def check_lines(file: Path, *, virtual: bool) -> list[VerdictLine]:
+def check_lines(log: Log, *, virtual: bool) -> list[VerdictLine]:
     """Returns what executing a log again showed.
 
     Args:
-        file: the log.
+        log: the log.
         virtual: whether to compare it with virtual time as well.
 
     Raises:
-        LogError: the log cannot be read.
+        LogError: a record cannot be read.
     """
-    lines = list(_checks(open_log(file), virtual=virtual))
+    lines = list(_checks(log, virtual=virtual))
     # whether a log is complete is not what its execution shows: reported, and no failure of it
     return [line._replace(passed=True) if line.label == _RECORDS else line for line in lines]
 

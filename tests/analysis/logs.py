@@ -1,17 +1,23 @@
 """Logs of every kind that a report must stand: few sites, many, nobody's hands, torn, short, late."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import msgspec
 
 import trilat_net
-from trilat_net.log.reader import Log, open_log
+from trilat_net.core.tick import LinkCounts
+from trilat_net.log.reader import Log, SiteLog, open_log
 from trilat_net.log.writer import LogWriter
 from trilat_net.net import topics
-from trilat_net.net.wire import State, encode
-from trilat_net.scenario import load, parse
+from trilat_net.net.messages import Event, LinkStats
+from trilat_net.net.wire import State, encode, encode_state
+from trilat_net.scenario import Scenario, command, load, parse
+from trilat_net.scenario.timeline import Change
+from trilat_net.sim import virtual
+from trilat_net.sim.network import RecordedNetwork
 
 FOUR = """
 name = "four"
@@ -44,9 +50,126 @@ c = { d = 1.0 }
 d = { a = 1.0 }
 """
 
+BUSY = """
+name = "busy"
+rate_hz = 200
+duration_s = 6.0
+seed = 5
+scheme = "second_order"
+[link]
+delay_ms = 50.0
+[on_stale]
+action = "hold"
+age_ms = 200.0
+return_s = 0.5
+[sites.a]
+role = "master"
+q0_rad = [0.3, -0.2]
+[sites.b]
+role = "master"
+rate_hz = 150
+on_stale = { action = "brake" }
+[sites.c]
+role = "slave"
+[dominance]
+a = { b = 0.5, c = 0.5 }
+b = { a = 0.5, c = 0.5 }
+c = { a = 0.5, b = 0.5 }
+[links."a->b"]
+outages_s = [[2.0, 3.0]]
+[links."b->a"]
+model = "gamma"
+delay_ms = 80.0
+deviation_ms = 30.0
+loss = 0.2
+loss_burst = 5.0
+[links."c->a"]
+model = "uniform"
+delay_ms = 60.0
+half_width_ms = 40.0
+order = "in_order"
+duplicate = 0.2
+[links."b->c"]
+model = "ar1"
+delay_ms = 60.0
+deviation_ms = 20.0
+correlation = 0.9
+playout_ms = 70.0
+[links."c->b"]
+model = "sine"
+delay_ms = 60.0
+amplitude_ms = 30.0
+period_s = 0.7
+[[timeline]]
+at_s = 1.0
+link = "a->c"
+to = { delay_ms = 90.0, loss = 0.1 }
+[[timeline]]
+at_s = 4.0
+dominance = "c"
+to = { a = 0.9, b = 0.1 }
+ramp_s = 1.0
+[[timeline]]
+at_s = 99.0
+link = "a->c"
+to = { delay_ms = 1.0 }
+"""
+"""Links of many kinds, two sites that lose a peer for a second, changes, one of them after the end."""
+
+ORDERED = {
+    "a": {500: Change(3.0, link="c->a", to={"model": "uniform", "delay_ms": 30.0, "half_width_ms": 30.0})}
+}
+"""What is ordered while it runs besides: per site and tick."""
+
+
+class Run(NamedTuple):
+    """A run that this module drove itself: its log, and what each site's links counted."""
+
+    log: Log
+    counts: dict[str, tuple[LinkCounts, ...]]
+
+
+Sample = tuple[str, int, int]
+"""Receiver, index of the peer among its peers, tick of the sample."""
+
 
 @cache
-def virtual(name: str) -> Log:
+def busy() -> Run:
+    return driven(parse(BUSY))
+
+
+def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()) -> Run:
+    """A run with `ORDERED` changes, where they fit, over a network that loses and doubles some samples."""
+    at: dict[str, dict[int, list[list[int]]]] = {}
+    for name in scenario.names:
+        at[name] = {}
+        rate_hz = scenario.sites[name].rate_hz
+        for index, peer in enumerate(scenario.peers(name)):
+            for tick in range(scenario.ticks(peer)):
+                comes = tick * rate_hz // scenario.sites[peer].rate_hz + 1
+                times = 1 - ((name, index, tick) in lost) + ((name, index, tick) in twice)
+                at[name].setdefault(comes, []).extend([[index, tick, 0]] * times)
+    network = RecordedNetwork(at, {name: scenario.peers(name) for name in scenario.names})
+    ordered = {
+        site: {tick: [command(scenario, change)] for tick, change in changes.items()}
+        for site, changes in ORDERED.items()
+        if site in scenario.sites
+    }
+    stream = io.BytesIO()
+    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
+    counts = {}
+    for site, arrivals, output in virtual.run(scenario, network, ordered):
+        payload = encode_state(site.name, 1, site.peers, output, arrivals, 0, 0)
+        key = topics.key(scenario.name, site.name, topics.STATE)
+        writer.add_state(site.name, key, payload, output.t_ns, output.t_ns, output.tick)
+        counts[site.name] = site.counts()
+    writer.finish({})
+    stream.seek(0)
+    return Run(open_log(stream), counts)
+
+
+@cache
+def simulated(name: str) -> Log:
     """Two seconds of a shipped scenario, or of four sites with rates of their own."""
     if name == "four":
         return trilat_net.simulate(parse(FOUR))
@@ -55,7 +178,7 @@ def virtual(name: str) -> Log:
 
 @cache
 def twin(name: str) -> Log:
-    return trilat_net.simulate(virtual(name).scenario.without_hands())
+    return trilat_net.simulate(simulated(name).scenario.without_hands())
 
 
 @cache
@@ -69,8 +192,9 @@ def rewritten(
     change: Callable[[State], State] = lambda state: state,
     driver: str = "virtual",
     finished: bool = True,
+    others: Sequence[LinkStats | Event] = (),
 ) -> Log:
-    """The log with some of its records, changed, in a file of its own."""
+    """The log with some of its records, changed, and other messages, in a file of its own."""
     stream = io.BytesIO()
     writer = LogWriter(stream, log.scenario, "again", driver, 1_700_000_000 * 10**9)
     for site in log.sites:
@@ -79,6 +203,10 @@ def rewritten(
             writer.add_state(
                 site, topics.key("again", site, topics.STATE), payload, state.t_ns, 0, state.tick
             )
+    for message in others:
+        stats = isinstance(message, LinkStats)
+        member, channel = (message.site, topics.LINK) if stats else (message.member, topics.EVENT)
+        writer.add(topics.key("again", member, channel), encode(message), 0, 0, 0)
     writer.flush()
     if finished:
         writer.finish({})
@@ -93,3 +221,16 @@ def timed(log: Log) -> Log:
         change=lambda state: msgspec.structs.replace(state, late_us=state.tick, busy_us=7),
         driver="live",
     )
+
+
+def replaced(state: State, **fields: object) -> State:
+    return msgspec.structs.replace(state, **fields)
+
+
+def in_modes(modes: Sequence[str]) -> SiteLog:
+    """The first records of a site of `paper`, with other modes."""
+    part = simulated("paper")["m1"]
+    states = [replaced(state, mode=mode) for state, mode in zip(part.states, modes, strict=False)]
+    changed = SiteLog("m1", part.peers, part.rate_hz, [], "again")
+    changed.states = states
+    return changed

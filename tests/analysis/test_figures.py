@@ -5,17 +5,28 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from trilat_net.analysis import figures, motion, poses, quantities, style, timing
+import trilat_net
+from trilat_net.analysis import ages, figures, marks, motion, poses, quantities, style, timing
+from trilat_net.analysis.happenings import spans
 
 from . import logs
 
-UNIT = re.compile(r"\((s|rad|m|N m|kg m|kg m²|ms|µs|count)\)$")
+UNIT = re.compile(r"\((s|rad|m|N m|kg m|kg m²|ms|µs|count|%)\)$")
 SCENARIOS = ("two_sites", "paper", "four")
+BACKGROUND = 0.6
+"""What marks are drawn at or below, so that lines cover them."""
 
 
 def outer(figure):
     """Panels in which something is drawn."""
     return [axes for axes in figure.axes if axes.axison]
+
+
+def marked(figure):
+    """What is drawn behind the lines of all panels: shades, and lines where something was changed."""
+    shades = [p for axes in figure.axes for p in axes.patches if p.get_zorder() < BACKGROUND]
+    changes = [line for axes in figure.axes for line in axes.lines if line.get_zorder() == BACKGROUND]
+    return shades, changes
 
 
 def lines(axes):
@@ -25,7 +36,7 @@ def lines(axes):
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_axis_says_its_unit(name):
-    log = logs.timed(logs.virtual(name))
+    log = logs.timed(logs.simulated(name))
     for title, figure in figures.all_figures(log, logs.twin(name)):
         grid = outer(figure)
         assert grid, title
@@ -41,14 +52,14 @@ def test_every_axis_says_its_unit(name):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_figures_are_written_and_leave_matplotlib_as_it_was(name, tmp_path):
     before = dict(mpl.rcParams)
-    paths = figures.write_figures(logs.timed(logs.virtual(name)), tmp_path, logs.twin(name))
+    paths = figures.write_figures(logs.timed(logs.simulated(name)), tmp_path, logs.twin(name))
     assert len(paths) == 8
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
     assert dict(mpl.rcParams) == before
 
 
 def test_a_site_has_one_colour_in_every_figure():
-    log = logs.virtual("paper")
+    log = logs.simulated("paper")
     for figure in (
         motion.tracking_errors(log),
         motion.parameter_estimates(log),
@@ -61,7 +72,7 @@ def test_a_site_has_one_colour_in_every_figure():
 
 
 def test_operator_torque_is_the_torque_on_the_arm():
-    log = logs.virtual("four")
+    log = logs.simulated("four")
     (line,) = lines(motion.operator_torques(log).axes[0])
     assert line.get_ydata().max() == pytest.approx(8.0, rel=1e-3)
     assert line.get_ydata().min() == 0.0
@@ -69,20 +80,20 @@ def test_operator_torque_is_the_torque_on_the_arm():
 
 
 def test_nobody_at_the_arms_is_said():
-    log = logs.virtual("free")
+    log = logs.simulated("free")
     for figure in (motion.operator_torques(log), motion.hands_moved(log, None)):
         assert [text.get_text() for text in figure.texts] == [motion.NO_HANDS]
-    (text,) = motion.hands_moved(logs.virtual("paper"), None).texts
+    (text,) = motion.hands_moved(logs.simulated("paper"), None).texts
     assert text.get_text() == motion.NO_TWIN
 
 
 def test_virtual_time_is_said_instead_of_zeros():
-    (text,) = timing.loop_timing(logs.virtual("paper")).texts
+    (text,) = timing.loop_timing(logs.simulated("paper")).texts
     assert text.get_text() == timing.NO_CLOCK
 
 
 def test_histograms_count_every_tick():
-    log = logs.timed(logs.virtual("four"))
+    log = logs.timed(logs.simulated("four"))
     edges = timing.bin_edges(log)
     for site in log.sites:
         assert timing.histogram(log[site].late_us, edges).sum() == len(log[site])
@@ -90,7 +101,7 @@ def test_histograms_count_every_tick():
 
 
 def test_estimates_show_the_sites_that_are_asked_for():
-    log = logs.virtual("paper")
+    log = logs.simulated("paper")
     figure = motion.parameter_estimates(log, ["m2"])
     assert [len(lines(axes)) for axes in figure.axes] == [1] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
@@ -98,17 +109,87 @@ def test_estimates_show_the_sites_that_are_asked_for():
 
 
 def test_ages_are_drawn_per_link():
-    log = logs.virtual("four")
-    figure = timing.sample_age(log)
+    log = logs.simulated("four")
+    figure = ages.sample_age(log)
     assert len(figure.axes) == 12
     assert figure.axes[0].get_title(loc="left") == "b → a"
-    ages = lines(figure.axes[0])[0].get_ydata()
-    assert np.isnan(ages[0])
-    assert np.nanmin(ages) >= 40.0
+    drawn = lines(figure.axes[0])[0].get_ydata()
+    assert np.isnan(drawn[0])
+    assert np.nanmin(drawn) >= 40.0
+
+
+def test_a_log_in_which_nothing_happened_has_no_marks_and_no_distribution():
+    log = logs.simulated("paper")
+    for title, figure in figures.all_figures(log, logs.twin("paper")):
+        assert marked(figure) == ([], []), title
+        assert figure.get_supxlabel() == ""
+    assert "delay_distributions" not in dict(figures.all_figures(log, None))
+    assert [text.get_text() for text in ages.delay_distributions(log).texts] == [ages.NO_JITTER]
+
+
+def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow():
+    log = logs.busy().log
+    figure = motion.positions(log)
+    for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
+        for axes in row:
+            at_s = [line.get_xdata()[0] for line in axes.lines if line.get_zorder() == BACKGROUND]
+            assert at_s == {"a": [3.0], "b": [], "c": [1.0, 4.0]}[site]
+            drawn = [edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())]
+            assert drawn == pytest.approx([edge for span in spans(log[site]) for edge in span[1:]])
+    shades, changes = marked(motion.tracking_errors(log))
+    assert len(changes) == 3 * 3
+    assert len(shades) == 3 * sum(len(spans(log[site])) for site in log.sites)
+    assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
+    assert "holds" in figure.get_supxlabel()
+
+
+def test_of_many_changes_a_figure_names_the_first_ones(monkeypatch):
+    monkeypatch.setattr(marks, "MOST", 1)
+    assert "and 2 more" in motion.positions(logs.busy().log).get_supxlabel()
+
+
+def test_the_stated_mean_is_drawn_while_it_holds_and_not_where_there_is_none():
+    log = logs.busy().log
+    figure = ages.sample_age(log)
+    panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
+    t_s, mean_ms = lines(panel)[-1].get_data()
+    assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
+    assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
+    measured = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
+    figure = ages.sample_age(measured)
+    assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
+    assert "mean delay as stated" not in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_distributions_are_cumulative_and_of_delay_and_age():
+    log = logs.busy().log
+    assert "delay_distributions" in dict(figures.all_figures(log, None))
+    for axes in ages.delay_distributions(log).axes:
+        age, delay = (line.get_ydata() for line in axes.lines)
+        for curve in (age, delay):
+            assert (np.diff(curve) >= 0.0).all()
+            assert curve[0] < 1.0
+            assert 80.0 < curve[-1] <= 100.0
+
+
+@pytest.mark.parametrize("outage_ms", [0.0, 5000.0])
+def test_the_axis_of_ages_is_logarithmic_after_an_outage(outage_ms):
+    values = np.append(np.full(1000, 200.0), 200.0 + outage_ms)
+    assert ages.is_tall(values) == (outage_ms > 0.0)
+    assert not ages.is_tall(np.full(3, np.nan))
+
+
+def test_shares_are_of_all_that_there_is():
+    assert ages.percent_up_to(np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])).tolist() == [
+        0,
+        75,
+        100,
+    ]
+    assert np.isnan(ages.percent_up_to(np.zeros(0), np.zeros(2))).all()
 
 
 def test_arms_stand_where_their_angles_put_them():
-    arm = logs.virtual("four").scenario.sites["c"].arm
+    arm = logs.simulated("four").scenario.sites["c"].arm
     base, elbow, tip = poses.joints_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert base == pytest.approx([0.0, 0.0])
     assert elbow == pytest.approx([0.0, 0.6])
@@ -116,7 +197,7 @@ def test_arms_stand_where_their_angles_put_them():
 
 
 def test_arms_fit_into_their_panels_with_equal_axes():
-    log = logs.virtual("four")
+    log = logs.simulated("four")
     figure = poses.arms(log, [0.0, 1.0])
     assert len(figure.axes) == 8
     for axes in figure.axes:
@@ -132,7 +213,7 @@ def test_arms_fit_into_their_panels_with_equal_axes():
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_instants_begin_at_the_beginning_and_end_at_the_end(name):
-    log = logs.virtual(name)
+    log = logs.simulated(name)
     instants = poses.instants_s(log)
     assert instants[0] == 0.0
     assert instants[-1] == pytest.approx(2.0)

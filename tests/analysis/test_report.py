@@ -57,7 +57,7 @@ def column(table, n):
 
 @pytest.mark.parametrize("name", ["two_sites", "paper", "four"])
 def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
-    paths, html, data = written(logs.virtual(name), tmp_path, logs.twin(name))
+    paths, html, data = written(logs.simulated(name), tmp_path, logs.twin(name))
     assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
     assert all(path.suffix == ".png" for path in paths[2:])
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
@@ -69,7 +69,7 @@ def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
 
 
 def test_the_page_asks_nothing_of_any_network():
-    html, _ = page(logs.timed(logs.virtual("four")))
+    html, _ = page(logs.timed(logs.simulated("four")))
     seen = Page(html)
     for tag, attrs in seen.elements:
         assert tag not in ("link", "img", "iframe", "object", "base", "form")
@@ -85,7 +85,7 @@ def test_the_page_asks_nothing_of_any_network():
 
 
 def test_texts_of_a_scenario_stay_texts():
-    log = logs.virtual("four")
+    log = logs.simulated("four")
     html, _ = page(log)
     seen = Page(html)
     assert len(seen.scripts()) == 3  # data, library, page
@@ -97,13 +97,13 @@ def test_texts_of_a_scenario_stay_texts():
 
 
 def test_verdicts_show_what_passed_and_what_failed():
-    html, _ = page(logs.virtual("paper"))
+    html, _ = page(logs.simulated("paper"))
     items = [attrs["class"] for tag, attrs in Page(html).elements if tag == "li" and "class" in attrs]
     assert items == ["passed", "failed"]
 
 
 def test_the_page_says_how_to_do_it_again():
-    html, _ = page(logs.virtual("four"))
+    html, _ = page(logs.simulated("four"))
     assert "trilat verify FILE" in html
     assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
     assert "dominance" in html
@@ -115,7 +115,7 @@ def test_a_spike_of_one_tick_is_on_the_page():
             msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
         )
 
-    log = logs.rewritten(logs.virtual("paper"), change=spike)
+    log = logs.rewritten(logs.simulated("paper"), change=spike)
     _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
     series = chart["series"][0]
@@ -127,7 +127,7 @@ def test_a_spike_of_one_tick_is_on_the_page():
 
 
 def test_the_page_holds_the_log():
-    log = logs.virtual("two_sites")
+    log = logs.simulated("two_sites")
     _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
@@ -135,9 +135,40 @@ def test_the_page_holds_the_log():
         assert values == pytest.approx(quantities.errors(log[site])[:, 1], rel=1e-6, abs=1e-12)
 
 
+def test_the_page_tells_what_the_links_did_and_what_happened():
+    html, data = page(logs.busy().log)
+    assert "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms" in html
+    assert "ordered, taken in at tick 500 of a" in html
+    assert '<td class="words">brake</td>' in html
+    assert [change["n"] for change in data["changes"]] == [1, 2, 3]
+    assert {span[1] for spans in data["spans"].values() for span in spans} == {"hold", "brake", "return"}
+    (chart,) = (c for c in data["charts"] if c["section"] == "ages" and c["sites"] == ["c"])
+    # a at 50 and then 90 ms, b at its mean throughout
+    drawn = [(line["colour"], line["from"], round(line["to"], 9)) for line in chart["lines"]]
+    assert drawn == [(0, 0.0, 1.0), (0, 1.0, 6.0), (1, 0.0, 6.0)]
+    curves = [series for c in data["charts"] if c["section"] == "delays" for series in c["series"]]
+    assert len(curves) == 2 * 6
+    for curve in curves:
+        percent = np.frombuffer(base64.b64decode(curve["values"]), "<f4")
+        assert len(percent) == 400
+        assert (np.diff(percent) >= 0.0).all()
+
+
+def test_the_page_of_a_plain_log_has_nothing_superfluous():
+    html, data = page(logs.simulated("paper"))
+    assert data["changes"] == []
+    assert set(map(len, data["spans"].values())) == {0}
+    assert not [c for c in data["charts"] if c["section"] == "delays"]
+    assert "What was changed" not in html
+    assert "about stale peers" not in html
+    assert "clock of the sender" not in html
+    ages = [c for c in data["charts"] if c["section"] == "ages"]
+    assert [chart["lines"] for chart in ages] == [[{"value": 200.0, "colour": "limit"}]] * 3
+
+
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_a_report(records, tmp_path):
-    log = logs.rewritten(logs.virtual("paper"), keep=lambda s: s.tick < records, finished=False)
+    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False)
     paths, html, _ = written(log, tmp_path, logs.twin("paper"))
     assert "the file was not finished" in html
     assert len(paths) == 10
@@ -145,7 +176,7 @@ def test_short_logs_have_a_report(records, tmp_path):
 
 @pytest.mark.parametrize("silent", ["m1", "m2", "s"])
 def test_a_site_without_records_has_a_report(silent, tmp_path):
-    log = logs.rewritten(logs.timed(logs.virtual("paper")), keep=lambda s: s.site != silent, driver="live")
+    log = logs.rewritten(logs.timed(logs.simulated("paper")), keep=lambda s: s.site != silent, driver="live")
     paths, _, _ = written(log, tmp_path, logs.twin("paper"))
     assert len(paths) == 10
 

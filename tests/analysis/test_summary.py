@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import trilat_net
 from trilat_net.analysis.summary import summarise
 
 from . import logs
@@ -15,7 +16,7 @@ def strict(facts):
 
 
 def test_numbers_agree_with_the_records():
-    log = logs.virtual("paper")
+    log = logs.simulated("paper")
     facts = strict(summarise(log, logs.twin("paper")))
     for name in log.sites:
         states = log[name].states
@@ -33,14 +34,18 @@ def test_numbers_agree_with_the_records():
             for s, t in zip(states, logs.twin("paper")[name].states, strict=True)
         ]
         assert site["hands_moved_max_rad"] == [max(joint) for joint in zip(*moved, strict=True)]
-    assert facts["links"]["m2->s"]["age_ms"] == {"p50": 200.0, "min": 200.0, "max": 200.0}
-    assert facts["links"]["m2->s"]["late_samples"] == 0
+    link = facts["links"]["m2->s"]
+    age = dict.fromkeys(("mean", "p50", "p95", "p99", "min", "max"), 200.0)
+    assert link["age_ms"] == {**age, "deviation": 0.0}
+    assert link["late_samples"] == 0
+    assert link["stated"] == [{"from_s": 0.0, "link": "200 ms", "mean_ms": 200.0, "deviation_ms": 0.0}]
+    assert facts["changes"] == []
     assert facts["diverged"] is False
     assert facts["settle_s"] is None  # two seconds are not enough
 
 
 def test_settling_is_the_last_time_above_the_limit():
-    log = logs.virtual("paper")
+    log = logs.simulated("paper")
 
     def settle_at_250(state):
         return msgspec.structs.replace(state, q=[q + 0.02 * (state.tick == 250) for q in state.q_des])
@@ -53,7 +58,7 @@ def test_settling_is_the_last_time_above_the_limit():
 
 
 def test_times_of_the_loop():
-    facts = summarise(logs.timed(logs.virtual("four")))
+    facts = summarise(logs.timed(logs.simulated("four")))
     site = facts["sites"]["c"]  # 200 Hz: 400 ticks, late by 0 to 399 us
     assert site["late_us"]["p50"] == 199.5
     assert site["late_us"]["p99_9"] == pytest.approx(np.percentile(np.arange(400), 99.9))
@@ -66,12 +71,12 @@ def test_overruns_begin_at_a_whole_period():
     def late(state):
         return msgspec.structs.replace(state, late_us={10: 4999, 20: 5000, 30: 9000}.get(state.tick, 1))
 
-    facts = summarise(logs.rewritten(logs.virtual("paper"), change=late))
+    facts = summarise(logs.rewritten(logs.simulated("paper"), change=late))
     assert [site["overruns"] for site in facts["sites"].values()] == [2, 2, 2]  # 200 Hz: 5000 us
 
 
 def test_saturation_is_counted():
-    log = logs.virtual("paper")
+    log = logs.simulated("paper")
     limit = log.scenario.sites["m1"].limits.tau_limit_nm
 
     def cut(state):
@@ -87,8 +92,37 @@ def test_a_run_that_diverged_says_so_and_misses_nothing():
     assert 0.0 < min(s["diverged_at_s"] for s in facts["sites"].values() if s["diverged_at_s"]) < 2.0
 
 
+def test_a_site_that_holds_at_the_end_has_not_diverged():
+    def hold(state):
+        return logs.replaced(state, mode="hold" if state.tick > 350 else "run")
+
+    facts = strict(summarise(logs.rewritten(logs.simulated("paper"), change=hold)))
+    assert facts["diverged"] is False
+    assert facts["sites"]["m1"]["modes"] == [{"mode": "hold", "from_s": 351 / 200, "to_s": 2.0}]
+
+
+def test_what_was_changed_is_told_with_who_asked():
+    facts = strict(summarise(logs.busy().log))
+    told = [(c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"]) for c in facts["changes"]]
+    assert told == [
+        (1.0, "a->c", "90 ms, loss 10 %", "c", None),
+        (3.0, "c->a", "uniform 30 +- 17.3 ms", "a", 500),
+        (4.0, "shares of c", "a 0.9, b 0.1 within 1 s", "c", None),
+    ]
+    assert [s["from_s"] for s in facts["links"]["c->a"]["stated"]] == [0.0, 3.0]
+
+
+def test_a_measured_link_states_nothing():
+    log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
+    facts = strict(summarise(log))
+    for link in facts["links"].values():
+        assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (None, None, None)
+        assert link["age_ms"]["max"] == 5.0
+    assert set(facts["scenario"]["delay_ms"].values()) == {None}
+
+
 def test_missing_records_are_counted():
-    log = logs.rewritten(logs.virtual("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
+    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
     facts = summarise(log)
     assert [site["missing"] for site in facts["sites"].values()] == [0, 50, 0]
     assert facts["missing"] == 50
@@ -96,7 +130,7 @@ def test_missing_records_are_counted():
 
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_nulls_and_no_nan(records):
-    log = logs.rewritten(logs.virtual("paper"), keep=lambda s: s.tick < records, finished=False)
+    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False)
     facts = strict(summarise(log, logs.twin("paper")))
     assert facts["session"]["complete"] is False
     for site in facts["sites"].values():
@@ -105,4 +139,4 @@ def test_short_logs_have_nulls_and_no_nan(records):
         assert (site["q_end_rad"] is None) == (records == 0)
         assert (site["busy_us"]["max"] is None) == (records < 2)
     assert facts["links"]["s->m1"]["age_ms"]["p50"] is None
-    assert facts["links"]["s->m1"]["late_samples"] is None
+    assert facts["links"]["s->m1"]["late_samples"] == (0 if records else None)

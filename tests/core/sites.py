@@ -3,6 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from tests.core.channels import LINK_NAME
+from trilat_net.core.delay import Model, Points
+from trilat_net.core.draw import link_key
 from trilat_net.core.setup import LinkSetup, SiteSetup
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Arrival, Output, Tick
@@ -14,9 +17,21 @@ def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSe
     return load(scenario, {key.replace("__", "."): value for key, value in overrides.items()}).setup(site)
 
 
-def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int, start: Sequence[float] = (0.5, -0.25)) -> Site:
-    """A site with a single peer, whose reference therefore is the sample in use."""
-    link = LinkSetup("peer", 1.0, delay_ns, peer_rate_hz, tuple(start))
+def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int) -> Site:
+    """A site with a single peer behind a constant delay; its reference therefore is the sample in use."""
+    return linked(rate_hz, peer_rate_hz, [Model(location=delay_ns / 1000)])
+
+
+def linked(
+    rate_hz: int,
+    peer_rate_hz: int,
+    models: Sequence[Model],
+    trace: Points | None = None,
+    outages: tuple[tuple[int, int], ...] = (),
+) -> Site:
+    """A site with a single peer behind any link, by the name and seed of `channels.channel`."""
+    key, traces = link_key(1, LINK_NAME), (trace,) * len(models)
+    link = LinkSetup("peer", 1.0, peer_rate_hz, (0.5, -0.25), key, tuple(models), traces, outages)
     return Site(setup()._replace(rate_hz=rate_hz, links=(link,)))
 
 

@@ -57,6 +57,7 @@ def test_a_sample_is_released_by_the_first_tick_at_or_after_its_due_time_and_nev
     rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
 ) -> None:
     released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
+    assert released is not None
     model = SampleList(rate_hz, peer_rate_hz, delay_us * 1000)
     assert model.due(tick, released)
     assert not model.due(tick, released - 1)
@@ -151,11 +152,12 @@ def test_a_stamp_ahead_by_whatever_the_wire_can_carry_is_refused(tick: int) -> N
     assert site.counts()[0].refused == 1
 
 
-@given(delay_us=st.integers(0, 10_000_000), rate_hz=rates)
-def test_a_calendar_has_a_page_for_all_that_may_wait(delay_us: int, rate_hz: int) -> None:
-    pages = calendar_pages(delay_us * 1000, rate_hz)
+@given(rate_hz=st.integers(1, 20_000))
+def test_a_calendar_has_a_page_for_all_that_may_wait(rate_hz: int) -> None:
+    """The longest delay of a sample from as far ahead as any."""
+    pages = calendar_pages(rate_hz)
     assert pages & (pages - 1) == 0
-    assert pages > Fraction(delay_us * 1000 + 10 * S, S) * rate_hz + 1
+    assert pages > 20 * rate_hz + 1
 
 
 def test_samples_from_far_ahead_wait_without_touching_nearer_ones() -> None:

@@ -6,10 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.net import topics
+from trilat_net.net.answers import Pong
 from trilat_net.net.asking import CAPACITY, Asking
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import ManualClock, SkewedClock
-from trilat_net.net.messages import VERSION, Pong
+from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import known
 from trilat_net.net.pinging import GLANCE_NS, PACE_NS, PINGS, REST_NS, WINDOW, Pinger, Trips, answer_pings
 from trilat_net.net.wire import encode

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from trilat_net.core.tick import Arrival, Mode, Output
 from trilat_net.errors import WireError
+from trilat_net.net.answers import Order, Pong, Reply
 from trilat_net.net.messages import (
     READABLE,
     STATE_VECTORS,
@@ -20,9 +21,6 @@ from trilat_net.net.messages import (
     Event,
     Info,
     LinkStats,
-    Order,
-    Pong,
-    Reply,
     Sample,
     State,
     json_schema,

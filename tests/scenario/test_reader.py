@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.setup import Scheme
+from trilat_net.core.delay import Model
+from trilat_net.core.setup import Law, Scheme, Stale, StaleRule
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load, override, parse, shipped, shipped_text, template_text
 
@@ -24,8 +25,9 @@ def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
     return error.value
 
 
-def test_shipped_are_the_five() -> None:
-    assert shipped() == ["asymmetric", "free", "paper", "paper_rods", "two_sites"]
+def test_what_is_shipped() -> None:
+    adaptive = ["asymmetric", "free", "paper", "paper_rods", "two_sites"]
+    assert shipped() == sorted([*adaptive, "4g", "handover", "jitter", "outage"])
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -49,7 +51,7 @@ def test_paper_is_section_iv() -> None:
     assert (m1.Lambda.tolist(), m1.Kp.tolist(), m1.Kd.tolist()) == ([1, 1], [1, 1], [3, 3])
     assert (m1.Gamma.tolist(), m1.theta_hat0.tolist()) == ([1] * 5, [0] * 5)
     assert [link.peer for link in m1.links] == ["m2", "s"]
-    assert m1.links[0].delay_ns == 200_000_000
+    assert m1.links[0].models == (Model(location=200_000.0),)
 
 
 def test_the_template_is_valid_and_its_defaults_are_what_it_says() -> None:
@@ -124,6 +126,37 @@ def test_an_override_without_key_or_value_is_refused(text: str) -> None:
     assert "KEY=VALUE" in str(refused([text]))
 
 
+def test_an_override_that_names_a_kind_replaces_what_the_file_says_of_another() -> None:
+    """Whatever comes first; other overrides of the same table stay."""
+    for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
+        links = load("paper", texts).links.values()
+        assert {link.describe() for link in links} == {"hyperexponential 53 +- 87.8 ms, loss 10 %"}
+    assert load("paper", ["link.model=measured"]).measured
+    assert load("4g", ["link.delay_ms=5", "link.model=constant"]).links["m1->s"].describe() == "5 ms"
+
+
+def test_an_override_of_the_law_takes_that_laws_gains() -> None:
+    scenario = load("paper", ["control.law=p_d", "control.d=7"])
+    setup = scenario.setup("m1")
+    assert setup.law is Law.P_D
+    assert (setup.K.tolist(), setup.d.tolist()) == ([10.0, 10.0], [7.0, 7.0])
+    assert refused(["control.law=p_d", "control.Kp=2"]).path == "control.Kp"
+    mixed = load("paper", {"sites.s.control": {"law": "p_d"}})
+    assert [mixed.setup(name).law for name in mixed.names] == [Law.ADAPTIVE, Law.ADAPTIVE, Law.P_D]
+
+
+def test_what_to_do_about_a_stale_peer() -> None:
+    assert load("paper").setup("s").on_stale == StaleRule(Stale.USE, 350_000_000, 1_000_000_000)
+    keys = {"on_stale": {"action": "hold", "age_ms": 120.5}, "sites.s.on_stale": {"action": "brake"}}
+    scenario = load("paper", keys)
+    assert scenario.setup("m1").on_stale == StaleRule(Stale.HOLD, 120_500_000, 1_000_000_000)
+    assert scenario.setup("s").on_stale == StaleRule(Stale.BRAKE, 120_500_000, 1_000_000_000)
+    for value in (0, -1, "soon"):
+        assert "age_ms" in refused({"on_stale.age_ms": value}).path
+    assert refused({"on_stale.return_s": 0}).problem
+    assert "must be 'use' or 'hold' or 'brake'" in refused({"on_stale.action": "panic"}).problem
+
+
 def test_an_override_below_a_value_is_refused() -> None:
     assert refused(["seed.x=1"]).path == "seed"
 
@@ -144,16 +177,15 @@ def test_a_site_overrides_single_keys_of_its_arm_and_a_link_its_delay() -> None:
     )
     assert scenario.sites["s"].arm.m1_kg == 2.0
     assert scenario.sites["m1"].arm.m1_kg == 1.0
-    assert scenario.links["m1->s"].delay_ns == 350_000_000
-    assert scenario.links["s->m1"].delay_ns == 200_000_000
+    assert [link.models[0].location for link in scenario.setup("s").links] == [350_000.0, 200_000.0]
     setup = scenario.setup("m1")
+    assert [link.models[0].location for link in setup.links] == [200_000.0, 200_000.0]
     assert [link.rate_hz for link in setup.links] == [500, 1000]
 
 
 def test_a_delay_is_rounded_to_whole_microseconds() -> None:
-    scenario = load("paper", {"link.delay_ms": 0.0004})
-    assert scenario.links["m1->s"].delay_ns == 0
-    assert load("paper", {"link.delay_ms": 0.0006}).links["m1->s"].delay_ns == 1000
+    for delay_ms, us in ((0.0004, 0.0), (0.0006, 1.0), (199.0011, 199_001.0)):
+        assert load("paper", {"link.delay_ms": delay_ms}).setup("m1").links[0].models[0].location == us
 
 
 def test_each_scheme_has_its_name() -> None:

@@ -11,8 +11,8 @@ from sites.changes import AHEAD_MS, Changes
 from trilat_net.core.site import MAX_COMMANDS, Site
 from trilat_net.core.tick import Command, Tick
 from trilat_net.net import topics
+from trilat_net.net.answers import Order, Reply
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
-from trilat_net.net.messages import Order, Reply
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario, command_from, load
 

@@ -86,7 +86,7 @@ def test_what_comes_before_it_was_sent_is_counted_and_used() -> None:
     desk.send[0](payload(1, 0, sent_ns=4_000_000))
     assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [(0, -1), (1, 1000)]
     assert [meter.figures().faults for meter in desk.meters] == [1, 0]
-    assert desk.meters[0].faulty() == 1
+    assert desk.meters[0].worst_ns == 1
     assert not desk.dropped
 
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ..core.arm import JOINTS, PARAMETERS, Array
 from ..log.reader import Ints, Log
-from . import poses, quantities, style, timing
+from . import ages, poses, quantities, style, timing
 from .decimation import thin
+from .happenings import changes, spans, stated
 from .motion import THETA_UNITS
 
 BUDGET = 48_000
@@ -36,6 +37,7 @@ class Charts:
     def __init__(self, log: Log, twin: Log | None) -> None:
         self._log = log
         self._twin = twin
+        self._changes = changes(log)
         self._tables: list[Json] = []
         columns_per_site = 9 * JOINTS + PARAMETERS + len(log.sites)
         self._buckets = max(100, min(1200, BUDGET // (columns_per_site * len(log.sites))))
@@ -48,6 +50,14 @@ class Charts:
             "colours": {"light": list(style.COLOURS), "dark": list(style.DARK_COLOURS)},
             "tables": self._tables,
             "charts": charts,
+            "changes": [
+                {"n": n, "t": c.change.at_s, "site": c.site, "link": c.change.link}
+                for n, c in enumerate(self._changes, 1)
+            ],
+            "spans": {
+                site: [(index, *span) for span in spans(self._log[site])]
+                for index, site in enumerate(self._log.sites)
+            },
             "arms": self._arms(),
         }
 
@@ -108,7 +118,7 @@ class Charts:
                 table = self._table(site, part.tick, part.t_s, both[:, joint])
                 desired = {"label": "desired", "colour": LIMIT, "dash": True, "table": table, "column": 1}
                 series = [self._series(site, table, 0), desired]
-                yield self._chart("positions", f"{site}, joint {joint + 1}", "rad", series, site=site)
+                yield self._chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
 
     def _estimates(self) -> Iterator[Json]:
         log = self._log
@@ -126,20 +136,60 @@ class Charts:
 
     def _timing(self) -> Iterator[Json]:
         log = self._log
-        for site in log.sites:
-            part = log[site]
-            table = self._table(site, part.tick, part.t_s, quantities.ages_ms(log, site))
-            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(part.peers)]
-            delays = {log.scenario.links[f"{peer}->{site}"].moments().mean_ms for peer in part.peers}
-            lines = [{"value": delay, "colour": LIMIT} for delay in sorted(delays)]
-            yield self._chart(
-                "ages", f"age of the samples that {site} uses", "ms", series, lines=lines, margin=0.025
-            )
+        yield from self._ages()
+        if ages.varied(log):
+            yield from self._distributions()
         if timing.has_clock(log):
             tables = self._tables_of(list(log.sites), lambda part: part.late_us[:, np.newaxis] * 1e-3)
             series = [self._series(site, table, 0) for site, table in tables.items()]
             yield self._chart("timing", "wake-up after the deadline", "ms", series, zero=True)
             yield from self._histograms()
+
+    def _ages(self) -> Iterator[Json]:
+        log = self._log
+        for site in log.sites:
+            part, age_ms = log[site], quantities.ages_ms(log, site)
+            table = self._table(site, part.tick, part.t_s, age_ms)
+            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(part.peers)]
+            lines = self._stated(site)
+            drawn = np.concatenate([age_ms.ravel(), [line["value"] for line in lines]])
+            yield self._chart(
+                "ages",
+                f"age of the samples that {site} uses",
+                "ms",
+                series,
+                lines=lines,
+                margin=0.025,
+                sites=[site],
+                links=True,
+                log=ages.is_tall(drawn),
+            )
+
+    def _stated(self, site: str) -> list[Json]:
+        """Returns the stated mean delays of the links to a site, as lines while they held."""
+        log = self._log
+        lines: list[Json] = []
+        for peer in log[site].peers:
+            t_s, mean_ms = ages.stated_line(log, stated(log, f"{peer}->{site}", self._changes))
+            for start, end, value in zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True):
+                if np.isfinite(value):
+                    line = {"value": value, "colour": log.sites.index(peer), "from": start, "to": end}
+                    lines.append(line)
+        same = len({line["value"] for line in lines}) == 1
+        return [{"value": lines[0]["value"], "colour": LIMIT}] if same else lines
+
+    def _distributions(self) -> Iterator[Json]:
+        found = ages.distributions(self._log)
+        x_ms = ages.delay_axis(found)
+        for site in self._log.sites:
+            series = []
+            for link in (link for link in found if link.site == site):
+                for name, values, dash in (("age", link.age_ms, False), ("delay", link.delay_ms, True)):
+                    percent = _packed(ages.percent_up_to(values, x_ms).astype("<f4"))
+                    entry = {"label": f"{name}, {link.peer}", "values": percent, "dash": dash}
+                    series.append({**entry, "colour": self._log.sites.index(link.peer)})
+            title = f"delay and age on the way to {site}"
+            yield self._chart("delays", title, "ms", series, points=len(x_ms), end=float(x_ms[-1]))
 
     def _histograms(self) -> Iterator[Json]:
         log = self._log

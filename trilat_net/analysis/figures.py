@@ -7,13 +7,15 @@ from matplotlib.figure import Figure
 
 from ..log.reader import Log
 from . import style
+from .ages import delay_distributions, sample_age, varied
 from .motion import hands_moved, operator_torques, parameter_estimates, positions, tracking_errors
 from .poses import arms
-from .timing import loop_timing, sample_age
+from .timing import loop_timing
 
 __all__ = [
     "all_figures",
     "arms",
+    "delay_distributions",
     "hands_moved",
     "loop_timing",
     "operator_torques",
@@ -39,6 +41,8 @@ def all_figures(log: Log, twin: Log | None) -> Iterator[tuple[str, Figure]]:
     yield "hands_moved", hands_moved(log, twin)
     yield "arms", arms(log)
     yield "sample_age", sample_age(log)
+    if varied(log):
+        yield "delay_distributions", delay_distributions(log)
     yield "loop_timing", loop_timing(log)
 
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from ..core.arm import JOINTS, PARAMETERS
 from ..log.reader import Log
 from . import quantities, style
+from .marks import Marks
 
 THETA_UNITS = ("kg m²", "kg m²", "kg m²", "kg m", "kg m")
 """Of the five parameters of Eq. (24)."""
@@ -26,6 +27,7 @@ def operator_torques(log: Log) -> Figure:
     sites = quantities.sites_with_hands(log)
     if not sites:
         return style.says(NO_HANDS)
+    marks = Marks(log)
     with style.paper():
         figure = style.new_figure(2.2)
         row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
@@ -35,14 +37,17 @@ def operator_torques(log: Log) -> Figure:
                 part = log[site]
                 torque = quantities.hand_torques(part)[:, joint]
                 style.draw(axes, part.tick, part.t_s, torque, **style.line(log, site))
+            marks.draw(axes, sites)
         row[0].set_ylabel("torque on the arm (N m)")
         style.time_axis(log, row)
         style.legend(figure, style.site_entries(log, sites))
+        marks.explain(figure)
     return figure
 
 
 def positions(log: Log) -> Figure:
     """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
+    marks = Marks(log)
     with style.paper():
         figure = style.new_figure(0.7 + 1.25 * len(log.sites))
         grid = style.panels(figure, len(log.sites), JOINTS, sharex=True, sharey="col")
@@ -52,12 +57,14 @@ def positions(log: Log) -> Figure:
             for joint, axes in enumerate(row):
                 style.draw(axes, part.tick, part.t_s, actual[:, joint], **style.line(log, site, 1.6))
                 style.draw(axes, part.tick, part.t_s, desired[:, joint], **_REFERENCE)
+                marks.draw(axes, [site])
                 _note_absence(log, site, axes)
             row[0].set_ylabel(f"angle of {site} (rad)")
         _joint_titles(grid[0])
         style.time_axis(log, grid[-1])
         actual_entries = [(f"{style.title(log, s)}, actual", style.line(log, s, 1.6)) for s in log.sites]
         style.legend(figure, [*actual_entries, ("desired", _REFERENCE)])
+        marks.explain(figure)
     return figure
 
 
@@ -67,6 +74,7 @@ def tracking_errors(log: Log) -> Figure:
     The lowest panel shows, at every time, the largest error of any joint that is still to come: where it
     crosses the dashed line, the site has settled.
     """
+    marks = Marks(log)
     with style.paper():
         figure = style.new_figure(3.6)
         panels = figure.subplot_mosaic([["1", "2"], ["all", "all"]])
@@ -80,9 +88,12 @@ def tracking_errors(log: Log) -> Figure:
         _joint_titles(row)
         row[0].set_ylabel("tracking error (rad)")
         _settling(log, settling)
+        for axes in (*row, settling):
+            marks.draw(axes, log.sites)
         style.time_axis(log, [*row, settling])
         limit = (f"settled: {quantities.SETTLED_RAD:g} rad", _REFERENCE)
         style.legend(figure, [*style.site_entries(log, log.sites), limit])
+        marks.explain(figure)
     return figure
 
 
@@ -94,13 +105,16 @@ def parameter_estimates(log: Log, sites: Sequence[str] | None = None) -> Figure:
         sites: whose estimates; None for all. The paper shows master 1.
     """
     chosen = log.sites if sites is None else tuple(sites)
+    marks = Marks(log)
     with style.paper():
         figure = style.new_figure(3.6)
         panels = figure.subplot_mosaic([[*"112233"], [*"444555"]])
         for index in range(PARAMETERS):
             _estimate(log, chosen, index, panels[str(index + 1)])
+            marks.draw(panels[str(index + 1)], chosen)
         style.time_axis(log, list(panels.values()))
         style.legend(figure, [*style.site_entries(log, chosen), ("true value", _REFERENCE)])
+        marks.explain(figure)
     return figure
 
 
@@ -113,6 +127,7 @@ def hands_moved(log: Log, twin: Log | None) -> Figure:
     """
     if twin is None:
         return style.says(NO_TWIN if quantities.sites_with_hands(log) else NO_HANDS)
+    marks = Marks(log)
     with style.paper():
         figure = style.new_figure(2.2)
         row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
@@ -120,10 +135,13 @@ def hands_moved(log: Log, twin: Log | None) -> Figure:
             tick, t_s, moved = quantities.moved_by_hands(log, twin, site)
             for joint, axes in enumerate(row):
                 style.draw(axes, tick, t_s, moved[:, joint], **style.line(log, site))
+        for axes in row:
+            marks.draw(axes, log.sites)
         _joint_titles(row)
         row[0].set_ylabel("moved by hands (rad)")
         style.time_axis(log, row)
         style.legend(figure, style.site_entries(log, log.sites))
+        marks.explain(figure)
     return figure
 
 

@@ -12,7 +12,7 @@ from string import Template
 from typing import Any
 
 from ..log.reader import Log
-from . import charts, motion, strip, style, tables, timing
+from . import charts, link_tables, motion, strip, style, tables, timing
 from .figures import write_figures
 from .summary import Facts, summarise
 from .tables import VerdictLine
@@ -33,10 +33,22 @@ _SECTIONS = {
     "control": ("Control torques", "τ of Eq. (13), what the controllers ask of the joints."),
     "ages": (
         "Age of the samples in use",
-        "Now minus the stamp of the sample in use. Dashed: the delay as set.",
+        "Now minus the stamp of the sample in use: the effective delay. Dashed: the mean delay as stated.",
+    ),
+    "delays": (
+        "Delay and age, how often",
+        "Which share of samples has no more delay, and which share of ticks no more age, than so much.",
     ),
     "timing": ("The loops", "How late each loop woke up, and how long its ticks took."),
 }
+_EFFECTIVE = (
+    "Effective is the delay that the controller saw: the age of the sample in use, over all ticks. Jitter "
+    "makes it shorter than stated where the newest sample wins, and longer where samples stay in order."
+)
+_SAMPLES = (
+    "What became of the samples. Superseded: never used, because a newer one came into use before or with it."
+)
+_CLOCKS = "The sender's clock against the receiver's, as it was estimated while the session ran."
 
 
 def write_report(
@@ -83,7 +95,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         facts=tables.facts_html(log, facts),
         sites=tables.sites_html(log, facts),
         loops=tables.loops_html(log, facts),
-        links=tables.links_html(log, facts),
+        links=_links(log, facts),
         strip=strip.arms_svg(log, bounds),
         sections=_sections(log, data["charts"]),
         assumed=tables.assumed_html(scenario),
@@ -94,7 +106,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         data=_json(data).replace("<", "\\u003c"),
         css=_asset("report.css"),
         site_css=_site_css(log),
-        js=_asset("report.js"),
+        js=_asset("report.js") + _asset("arms.js"),
         uplot_css=_asset("uPlot.min.css"),
         uplot_js=_asset("uPlot.iife.min.js"),
     )
@@ -114,6 +126,22 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
             continue
         html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
     return html
+
+
+def _links(log: Log, facts: Facts) -> str:
+    """Returns what the links did and what happened besides, in tables, each with a sentence."""
+    parts = [
+        (link_tables.ages_html(log, facts), _EFFECTIVE),
+        (link_tables.samples_html(log, facts), _SAMPLES),
+        (link_tables.clocks_html(log, facts), _CLOCKS),
+        (link_tables.changes_html(facts), "What was changed while it ran; charts have its number."),
+        (link_tables.modes_html(log, facts), "What sites did about stale peers; charts are shaded then."),
+    ]
+    return "".join(
+        f'<p class="note">{escape(sentence)}</p><div class="scroll">{table}</div>'
+        for table, sentence in parts
+        if table
+    )
 
 
 def _site_css(log: Log) -> str:

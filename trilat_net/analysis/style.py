@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..core.arm import Array
 from ..log.reader import Ints, Log
 from .decimation import thin
+from .happenings import end_s
 
 Grid = NDArray[np.object_]
 
@@ -138,12 +139,7 @@ def time_axis(log: Log, row: Sequence[Axes]) -> None:
 
 def span_s(log: Log) -> float:
     """Returns the time that figures show, s: to the end of the last record's period."""
-    ends = [
-        float(log[name].t_s[-1]) + 1.0 / log.scenario.sites[name].rate_hz
-        for name in log.sites
-        if len(log[name])
-    ]
-    return max(ends, default=log.scenario.duration_s)
+    return end_s(log)
 
 
 def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:

@@ -3,6 +3,7 @@
 Law: keys end in their unit; what a log cannot tell is null, never a guess and never NaN.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike
 
 from ..log.reader import Log, SiteLog
 from . import quantities
+from .clocks import clock_use
+from .happenings import Changed, Stated, changes, diverged_at_s, spans
+from .link_use import LinkUse, Spread, link_uses
 
 LAST_S = 1.0
 """Length of the end of a run that `max_error_end_rad` looks at, s."""
@@ -37,7 +41,8 @@ def summarise(log: Log, twin: Log | None = None) -> Facts:
         "records": sum(site["records"] for site in sites.values()),
         "missing": sum(site["missing"] for site in sites.values()),
         "sites": sites,
-        "links": {f"{peer}->{name}": link for name in log.sites for peer, link in _links(log, name).items()},
+        "links": {use.name: _link(log, use) for use in link_uses(log)},
+        "changes": [_changed(changed) for changed in changes(log)],
     }
 
 
@@ -51,7 +56,7 @@ def _scenario(log: Log) -> Facts:
         "seed": scenario.seed,
         "scheme": scenario.scheme,
         "sites": list(scenario.names),
-        "delay_ms": {name: link.moments().mean_ms for name, link in scenario.links.items()},
+        "delay_ms": {name: _known(link.moments().mean_ms) for name, link in scenario.links.items()},
         "dominance": scenario.dominance,
         "assumed": list(scenario.assumed),
     }
@@ -75,7 +80,6 @@ def _site(log: Log, name: str, twin: Log | None) -> Facts:
 
 def _records(log: Log, part: SiteLog) -> Facts:
     """Counts records; what is missing is missing of the ticks that the site said it made, if it said so."""
-    diverged = [state for state in part.states[-1:] if state.mode != "run"]
     made = next((e.ticks for e in log.events if e.kind == "end" and e.member == part.name), None)
     expected = log.scenario.ticks(part.name)
     return {
@@ -83,7 +87,8 @@ def _records(log: Log, part: SiteLog) -> Facts:
         "expected_ticks": expected,
         "made_ticks": made,
         "missing": max(0, (expected if made is None else made) - len(part)),
-        "diverged_at_s": diverged[0].t_ns * 1e-9 if diverged else None,
+        "diverged_at_s": diverged_at_s(part),
+        "modes": [span._asdict() for span in spans(part)],
     }
 
 
@@ -99,20 +104,50 @@ def _motion(part: SiteLog) -> Facts:
     }
 
 
-def _links(log: Log, name: str) -> dict[str, Facts]:
-    """Returns what can be said of the links to a site, per peer."""
-    ages = quantities.ages_ms(log, name)
-    stats = log.link_stats(name)[-1:]
-    links = {}
-    for peer, age_ms in zip(log[name].peers, ages.T, strict=True):
-        known = age_ms[np.isfinite(age_ms)]
-        links[peer] = {
-            "delay_ms": log.scenario.links[f"{peer}->{name}"].moments().mean_ms,
-            "age_ms": _spread(known, {"p50": 50.0, "min": 0.0, "max": 100.0}),
-            "late_samples": stats[0].late.get(peer, 0) if stats else None,
-            "duplicate_samples": stats[0].duplicate.get(peer, 0) if stats else None,
-        }
-    return links
+def _link(log: Log, use: LinkUse) -> Facts:
+    """Returns what can be said of a link."""
+    counts, clock = use.counts, clock_use(log, use.peer, use.site)
+    return {
+        "delay_ms": _known(use.stated[0].link.moments().mean_ms),
+        "stated": [_stated(state) for state in use.stated],
+        "drawn_ms": use.drawn_ms._asdict() if use.drawn_ms else None,
+        "age_ms": use.age_ms._asdict() if use.age_ms else dict.fromkeys(Spread._fields),
+        "ages": use.ages._asdict() if use.ages else None,
+        "first_use_s": use.first_use_s,
+        "ticks_without_new": use.ticks_without_new,
+        "silence_ms": use.silence_ms,
+        "samples": counts._asdict() if counts else None,
+        "late_samples": counts.late if counts else None,
+        "duplicate_samples": counts.duplicate if counts else None,
+        "loss": use.loss,
+        "burst": use.burst,
+        "one_way_us": use.one_way_us._asdict() if use.one_way_us else None,
+        "clock": clock._asdict() if clock else None,
+    }
+
+
+def _stated(state: Stated) -> Facts:
+    mean_ms, deviation_ms = state.link.moments()
+    return {
+        "from_s": state.from_s,
+        "link": state.link.describe(),
+        "mean_ms": _known(mean_ms),
+        "deviation_ms": _known(deviation_ms),
+    }
+
+
+def _changed(changed: Changed) -> Facts:
+    return {
+        "at_s": changed.change.at_s,
+        "about": changed.about,
+        "to": changed.text,
+        "site": changed.site,
+        "taken_at_tick": changed.taken_at_tick,
+    }
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _moved(log: Log, twin: Log | None, name: str) -> Facts:

@@ -51,7 +51,7 @@ def facts_html(log: Log, facts: Facts) -> str:
         ("driven by", _driven(log)),
         ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}"),
         ("records", f"{facts['records']}, {facts['missing']} missing" + _torn(log)),
-        ("largest error at the end", f"{_number(facts['max_error_end_rad'])} rad in the last second"),
+        ("largest error at the end", f"{number(facts['max_error_end_rad'])} rad in the last second"),
         ("settled", _settled(facts)),
         ("dominance", _dominance(scenario)),
         ("diverged", "yes" if facts["diverged"] else "no"),
@@ -61,7 +61,7 @@ def facts_html(log: Log, facts: Facts) -> str:
 
 def sites_html(log: Log, facts: Facts) -> str:
     """Returns the table of the sites: their records, and how they moved."""
-    return _table(_SITE_HEADS, [_site_row(log, facts, name) for name in log.sites])
+    return table(_SITE_HEADS, [_site_row(log, facts, name) for name in log.sites])
 
 
 def loops_html(log: Log, facts: Facts) -> str:
@@ -75,7 +75,7 @@ def loops_html(log: Log, facts: Facts) -> str:
         values = [*(late[key] for key in ("p50", "p99", "p99_9", "max"))]
         values += [*(busy[key] for key in ("p50", "p99", "max")), site["overruns"]]
         rows.append([_site_label(log, name), *("–" if v is None else f"{v:.0f}" for v in values)])
-    return _table(_LOOP_HEADS, rows)
+    return table(_LOOP_HEADS, rows)
 
 
 def _site_row(log: Log, facts: Facts, name: str) -> list[str]:
@@ -84,28 +84,14 @@ def _site_row(log: Log, facts: Facts, name: str) -> list[str]:
         str(site["records"]),
         str(site["missing"]),
         _numbers(site["q_end_rad"]),
-        _number(site["max_error_rad"]),
-        _number(site["max_error_end_rad"]),
-        _number(site["settle_s"]),
-        _number(site["peak_tau_nm"]),
+        number(site["max_error_rad"]),
+        number(site["max_error_end_rad"]),
+        number(site["settle_s"]),
+        number(site["peak_tau_nm"]),
         str(site["saturated_ticks"]),
         _numbers(site["hands_moved_max_rad"]),
     ]
     return [_site_label(log, name), *map(escape, cells)]
-
-
-def links_html(log: Log, facts: Facts) -> str:
-    """Returns the table of the links."""
-    heads = ("link", "delay as set (ms)", "age p50 (ms)", "min", "max", "late samples", "duplicates")
-    rows = []
-    for name, link in facts["links"].items():
-        age: Facts = link["age_ms"]
-        peer, site = name.split("->")
-        cells = [link["delay_ms"], age["p50"], age["min"], age["max"]]
-        cells += [link["late_samples"], link["duplicate_samples"]]
-        label = f"{_swatch(log, peer)}{escape(peer)} → {escape(site)}"
-        rows.append([label, *(escape(_number(cell)) for cell in cells)])
-    return _table(heads, rows)
 
 
 def assumed_html(scenario: Scenario) -> str:
@@ -171,7 +157,8 @@ def _dominance(scenario: Scenario) -> str:
     return "; ".join(rows)
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Returns a number as cells show it; a dash where there is none."""
     return "–" if value is None else f"{value:.4g}"
 
 
@@ -180,10 +167,11 @@ def _numbers(values: Iterable[float] | None) -> str:
 
 
 def _site_label(log: Log, name: str) -> str:
-    return f"{_swatch(log, name)}{escape(name)} ({escape(log.scenario.sites[name].role)})"
+    return f"{swatch(log, name)}{escape(name)} ({escape(log.scenario.sites[name].role)})"
 
 
-def _swatch(log: Log, name: str) -> str:
+def swatch(log: Log, name: str) -> str:
+    """Returns a little square in the colour of a site."""
     return f'<span class="swatch fill-{log.sites.index(name)}"></span>'
 
 
@@ -192,10 +180,20 @@ def _facts(rows: Iterable[tuple[str, Any]]) -> str:
     return f'<table class="facts">{lines}</table>'
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Returns a table; its heads are ours, and its cells are HTML already."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()) -> str:
+    """Returns a table.
+
+    Args:
+        heads: of its columns; ours, plain text.
+        rows: their cells, HTML already.
+        words: the columns besides the first that hold words instead of numbers.
+    """
+    kinds = [' class="words"' if n in words else "" for n in range(len(heads))]
+    head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, heads, strict=True))
+    body = "".join(
+        f"<tr>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in zip(kinds, row, strict=True))}</tr>"
+        for row in rows
+    )
     return f'<table class="sites"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 

@@ -1,4 +1,4 @@
-"""Figures of the loop and of the links: lateness, computing time, age of the samples in use.
+"""Figures of the loops: lateness and computing time.
 
 Law: in virtual time there is no clock, and a figure of one says so instead of drawing zeros.
 """
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ..core.arm import Array
 from ..log.reader import Ints, Log
-from . import quantities, style
+from . import style
 
 NO_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_TIMES = "no lateness and no computing time in this log"
@@ -70,38 +70,6 @@ def loop_timing(log: Log) -> Figure:
         grid[-1, 1].set_xlabel("computing time of a tick (µs)")
         style.legend(figure, [("one period", _PERIOD)])
     return figure
-
-
-def sample_age(log: Log) -> Figure:
-    """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    with style.paper():
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
-        grid = style.panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
-        for site, row in zip(log.sites, grid, strict=True):
-            _ages(log, site, row)
-        for axes in grid[:, 0]:
-            axes.set_ylabel("age (ms)")
-        grid[0, 0].set_ylim(0.0, _age_limit_ms(log))
-        style.time_axis(log, grid[-1])
-        sent = [(f"from {style.title(log, s)}", style.line(log, s, 1.8)) for s in log.sites]
-        style.legend(figure, [*sent, ("delay as set", _PERIOD)])
-    return figure
-
-
-def _ages(log: Log, site: str, row: style.Grid) -> None:
-    part = log[site]
-    for peer, age_ms, axes in zip(part.peers, quantities.ages_ms(log, site).T, row, strict=True):
-        style.draw(axes, part.tick, part.t_s, age_ms, **style.line(log, peer, 1.8))
-        axes.axhline(log.scenario.links[f"{peer}->{site}"].moments().mean_ms, **_PERIOD)
-        axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
-        if not np.any(np.isfinite(age_ms)):
-            style.note(axes, "no sample in use")
-
-
-def _age_limit_ms(log: Log) -> float:
-    ages = [quantities.ages_ms(log, site) for site in log.sites]
-    largest = max((float(a[np.isfinite(a)].max(initial=0.0)) for a in ages), default=0.0)
-    return 1.25 * max(largest, *(link.moments().mean_ms for link in log.scenario.links.values()), 1.0)
 
 
 def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array) -> None:

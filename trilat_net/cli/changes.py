@@ -106,8 +106,8 @@ def dominance(
 
 def _place(context: typer.Context, site: str, order: dict[str, Any]) -> None:
     """Asks the site and prints its answer."""
+    from ..net.answers import Order
     from ..net.clock import SystemClock
-    from ..net.messages import Order
     from ..net.ordering import place_order
     from ..scenario import parse
 

@@ -126,7 +126,10 @@ def _links(probe: "Probe") -> list[dict[str, Any]]:
 
 def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any]]) -> None:
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
-    out.print(f"session {escape(session)} {state}; times in us; a clock is the one there minus the one here")
+    out.print(
+        f"session {escape(session)} {state}; times in us; a clock is the one there minus the one here",
+        soft_wrap=True,
+    )
     table = _table("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     for member in members:
         rtt = member.get("rtt_us", {})

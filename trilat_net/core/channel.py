@@ -98,7 +98,7 @@ def _due_ns(sample: int, fresh: bool, link: Row, model: Row, points: Points) -> 
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         due_ns = max(due_ns, link.due_before)
-        link.due_before = due_ns
+    link.due_before = max(due_ns, link.due_before)
     return due_ns
 
 

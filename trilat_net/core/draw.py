@@ -19,8 +19,8 @@ _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 _ROUNDS = 10
 
-_TO_27, _TO_26 = np.uint64(5), np.uint64(6)
-_TWO_26, _TWO_53 = 67_108_864.0, 9_007_199_254_740_992.0
+_TO_26 = np.uint64(6)
+_TWO_26, _TWO_52 = 67_108_864.0, 4_503_599_627_370_496.0
 
 Words = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 Key = np.uint64
@@ -47,8 +47,17 @@ def philox(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.ui
 
 
 @leaf
+def unit(high: np.uint64, low: np.uint64) -> float:
+    """Returns a number of the open interval (0, 1) from two 32-bit words: 52 bits, then a half, exactly.
+
+    With 53 bits the largest one would round to 1.
+    """
+    return (float(high >> _TO_26) * _TWO_26 + float(low >> _TO_26) + 0.5) / _TWO_52
+
+
+@leaf
 def uniforms(key: Key, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
-    """Returns two numbers, uniform on the open interval (0, 1), 53 bits each.
+    """Returns two numbers, uniform on the open interval (0, 1), see `unit`.
 
     Args:
         key: the link's, see `link_key`.
@@ -60,9 +69,7 @@ def uniforms(key: Key, sample: int, purpose: int, attempt: int) -> tuple[float, 
     a, b, c, d = philox(
         index & _LOW, index >> _SHIFT, np.uint64(purpose), np.uint64(attempt), key & _LOW, key >> _SHIFT
     )
-    first = (float(a >> _TO_27) * _TWO_26 + float(b >> _TO_26) + 0.5) / _TWO_53
-    second = (float(c >> _TO_27) * _TWO_26 + float(d >> _TO_26) + 0.5) / _TWO_53
-    return first, second
+    return unit(a, b), unit(c, d)
 
 
 @leaf
@@ -95,7 +102,8 @@ def standard_gamma(key: Key, sample: int, purpose: int, shape: float) -> float:
     c = 1.0 / math.sqrt(9.0 * d)
     for attempt in range(64):  # one in twenty is rejected at most: 64 in a row never happen
         x = normal(key, sample, purpose, attempt)
-        v = (1.0 + c * x) ** 3
+        root = 1.0 + c * x
+        v = root * root * root
         u, _ = uniforms(key, sample, purpose + 1, attempt)
         if v > 0.0 and math.log(u) < 0.5 * x * x + d - d * v + d * math.log(v):
             return boost * d * v

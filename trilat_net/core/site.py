@@ -47,6 +47,7 @@ class Site:
         self.name = setup.name
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
+        self._starts = [link.q0 for link in setup.links]
         self._site = np.zeros(1, SITE)
         self._pulses = np.ascontiguousarray(setup.pulses, dtype=np.float64)
         self._row = np.zeros(ROW_FLOATS)
@@ -237,9 +238,12 @@ class Site:
         self._samples["tick"] = -1
         self._calendars[:] = -1
         link: Row
-        for link, sample in zip(self._links, in_use, strict=True):
-            link.foreseen, link.model = -1, 0  # the channel's memory is a function of what went before
-            if sample is not None:
+        for link, start, sample in zip(self._links, self._starts, in_use, strict=True):
+            # the channel's memory is a function of what went before
+            link.foreseen, link.model, link.due_before = -1, 0, 0
+            if sample is None:
+                link.used, link.q, link.qd = -1, start, 0.0
+            else:
                 link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
         self._pack(waiting)
         site_accept(

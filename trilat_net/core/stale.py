@@ -11,7 +11,8 @@ from .link import Rows
 from .setup import Stale
 from .tick import Mode
 
-_RUN, _HOLD, _BRAKE, _RETURN = int(Mode.RUN), int(Mode.HOLD), int(Mode.BRAKE), int(Mode.RETURN)
+_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_HOLD, _BRAKE, _RETURN = int(Mode.HOLD), int(Mode.BRAKE), int(Mode.RETURN)
 _USE, _ACT_BRAKE = int(Stale.USE), int(Stale.BRAKE)
 
 
@@ -35,7 +36,7 @@ def mind_stale_peers(t_ns: int, site: Row, links: Rows) -> None:
         site: the site's row; its q_des and qd_des are what the peers give, its q_held what was in force.
         links: one row per peer, dtype LINK.
     """
-    if site.on_stale == _USE:
+    if site.on_stale == _USE or site.mode == _DIVERGED:
         return
     stale = is_stale(t_ns, site.stale_ns, links)
     if stale and (site.mode == _RUN or site.mode == _RETURN):

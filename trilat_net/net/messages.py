@@ -128,7 +128,8 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         delay_us: per peer, one-way delay: median since the last statistics; -1 where nothing came.
         delay_max_us: per peer, its largest.
         rtt_us: per peer, smallest round trip since the last statistics; -1 where none was made.
-        clock_faults: per peer, samples since the start that came before they were sent, beyond the bound.
+        clock_faults: per peer, since the start: samples that came before they were sent, beyond the bound,
+            and windows that contradict those before.
         grid_error_us: how late the own grid of ticks is against the leader's.
         slew_ppb: by how much it lags the own clock to follow the leader's, ns/s.
     """
@@ -183,7 +184,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         clocks: per member the identity of its clock.
         epochs: per member the epoch on its own clock.
         offset_ns: of "clock": the clock of `about` minus the own one, at that tick; of "clock fault" by how
-            much a sample came before it was sent.
+            much a sample came before it was sent, or 0.
         bound_ns: how far that offset is from the truth at most, for a second from there; then it grows.
         drift_ppb: by how much the offset grows, ns/s.
         drift_bound_ppb: how far that is from the truth at most.
@@ -239,62 +240,6 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     needs_recorder: bool = False
     running: bool = False
     ticks: int = 0
-
-
-class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a member answers to a ping, at once.
-
-    Attributes:
-        v: version of this schema.
-        member: a site, or "recorder".
-        boot: its process start.
-        clock: identity of its monotonic clock.
-        came_ns: that clock when the ping had come.
-        left_ns: that clock when the answer was given.
-    """
-
-    v: int = VERSION
-    member: str
-    boot: U64
-    clock: str
-    came_ns: Instant
-    left_ns: Instant
-
-
-class Order(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A change that somebody asks a site for, as in a scenario's timeline, from as soon as it can be.
-
-    Attributes:
-        v: version of this schema.
-        link: the link to change, as in "m1->s", or "".
-        dominance: the site whose shares to change, or "".
-        to: what the link or the row is to be.
-        ramp_s: how long shares take, s.
-    """
-
-    v: int = VERSION
-    link: str = ""
-    dominance: str = ""
-    to: dict[str, Any]
-    ramp_s: float = 0.0
-
-
-class Reply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a site answers to an `Order`.
-
-    Attributes:
-        v: version of this schema.
-        member: who answers.
-        accepted: whether it does it.
-        text: from when on, or why not.
-        tick: its first tick, at its own rate, for which the change holds; -1 where it was refused.
-    """
-
-    v: int = VERSION
-    member: str
-    accepted: bool
-    text: str
-    tick: int = -1
 
 
 SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}

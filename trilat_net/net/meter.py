@@ -67,7 +67,9 @@ class Meter:
     Attributes:
         course: the offset in force.
         news: the newest sample since it was asked last: its tick, and its arrival on the own clock, ns.
-        worst_ns: how long before its sending a sample came, at worst, since `faulty` was asked last.
+        faults: stamps that cannot be right, since the start.
+        worst_ns: how long before its sending a sample came, at worst, since `forgive`.
+        contradicted: whether windows contradicted each other since then.
     """
 
     def __init__(
@@ -77,12 +79,18 @@ class Meter:
         self.news: tuple[int, int] | None = None
         self.faults = 0
         self.worst_ns = 0
+        self.contradicted = False
         self._epoch_ns, self._place, self._sent, self._estimator = epoch_ns, place, sent, estimator
         self._delays: list[int] = []
         self._rtt_ns = _FAR_NS
         self._windows = 0
         self._opened_ns: int | None = None
         self._begin()
+
+    @property
+    def estimated(self) -> bool:
+        """True where the peer's clock is another one."""
+        return self._estimator is not None
 
     def _begin(self) -> None:
         self._there_ns = self._back_ns = _FAR_NS  # the smallest delays of the window, and what they limit
@@ -135,8 +143,12 @@ class Meter:
             return None
         self._opened_ns = now_ns
         self._windows += 1
+        broken = self._estimator.broken
         self._estimator.add(self._ceiling, self._floor)
         estimate = self._estimator.estimate(now_ns)
+        if self._estimator.broken > broken:
+            self.faults += 1
+            self.contradicted = True
         if estimate is None:  # nothing has come, or what came contradicts itself: a clock has stepped
             estimate = self.course.estimate.including(self._ceiling, self._floor)
             self._windows = 0
@@ -144,10 +156,10 @@ class Meter:
         self.course.bend(from_ns, estimate)
         return estimate
 
-    def faulty(self) -> int:
-        """Returns by how much a sample came before its sending since the last call, ns; 0 where none did."""
-        worst_ns, self.worst_ns = self.worst_ns, 0
-        return worst_ns
+    def forgive(self) -> None:
+        """Begins anew with what a log should be told of stamps that cannot be right."""
+        self.worst_ns = 0
+        self.contradicted = False
 
     def figures(self) -> Figures:
         """Returns what was measured since the last call."""

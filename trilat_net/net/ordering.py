@@ -9,11 +9,12 @@ from dataclasses import replace
 
 from ..errors import SessionError, WireError
 from . import topics
+from .answers import Order, Reply
 from .bus import Bus
 from .clock import Clock
 from .connection import Connection, open_bus
 from .endpoints import default_endpoint, default_endpoints
-from .messages import Info, Order, Reply
+from .messages import Info
 from .wire import decode, encode
 
 POLL_NS = 5_000_000

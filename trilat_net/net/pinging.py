@@ -10,10 +10,11 @@ from collections.abc import Collection, Mapping
 from ..core.grid import NS_PER_S
 from ..errors import WireError
 from . import topics
+from .answers import Pong
 from .asking import Asking
 from .bus import Bus
 from .clock import Clock
-from .messages import Info, Pong
+from .messages import Info
 from .offset import Estimate, Limit, OffsetEstimator, known, offset_text
 from .wire import decode, encode
 

@@ -14,15 +14,14 @@ Everything here is polled, on a `Bus` and a `Clock` that it is given; nothing wa
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ..errors import SessionError, WireError
+from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
 from .meeting import Meeting
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
-from .voice import Voice, token
-from .wire import decode
+from .voice import Voice, said, token
 
 AHEAD_NS = 500_000_000
 """How far ahead an epoch is announced, and two round trips more."""
@@ -106,11 +105,7 @@ class Joining:
 
     def _listen(self) -> Epoch | None:
         """Takes events; returns the epoch of the announcement that has been started."""
-        while (message := self._events.poll()) is not None:
-            try:
-                event = decode(message[1], Event)
-            except WireError:
-                continue  # a stranger's; the loop counts those, joining has no use for them
+        for event in said(self._events):
             if event.boots.get(event.member) != event.boot:
                 continue  # from nobody whom the announcement is for
             if event.kind == "epoch":

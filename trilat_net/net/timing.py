@@ -68,8 +68,17 @@ class Timing:
         self._followed: Meter | None = None
         self._leader_epoch_ns = 0
         for peer, meter in zip(peers, self.meters, strict=True):
+            meter.course.bend(epoch_ns, peer.estimate)
             if peer.name == leader and peer.estimator is not None:
                 self._followed, self._leader_epoch_ns = meter, peer.epoch_ns
+
+    def opening(self) -> list[News]:
+        """Returns what a log should say of the peers' clocks before tick 0."""
+        return [
+            _estimated(name, 0, self._epoch_ns, meter.course)
+            for name, meter in zip(self._names, self.meters, strict=True)
+            if meter.estimated
+        ]
 
     def sent(self, tick: int, now_ns: int) -> int:
         """Notes when the record of a tick is sent, and returns it since the epoch, ns."""
@@ -100,9 +109,11 @@ class Timing:
         due_ns = self.grid.deadline(k)
         self._estimate(k, now_ns, due_ns, news)
         for n, (name, meter) in enumerate(zip(self._names, self.meters, strict=True)):
-            if now_ns - self._faults_ns[n] >= FAULT_EVERY_NS and (before_ns := meter.faulty()):
+            faulty = bool(meter.worst_ns) or meter.contradicted
+            if faulty and now_ns - self._faults_ns[n] >= FAULT_EVERY_NS:
                 self._faults_ns[n] = now_ns
-                news.append(_fault(name, before_ns, meter.course.bound_ns))
+                news.append(_fault(name, meter.worst_ns, meter.course.bound_ns))
+                meter.forgive()
         if self._followed is not None:
             course = self._followed.course
             leader_ns = due_ns + course.at(due_ns) - self._leader_epoch_ns
@@ -154,10 +165,12 @@ def _estimated(name: str, k: int, at_ns: int, course: Course) -> News:
 
 
 def _fault(name: str, before_ns: int, bound_ns: int) -> News:
-    """Says that a sample came before it was sent."""
+    """Says that stamps cannot be right: a sample that came before it was sent, or windows that disagree."""
+    what = f"its stamps contradict those before, beyond the bound of {bound_ns / 1000:.0f} us"
+    if before_ns:
+        what = f"a sample came {before_ns / 1e6:.3f} ms before it was sent"
     return News(
         "clock fault",
-        f"a sample of {name} came {before_ns / 1e6:.3f} ms before it was sent, which the bound of "
-        f"{bound_ns / 1000:.0f} us does not allow: one of the two clocks has stepped",
+        f"clock of {name}: {what}; one of the two clocks has stepped",
         {"about": name, "offset_ns": before_ns, "bound_ns": bound_ns},
     )

@@ -1,13 +1,15 @@
 """One start of a member: its boot, its token, and what it says of itself."""
 
 import secrets
+from collections.abc import Iterator
 
 import msgspec
 
+from ..errors import WireError
 from . import topics
-from .bus import Bus
+from .bus import Bus, Inbox
 from .messages import Event, Info
-from .wire import encode
+from .wire import decode, encode
 
 
 def new_boot() -> int:
@@ -18,6 +20,15 @@ def new_boot() -> int:
 def token(session: str, member: str, boot: int) -> str:
     """Returns the liveliness token of one start of a member."""
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
+
+
+def said(inbox: Inbox) -> Iterator[Event]:
+    """Yields the events that wait in a ring; what is none of ours is passed over."""
+    while (message := inbox.poll()) is not None:
+        try:
+            yield decode(message[1], Event)
+        except WireError:
+            continue
 
 
 class Voice:

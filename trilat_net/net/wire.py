@@ -17,6 +17,7 @@ import msgspec
 
 from ..core.tick import Arrival, Output
 from ..errors import WireError
+from .answers import Order, Pong, Reply
 from .messages import (
     SAMPLE_VECTORS,
     STATE_VECTORS,
@@ -24,9 +25,6 @@ from .messages import (
     Event,
     Info,
     LinkStats,
-    Order,
-    Pong,
-    Reply,
     Sample,
     State,
 )

@@ -86,6 +86,8 @@ def command_from(scenario: Scenario, site: str, text: str) -> Command:
     if owner(change) != site or bool(change.link) == bool(change.dominance):
         raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
     check_change(change, "cmd")
+    if change.dominance:
+        change_shares(change.to, change.dominance, list(scenario.names), "cmd")
     return command(scenario, change)
 
 

@@ -8,7 +8,8 @@ import msgspec
 from ..core.arm import positive_definite
 from ..errors import ScenarioError
 from . import expectation
-from .links import Link, LinkBase
+from .link import LinkBase
+from .links import Link, Trace
 from .model import OnStale, Pulse, Scenario, SiteSpec
 from .resolution import Table
 from .timeline import Change
@@ -20,6 +21,7 @@ _CHOICES = {
         (SiteSpec, "role"),
         (Pulse, "kind"),
         (LinkBase, "order"),
+        (Trace, "at_end"),
         (OnStale, "action"),
     )
 }
@@ -50,16 +52,26 @@ def convert(resolved: Table) -> Scenario:
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
+    scenario = msgspec.structs.replace(scenario, timeline=tuple(map(_spelt, scenario.timeline)))
     if expected := expectation.fault(scenario.expect, scenario.names):
         key, problem = expected
         raise ScenarioError(problem, path=f"expect.{key}")
     return scenario
 
 
+def _spelt(change: Change) -> Change:
+    """Returns a change with its link spelt as in `links`, so that 350 and 350.0 are one experiment."""
+    if not change.link:
+        return change
+    return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
+
+
 def check_change(change: Change, path: str) -> None:
     """Refuses a change that makes no link of its link."""
     if not change.link:
         return
+    if change.ramp_s:
+        raise ScenarioError("a link changes at once; only shares have a ramp", path=f"{path}.ramp_s")
     try:
         found = change.after.fault()
     except msgspec.ValidationError as error:
@@ -73,7 +85,7 @@ def _plain(problem: str, path: str) -> str:
     """Puts a validation message into the words of a scenario's author."""
     if problem.startswith("Invalid enum value"):
         choices = _CHOICES[path.rpartition(".")[2]]
-        return f"is {problem.split()[-1]}, must be {' or '.join(map(repr, choices))}"
+        return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"
     if problem.startswith("Object missing required field"):
         return f"{problem.split()[-1].strip('`')} is missing"
     words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))

@@ -1,158 +1,23 @@
-"""What a directed link does to samples, as an author writes it: one type per delay model.
+"""The delay models of a directed link, as an author writes them: one type each.
 
 Law: each model states its mean and deviation in closed form, and the core draws from just that
 distribution. Keys end in their unit.
 """
 
 import math
-from typing import Annotated, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
 
-from ..core.delay import LIMIT_US, AtEnd, Delay, Model, Points
-from .frozen import Frozen
+from ..core.delay import AtEnd, Delay, Model, Points
+from .link import LIMIT_MS, Fault, LinkBase, Milliseconds, Moments, Probability, whole_us
 from .traces import points_of
 
-_LIMIT_MS = LIMIT_US / 1000
-
-Milliseconds = Annotated[float, Meta(ge=0.0, le=_LIMIT_MS)]
-PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=_LIMIT_MS)]
-Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
+PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=LIMIT_MS)]
+Deviation = Annotated[float, Meta(ge=0.001, le=LIMIT_MS)]
+"""A microsecond or more: what is drawn is rounded to that."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
-Instant = Annotated[float, Meta(ge=0.0, le=1e9)]
-
-
-class Fault(NamedTuple):
-    """What is wrong with a link: the key, and why."""
-
-    key: str
-    problem: str
-
-
-class Moments(NamedTuple):
-    """Mean and standard deviation of a delay, ms."""
-
-    mean_ms: float
-    deviation_ms: float
-
-
-class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """What every model has besides its delay.
-
-    Attributes:
-        loss: share of samples that are lost in the long run.
-        loss_burst: mean number of samples lost in a row; 0: each is lost by itself.
-        loss_bad: of a burst's samples, the share that is lost; below 1 bursts have holes.
-        duplicate: share of samples that come twice, the copy with a delay of its own.
-        outages_s: times between which the link is cut, by the samples' stamps, s.
-        order: "newest": a newer sample replaces an older one; "in_order": none overtakes an older one.
-        playout_ms: every sample is held at least so long: jitter below it becomes a constant delay.
-    """
-
-    loss: Probability = 0.0
-    loss_burst: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
-    loss_bad: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
-    duplicate: Probability = 0.0
-    outages_s: tuple[tuple[Instant, Instant], ...] = ()
-    order: Literal["newest", "in_order"] = "newest"
-    playout_ms: Milliseconds = 0.0
-
-    def delay(self) -> Model:
-        """Returns the delay alone, as the core has it."""
-        raise NotImplementedError
-
-    def moments(self) -> Moments:
-        """Returns what the model states of its delay, before play-out and order."""
-        raise NotImplementedError
-
-    @property
-    def random(self) -> bool:
-        """True where anything of it is drawn."""
-        drawn = self.delay().kind not in (Delay.CONSTANT, Delay.SINE, Delay.TRACE, Delay.MEASURED)
-        return drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
-
-    @property
-    def measured(self) -> bool:
-        """True where nothing is injected."""
-        return self.delay().kind == Delay.MEASURED
-
-    @property
-    def points(self) -> Points | None:
-        """The points of its trace, if it has one."""
-        return None
-
-    def core(self, from_ns: int = 0) -> Model:
-        """Returns what the core builds the link from.
-
-        Args:
-            from_ns: the first stamp that it applies to, ns since the epoch.
-        """
-        good, bad, enter, leave = self._chain()
-        return self.delay()._replace(
-            from_ns=from_ns,
-            loss_good=good,
-            loss_bad=bad,
-            enter=enter,
-            leave=leave,
-            duplicate=self.duplicate,
-            in_order=int(self.order == "in_order"),
-            playout_us=_us(self.playout_ms),
-        )
-
-    def _chain(self) -> tuple[float, float, float, float]:
-        """Returns the chain of losses: loss in good and bad state, probability to enter and leave the bad.
-
-        In the bad state a sample is lost with h = `loss_bad`, in the good one never. A run of losses goes
-        on with (1 - leave) h, so its mean length is B = 1 / (1 - (1 - leave) h); the share of bad samples
-        is loss / h = enter / (enter + leave).
-        """
-        if self.loss_burst == 0.0 or self.loss == 0.0:
-            return self.loss, 0.0, 0.0, 1.0
-        leave = 1.0 - (1.0 - 1.0 / self.loss_burst) / self.loss_bad
-        bad = self.loss / self.loss_bad
-        return 0.0, self.loss_bad, leave * bad / (1.0 - bad), leave
-
-    def fault(self) -> Fault | None:
-        """Returns what is wrong with it that no range of a single key shows."""
-        for n, (start_s, end_s) in enumerate(self.outages_s):
-            if end_s <= start_s:
-                return Fault(f"outages_s[{n}]", f"must end after it begins, reads {start_s:g} to {end_s:g}")
-        if self.loss_burst and self.loss:
-            return self._burst_fault()
-        return None
-
-    def _burst_fault(self) -> Fault | None:
-        if self.loss_burst < 1.0:
-            return Fault("loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}")
-        if self.loss >= self.loss_bad:
-            return Fault("loss", f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}")
-        _, _, enter, leave = self._chain()
-        if leave <= 0.0:
-            longest = 1.0 / (1.0 - self.loss_bad)
-            return Fault("loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}")
-        if enter > 1.0:
-            return Fault("loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}")
-        return None
-
-    def describe(self) -> str:
-        """Returns what it does, in a few words, with the mean and deviation that its model states."""
-        words = [self._words()]
-        if self.loss:
-            bursts = f" in bursts of {self.loss_burst:g}" if self.loss_burst else ""
-            words.append(f"loss {100 * self.loss:g} %{bursts}")
-        if self.duplicate:
-            words.append(f"duplicates {100 * self.duplicate:g} %")
-        words += [f"cut {start:g}-{end:g} s" for start, end in self.outages_s]
-        if self.order == "in_order":
-            words.append("in order")
-        if self.playout_ms:
-            words.append(f"play-out {self.playout_ms:g} ms")
-        return ", ".join(words)
-
-    def _words(self) -> str:
-        mean_ms, deviation_ms = self.moments()
-        return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
@@ -181,7 +46,7 @@ class Constant(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
     def delay(self) -> Model:
         """See `LinkBase`; in whole microseconds (L4)."""
-        return Model(kind=Delay.CONSTANT, location=float(_us(self.delay_ms)))
+        return Model(kind=Delay.CONSTANT, location=float(whole_us(self.delay_ms)))
 
     def moments(self) -> Moments:
         """See `LinkBase`."""
@@ -210,6 +75,10 @@ class Uniform(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         """See `LinkBase`: half the width over the root of 3."""
         return Moments(self.delay_ms, self.half_width_ms / math.sqrt(3.0))
 
+    def reach_ms(self) -> float:
+        """See `LinkBase`."""
+        return self.delay_ms + self.half_width_ms
+
     def fault(self) -> Fault | None:
         """See `LinkBase`."""
         if self.half_width_ms > self.delay_ms:
@@ -226,7 +95,7 @@ class Normal(LinkBase, frozen=True, kw_only=True, tag="normal"):
     """
 
     delay_ms: Milliseconds
-    deviation_ms: PositiveMilliseconds
+    deviation_ms: Deviation
 
     def delay(self) -> Model:
         """See `LinkBase`."""
@@ -249,7 +118,7 @@ class Gamma(LinkBase, frozen=True, kw_only=True, tag="gamma"):
     """
 
     delay_ms: PositiveMilliseconds
-    deviation_ms: PositiveMilliseconds
+    deviation_ms: Deviation
 
     def delay(self) -> Model:
         """See `LinkBase`: shape m^2 / s^2, scale s^2 / m."""
@@ -259,6 +128,10 @@ class Gamma(LinkBase, frozen=True, kw_only=True, tag="gamma"):
     def moments(self) -> Moments:
         """See `LinkBase`."""
         return Moments(self.delay_ms, self.deviation_ms)
+
+    def fault(self) -> Fault | None:
+        """See `LinkBase`."""
+        return _spread_fault(self.delay_ms, self.deviation_ms) or LinkBase.fault(self)
 
 
 class LogNormal(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
@@ -270,7 +143,7 @@ class LogNormal(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
     """
 
     delay_ms: PositiveMilliseconds
-    deviation_ms: PositiveMilliseconds
+    deviation_ms: Deviation
 
     def delay(self) -> Model:
         """See `LinkBase`: sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
@@ -281,6 +154,10 @@ class LogNormal(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
     def moments(self) -> Moments:
         """See `LinkBase`."""
         return Moments(self.delay_ms, self.deviation_ms)
+
+    def fault(self) -> Fault | None:
+        """See `LinkBase`."""
+        return _spread_fault(self.delay_ms, self.deviation_ms) or LinkBase.fault(self)
 
 
 class HyperExponential(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
@@ -326,7 +203,7 @@ class Correlated(LinkBase, frozen=True, kw_only=True, tag="ar1"):
     """
 
     delay_ms: Milliseconds
-    deviation_ms: PositiveMilliseconds
+    deviation_ms: Deviation
     correlation: Correlation
 
     def delay(self) -> Model:
@@ -339,11 +216,12 @@ class Correlated(LinkBase, frozen=True, kw_only=True, tag="ar1"):
         )
 
     def moments(self) -> Moments:
-        """See `LinkBase`: of max(0, x) for a normal x."""
+        """See `LinkBase`: of max(0, x) for a normal x, in a form in which nothing large cancels."""
         m, s = self.delay_ms, self.deviation_ms
-        above, density = _probability(m / s), _density(m / s)
-        mean = m * above + s * density
-        return Moments(mean, math.sqrt((m * m + s * s) * above + m * s * density - mean * mean))
+        a = m / s
+        above, below, density = _probability(a), _probability(-a), _density(a)
+        variance = above + a * above * a * below + a * density * (below - above) - density * density
+        return Moments(m * above + s * density, s * math.sqrt(max(variance, 0.0)))
 
 
 class Sine(LinkBase, frozen=True, kw_only=True, tag="sine"):
@@ -374,6 +252,10 @@ class Sine(LinkBase, frozen=True, kw_only=True, tag="sine"):
     def moments(self) -> Moments:
         """See `LinkBase`: over whole periods."""
         return Moments(self.delay_ms, self.amplitude_ms / math.sqrt(2.0))
+
+    def reach_ms(self) -> float:
+        """See `LinkBase`."""
+        return self.delay_ms + self.amplitude_ms
 
     def fault(self) -> Fault | None:
         """See `LinkBase`."""
@@ -454,8 +336,13 @@ LINKS: dict[str, type[LinkBase]] = {str(kind.__struct_config__.tag): kind for ki
 """The models by their names."""
 
 
-def _us(milliseconds: float) -> int:
-    return round(milliseconds * 1_000)
+def _spread_fault(delay_ms: float, deviation_ms: float) -> Fault | None:
+    """Returns what is wrong with a deviation beside its mean: out of these bounds it is hardly meant."""
+    if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
+        return None
+    return Fault(
+        "deviation_ms", f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
+    )
 
 
 def _density(x: float) -> float:

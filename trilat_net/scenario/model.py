@@ -21,7 +21,8 @@ from ..core.setup import Law, LinkSetup, Scheme, SiteSetup, Stale, StaleRule
 from ..core.tick import Ramp
 from .expectation import Expect
 from .frozen import Frozen
-from .links import Link, LinkBase
+from .link import LinkBase
+from .links import Link
 from .timeline import Change, later_links
 
 LARGEST = 1e9
@@ -257,16 +258,20 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns the peers of a site, in scenario order."""
         return tuple(name for name in self.names if name != site)
 
+    def _all_links(self) -> list[LinkBase]:
+        """Returns what every link is at any time of the run."""
+        later = [link for name in self.links for _, link in later_links(self.timeline, name)]
+        return [*self.links.values(), *later]
+
     @property
     def random(self) -> bool:
         """True where anything is drawn: then another seed is another run."""
-        later = [link for name in self.links for _, link in later_links(self.timeline, name)]
-        return any(link.random for link in (*self.links.values(), *later))
+        return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
         """True where a sample of some link is in use as soon as it has come: then the network decides."""
-        return any(link.measured for link in self.links.values())
+        return any(link.measured for link in self._all_links())
 
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""

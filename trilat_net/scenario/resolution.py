@@ -53,6 +53,8 @@ _VECTORS = {
     "Gamma": PARAMETERS,
     "theta_hat0": PARAMETERS,
 }
+_FILE = ("file", "of")
+"""Keys that say where a trace comes from; a resolved link has the trace in their place."""
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
 
@@ -117,6 +119,7 @@ def resolve(tables: Table, folder: Path) -> Table:
         _known(tables.get(group, {}), _fields(kind), group)
     _resolve_control(tables.get("control", {}), {}, "control")
     sites = _resolve_sites(tables)
+    rows = _resolve_dominance(tables, list(sites))
     links = _resolve_links(tables, list(sites), folder)
     resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
     return {
@@ -125,7 +128,7 @@ def resolve(tables: Table, folder: Path) -> Table:
         "scheme": "second_order",
         **resolved,
         "sites": sites,
-        "dominance": _resolve_dominance(tables, list(sites)),
+        "dominance": rows,
         "links": links,
         "timeline": _resolve_timeline(tables.get("timeline", []), links, list(sites)),
         "expect": tables.get("expect", {}),
@@ -216,11 +219,14 @@ def _row(row: Table, names: list[str], own: int, path: str) -> Table:
 def _resolve_links(tables: Table, names: list[str], folder: Path) -> Table:
     every = [f"{j}->{i}" for i in names for j in names if i != j]
     written = _known(tables.get("links", {}), every, "links")
-    default = resolve_link(tables.get("link", {}), {}, "link", folder)
+    default = resolve_link(tables.get("link", {}), {}, "link")
     links: Table = {}
     for name in every:
         path = f"links.{name}"
-        link = resolve_link(written.get(name, {}), default, path, folder)
+        link = resolve_link(written.get(name, {}), default, path)
+        if link["model"] == "trace":
+            shared = "file" in default and "file" not in written.get(name, {})
+            link = _with_trace(link, name, "link" if shared else path, folder)
         for field in msgspec.structs.fields(LINKS[link["model"]]):
             if field.required and field.name not in link:
                 raise ScenarioError("is missing; give it here or in [link]", path=f"{path}.{field.name}")
@@ -228,14 +234,15 @@ def _resolve_links(tables: Table, names: list[str], folder: Path) -> Table:
     return links
 
 
-def resolve_link(written: Any, base: Table, path: str, folder: Path | None = None) -> Table:
+def resolve_link(written: Any, base: Table, path: str) -> Table:
     """Returns a link: what is written upon what it was, or anew where a model or a preset is named.
+
+    The file of a trace is not read yet.
 
     Args:
         written: the author's table.
         base: what the link is otherwise.
         path: what errors call it.
-        folder: where a trace's file lies; None where no file may be named.
     """
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
@@ -246,17 +253,29 @@ def resolve_link(written: Any, base: Table, path: str, folder: Path | None = Non
     model = written.get("model", start.get("model", "constant"))
     _one_of(model, list(LINKS), f"{path}.model")
     if model != start.get("model", model):
-        start = {}
-    files = ("file", "of") if model == "trace" else ()
+        named = f"the preset {written['preset']!r} is {start['model']!r}: give one of the two"
+        raise ScenarioError(f"is {model!r}, but {named}", path=f"{path}.model")
+    files = _FILE if model == "trace" else ()
     valid = ("model", "preset", *_fields(LINKS[model]), *files)
-    link = {**start, **_known(written, valid, path), "model": model}
+    own = _known(written, valid, path)
+    replaced = _FILE if "trace" in own else ("trace",) if "file" in own else ()
+    link = {**{key: value for key, value in start.items() if key not in replaced}, **own, "model": model}
     link.pop("preset", None)
-    if "file" in link:
-        if folder is None:
-            raise ScenarioError("no file can be named here", path=f"{path}.file")
-        file, of = str(link.pop("file")), str(link.pop("of", path.removeprefix("links.")))
+    return link
+
+
+def _with_trace(link: Table, name: str, path: str, folder: Path) -> Table:
+    """Returns a link that holds the trace of its file; of a log that of the link of its name, or of `of`."""
+    link = dict(link)
+    file, of = (link.pop(key, None) for key in _FILE)
+    if ("trace" in link) == (file is not None):
+        problem = "give either trace or file" if "trace" in link else "is missing: a table or a log of delays"
+        raise ScenarioError(problem, path=f"{path}.file")
+    if file is None and of is not None:
+        raise ScenarioError("names a link of the log that file names", path=f"{path}.of")
+    if file is not None:
         try:
-            link["trace"] = read_trace(folder / file, of)
+            link["trace"] = read_trace(folder / str(file), str(of or name))
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=f"{path}.file") from None
     return link
@@ -282,6 +301,9 @@ def _resolve_timeline(written: Any, links: Table, names: list[str]) -> list[Tabl
         before_s = at_s
         if ("link" in change) == ("dominance" in change):
             raise ScenarioError("names either a link or, as dominance, a site", path=path)
+        for key in ("link", "dominance"):
+            if not isinstance(change.get(key, ""), str):
+                raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
         if "link" in change:
             change["to"] = present[change["link"]] = change_link(
                 change.get("to", {}), change["link"], present, path
@@ -306,6 +328,8 @@ def change_link(written: Any, link: str, present: Table, path: str) -> Table:
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
     after = resolve_link(written, present[link], f"{path}.to")
     before = present[link]
+    if "file" in after or "of" in after:
+        raise ScenarioError("no file can be named here", path=f"{path}.to.file")
     if after["model"] == "trace" and after.get("trace") != before.get("trace"):
         raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
     if "outages_s" in written and written["outages_s"] != before.get("outages_s"):

@@ -11,7 +11,8 @@ import msgspec
 from msgspec import Meta
 
 from .frozen import Frozen
-from .links import Link, LinkBase
+from .link import LinkBase
+from .links import Link
 
 
 class Change(Frozen, frozen=True, omit_defaults=True):

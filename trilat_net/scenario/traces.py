@@ -33,10 +33,14 @@ Reader = Callable[[Path, str], Sequence[Row]]
 
 
 def _csv_rows(path: Path, link: str) -> list[Row]:  # noqa: ARG001 - a table is of one link
-    rows = []
-    with path.open(newline="", encoding="utf-8") as stream:
+    rows: list[Row] = []
+    begun = False
+    with path.open(newline="", encoding="utf-8-sig") as stream:
         for number, cells in enumerate(csv.reader(stream), start=1):
-            if not cells or cells[0].lstrip().startswith("#") or (number == 1 and _is_head(cells)):
+            if not any(cells) or cells[0].lstrip().startswith("#"):
+                continue
+            first, begun = not begun, True
+            if first and _is_head(cells):
                 continue
             try:
                 time_text, delay_text = (cell.strip() for cell in cells)
@@ -49,11 +53,14 @@ def _csv_rows(path: Path, link: str) -> list[Row]:  # noqa: ARG001 - a table is 
 
 
 def _is_head(cells: Sequence[str]) -> bool:
-    try:
-        float(cells[0])
-    except ValueError:
-        return True
-    return False
+    """True where no cell is a number."""
+    for cell in cells:
+        try:
+            float(cell)
+        except ValueError:
+            continue
+        return False
+    return True
 
 
 _ELSEWHERE = {".mcap": "trilat_net.log.delays:measured_rows"}
@@ -82,7 +89,7 @@ def read_trace(path: Path, link: str) -> str:
         return text_of(_reader(path)(path, link))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:  # UnicodeDecodeError is one
+    except (ValueError, csv.Error) as error:  # UnicodeDecodeError is a ValueError
         raise ScenarioError(f"{path}: {error}") from None
 
 

@@ -1,12 +1,12 @@
-// Draws the charts and the arms of a report from the data in the page. One time axis for all of them.
+// Draws the charts of a report from the data in the page. One time axis for all of them.
 (() => {
   "use strict";
   const page = JSON.parse(document.getElementById("data").textContent);
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+  const floats = (text) => Array.from(new Float32Array(bytes(text)), (v) => (Number.isNaN(v) ? null : v));
   const tables = page.tables.map((table) => ({
     t: Array.from(new Int32Array(bytes(table.tick)), (k) => k / table.rate_hz),
-    columns: table.columns.map((column) =>
-      Array.from(new Float32Array(bytes(column)), (v) => (Number.isNaN(v) ? null : v))),
+    columns: table.columns.map(floats),
   }));
 
   const darkQuery = matchMedia("(prefers-color-scheme: dark)");
@@ -56,25 +56,55 @@
     grid: { stroke: grid(), width: 1 }, ticks: { stroke: grid(), width: 1, size: 4 }, ...extra,
   });
 
-  function horizontals(lines) {
-    return (u) => {
-      const { ctx, bbox } = u;
-      ctx.save();
-      ctx.beginPath();
-      ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-      ctx.clip();
-      ctx.setLineDash([6 * devicePixelRatio, 3 * devicePixelRatio]);
-      ctx.lineWidth = devicePixelRatio;
-      for (const line of lines) {
-        const y = u.valToPos(line.value, "y", true);
-        ctx.strokeStyle = colour(line.colour);
-        ctx.beginPath();
-        ctx.moveTo(bbox.left, y);
-        ctx.lineTo(bbox.left + bbox.width, y);
-        ctx.stroke();
+  const clipped = (u, paint) => {
+    const { ctx, bbox } = u;
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+    ctx.clip();
+    ctx.lineWidth = devicePixelRatio;
+    paint(ctx, bbox, (t) => u.valToPos(t, "x", true));
+    ctx.restore();
+  };
+  const stroke = (ctx, x0, y0, x1, y1) => {
+    ctx.beginPath();
+    ctx.moveTo(x0, y0);
+    ctx.lineTo(x1, y1);
+    ctx.stroke();
+  };
+
+  // Shades where sites do not follow their peers, and what was changed when.
+  function marks(chart) {
+    const sites = chart.sites || Object.keys(page.spans);
+    const changes = page.changes.filter((change) => sites.includes(change.site) && (change.link || !chart.links));
+    return (u) => clipped(u, (ctx, bbox, x) => {
+      for (const [index, mode, from, to] of sites.flatMap((site) => page.spans[site])) {
+        ctx.globalAlpha = mode === "return" ? 0.1 : 0.25;
+        ctx.fillStyle = colour(index);
+        ctx.fillRect(x(from), bbox.top, x(to) - x(from), bbox.height);
       }
-      ctx.restore();
-    };
+      ctx.globalAlpha = 1;
+      ctx.setLineDash([devicePixelRatio, 2 * devicePixelRatio]);
+      ctx.strokeStyle = ctx.fillStyle = colour("limit");
+      ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
+      ctx.textBaseline = "top";
+      ctx.textAlign = "left";
+      for (const { t, n } of changes) {
+        stroke(ctx, x(t), bbox.top, x(t), bbox.top + bbox.height);
+        ctx.fillText(n, x(t) + 2 * devicePixelRatio, bbox.top + devicePixelRatio);
+      }
+    });
+  }
+
+  function horizontals(lines) {
+    return (u) => clipped(u, (ctx, bbox, x) => {
+      ctx.setLineDash([6 * devicePixelRatio, 3 * devicePixelRatio]);
+      for (const { value, colour: index, from = 0, to = page.end_s } of lines) {
+        const y = u.valToPos(value, "y", true);
+        ctx.strokeStyle = colour(index);
+        stroke(ctx, x(from), y, x(to), y);
+      }
+    });
   }
 
   function timeData(chart) {
@@ -88,11 +118,15 @@
     return [aligned.length > 1 ? uPlot.join(aligned) : aligned[0], [...parts.values()].flat()];
   }
 
+  const rungs = (u, index, min, max) => [-3, -2, -1, 0, 1, 2, 3, 4, 5, 6].flatMap((power) =>
+    [1, 2, 5].map((step) => step * 10 ** power).filter((value) => value >= min && value <= max));
+
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
     const lines = chart.lines || [];
     const range = (u, min, max) => {
       const values = lines.map((line) => line.value);
+      if (chart.log) return [0.7 * Math.min(min ?? 1, ...values), 2 * Math.max(max ?? 1, ...values)];
       let low = Math.min(min ?? 0, ...values, ...(chart.zero ? [0] : []));
       let high = Math.max(max ?? 1, ...values);
       const pad = Math.max(0.06 * (high - low), (chart.margin || 0) * high) || 0.1 * Math.abs(high) || 0.1;
@@ -101,7 +135,7 @@
     const shared = order.length > 1 && !order.some((series) => series.dash);
     const options = {
       width: box.clientWidth, height: 210, padding: [8, 10, 0, 0],
-      scales: { x: { time: false, range: (u, min, max) => (min == null ? zoom : [min, max]) }, y: { range } },
+      scales: { x: { time: false, range: (u, min, max) => (min == null ? zoom : [min, max]) }, y: { range, distr: chart.log ? 3 : 1 } },
       cursor: {
         drag: { x: true, y: false }, points: { size: 6 }, dataIdx: nearest,
         sync: { key: "time", scales: ["x", null], setSeries: false,
@@ -116,11 +150,12 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52 })],
+      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(chart.log ? { splits: rungs } : {}) })],
       hooks: {
-        drawAxes: [horizontals(lines)],
+        drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
+        draw: chart.links ? [horizontals(lines)] : [],
         setScale: [(u, key) => { if (key === "x" && u.ready) zoomAll(u.scales.x.min, u.scales.x.max); }],
-        setCursor: [(u) => { if (u.cursor.event && u.cursor.left >= 0) show(u.posToVal(u.cursor.left, "x")); }],
+        setCursor: [(u) => { if (u.cursor.event && u.cursor.left >= 0) window.trilat.show(u.posToVal(u.cursor.left, "x")); }],
       },
     };
     const plot = new uPlot(options, data, box);
@@ -172,6 +207,23 @@
     }, [chart.edges, ...chart.series.map((series) => closed(series.counts))], box);
   }
 
+  function distribution(chart, box) {
+    const x = Array.from({ length: chart.points }, (_, n) => (n * chart.end) / (chart.points - 1));
+    return new uPlot({
+      width: box.clientWidth, height: 210, padding: [8, 16, 0, 0],
+      scales: { x: { time: false }, y: { range: [0, 104] } },
+      cursor: { drag: { x: false, y: false }, points: { size: 6 } },
+      series: [
+        { label: "up to", value: (u, v) => number(v, chart.unit) },
+        ...chart.series.map((series) => ({
+          label: series.label, stroke: colour(series.colour), width: series.dash ? 1.1 : 1.8, dash: dashOf(series),
+          points: { show: false }, value: (u, v) => number(v, "%"),
+        })),
+      ],
+      axes: [axis(`${chart.unit}; dashed: the delay of the samples`, { size: 30 }), axis("cumulative (%)", { size: 52 })],
+    }, [x, ...chart.series.map((series) => floats(series.values))], box);
+  }
+
   const boxes = page.charts.map((chart) => {
     const figure = document.createElement("figure");
     const caption = document.createElement("figcaption");
@@ -185,94 +237,12 @@
   function build() {
     plots.forEach((plot) => plot.destroy());
     timePlots = [];
-    plots = page.charts.map((chart, n) => (chart.edges ? histogram : timeChart)(chart, boxes[n]));
+    const kind = (chart) => (chart.edges ? histogram : chart.points ? distribution : timeChart);
+    plots = page.charts.map((chart, n) => kind(chart)(chart, boxes[n]));
   }
 
-  // ---- the arms at a time
-  const SVG = "http://www.w3.org/2000/svg";
-  const row = document.querySelector("#arms .row");
-  const slider = document.querySelector("#arms input");
-  const clock = document.querySelector("#arms output");
-  const button = document.querySelector("#arms button");
-  const [left, right, bottom, top] = page.bounds_m;
-  row.style.gridTemplateColumns = `repeat(${page.arms.length}, 1fr)`;
-  const element = (parent, name, attributes) => {
-    const made = document.createElementNS(SVG, name);
-    Object.entries(attributes).forEach(([key, value]) => made.setAttribute(key, value));
-    parent.append(made);
-    return made;
-  };
-  const drawn = page.arms.map((arm) => {
-    const cell = document.createElement("div");
-    const name = document.createElement("span");
-    name.textContent = arm.site;
-    cell.append(name);
-    row.append(cell);
-    const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
-      "aria-label": arm.site });
-    element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
-    const desired = element(svg, "polyline", { class: "desired" });
-    const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
-    const joints = [0, 1].map(() => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
-    element(svg, "rect", { class: "base", x: -0.05, y: -0.05, width: 0.1, height: 0.1 });
-    return { arm, desired, actual, joints };
-  });
-  const at = (table, time) => {
-    const { t, columns } = tables[table];
-    if (!t.length || time < t[0]) return null;
-    let low = 0;
-    let high = t.length - 1;
-    while (low < high) {
-      const middle = (low + high + 1) >> 1;
-      if (t[middle] <= time) low = middle; else high = middle - 1;
-    }
-    const next = Math.min(low + 1, t.length - 1);
-    const share = next > low ? (time - t[low]) / (t[next] - t[low]) : 0;
-    const values = columns.map((column) => column[low] + share * (column[next] - column[low]));
-    return columns.some((column) => column[low] === null || column[next] === null) ? null : values;
-  };
-  const bends = ([l1, l2], q1, q2) => {  // elbow and tip, in SVG whose y grows downwards
-    const [x, y] = [l1 * Math.cos(q1), -l1 * Math.sin(q1)];
-    return [[x, y], [x + l2 * Math.cos(q1 + q2), y - l2 * Math.sin(q1 + q2)]];
-  };
-  function show(time) {
-    const now = Math.max(0, Math.min(page.end_s, time));
-    slider.value = (1000 * now) / page.end_s;
-    clock.textContent = `${now.toFixed(3)} s`;
-    for (const { arm, desired, actual, joints } of drawn) {
-      const q = at(arm.table, now) || [NaN, NaN, NaN, NaN];
-      const known = !Number.isNaN(q[0]);
-      const points = bends(arm.links_m, q[0], q[1]);
-      actual.setAttribute("points", known ? `0,0 ${points.join(" ")}` : "");
-      desired.setAttribute("points", known ? `0,0 ${bends(arm.links_m, q[2], q[3]).join(" ")}` : "");
-      joints.forEach((joint, n) => {
-        joint.setAttribute("visibility", known ? "visible" : "hidden");
-        if (known) { joint.setAttribute("cx", points[n][0]); joint.setAttribute("cy", points[n][1]); }
-      });
-    }
-  }
-  let started = null;
-  function frame(stamp) {
-    if (started === null) return;
-    const time = (stamp - started) / 1000;
-    show(time);
-    if (time < page.end_s) requestAnimationFrame(frame); else stop();
-  }
-  function stop() {
-    started = null;
-    button.textContent = "play";
-  }
-  button.addEventListener("click", () => {
-    if (started !== null) return stop();
-    const from = (slider.value / 1000) * page.end_s;
-    started = performance.now() - 1000 * (from >= 0.999 * page.end_s ? 0 : from);
-    button.textContent = "stop";
-    requestAnimationFrame(frame);
-  });
-  slider.addEventListener("input", () => { stop(); show((slider.value / 1000) * page.end_s); });
-
+  window.trilat = { page, tables, plots: () => timePlots, show: () => {} }; // the arms join in
   build();
-  show(0);
   let pending = 0;
   addEventListener("resize", () => {
     clearTimeout(pending);
@@ -281,5 +251,4 @@
   darkQuery.addEventListener("change", build);
   addEventListener("beforeprint", () => { printing = true; build(); });
   addEventListener("afterprint", () => { printing = false; build(); });
-  window.trilat = { plots: () => timePlots, show }; // for the console
 })();

@@ -1,0 +1,303 @@
+"""What links did, from records: against the core's own counts, and against the theory of ages."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import trilat_net
+from trilat_net.analysis.fates import fates
+from trilat_net.analysis.link_use import histogram, link_uses, spread
+from trilat_net.scenario import load, parse
+
+from . import logs
+
+PERIOD_MS = 1.0
+
+
+def uses(log):
+    return {use.name: use for use in link_uses(log)}
+
+
+@cache
+def busy():
+    return uses(logs.busy().log)
+
+
+def counted(run, link):
+    peer, site = link.split("->")
+    return run.counts[site][run.log[site].peers.index(peer)]
+
+
+# -- counts
+
+
+@pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
+def test_counts_are_those_of_the_link_itself(link):
+    counts, core = busy()[link].counts, counted(logs.busy(), link)
+    assert counts.arrived + counts.duplicate == core.accepted
+    assert (counts.lost, counts.late, counts.duplicate) == (core.lost, core.late, core.duplicate)
+    assert counts.copies == pytest.approx(core.copies, abs=5)  # of samples that came no more
+    waiting = 0.15 * 200  # at the end: released with others, as the link knows and no record shows
+    assert counts.superseded <= core.superseded <= counts.superseded + waiting
+
+
+def test_what_was_superseded_is_in_use_in_no_record():
+    log = logs.busy().log
+    for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
+        release = fates(log, peer, site, log.scenario.ticks(peer)).release(log[site].rate_hz)
+        released = {n for n, tick in enumerate(release) if 0 <= tick <= log[site].tick[-1]}
+        arrived = {
+            tick for state in log[site].states for j, tick, _ in state.rx if log[site].peers[j] == peer
+        }
+        never = (released & arrived) - set(log[site].used[peer].tolist())
+        assert busy()[f"{peer}->{site}"].counts.superseded == len(never) > 0
+
+
+def test_what_the_network_lost_and_doubled_is_counted():
+    scenario = load("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
+    burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
+    run = logs.driven(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
+    found = uses(run.log)
+    lossy = found["m2->m1"]
+    assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
+    assert lossy.loss == 14 / 199
+    assert lossy.burst == 14 / 3
+    assert lossy.silence_ms == 55.0  # ten samples of 5 ms, and the one that came again
+    assert not lossy.plain
+    assert found["m2->s"].counts.duplicate == 2
+    assert counted(run, "m2->s").duplicate == 2
+    assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (0, None, 0.0)
+
+
+def test_what_a_missing_record_would_have_named_is_neither_lost_nor_come():
+    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
+    found = uses(log)
+    for link in ("m1->m2", "s->m2"):
+        counts = found[link].counts
+        assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
+        assert counts.judged == counts.arrived == 399 - 50
+    assert found["m2->s"].counts.missing == 0  # its samples came, though its own records are gone
+
+
+def test_a_link_that_is_cut_until_the_end_has_lost_all_that_was_sent():
+    scenario = load("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
+    run = logs.driven(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
+    cut = uses(run.log)["m2->m1"]
+    assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
+    assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
+
+
+def test_late_samples_are_those_of_the_core():
+    """Every sample of a link takes longer than the link's delay."""
+    log = logs.simulated("free")
+    hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
+    assert hurried != log.scenario.text
+    run = logs.driven(parse(hurried))
+    for use in link_uses(run.log):
+        assert use.counts.late == counted(run, use.name).late
+
+
+def test_a_stamp_out_of_range_is_refused_and_nothing_else():
+    def hostile(state):
+        return logs.replaced(
+            state, rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx
+        )
+
+    found = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
+    assert [use.counts.refused for use in found.values()] == [1] * 6
+    assert [use.counts.sent for use in found.values()] == [400] * 6
+
+
+def test_a_record_of_a_tick_that_is_never_made_costs_no_memory():
+    """Ticks are the sender's word: a false one must not make tables as long as it says."""
+
+    def far(state):
+        return logs.replaced(state, tick=2**39) if (state.site, state.tick) == ("m2", 399) else state
+
+    found = uses(logs.rewritten(logs.simulated("paper"), change=far))
+    assert found["m2->s"].counts.sent == 400
+    assert found["s->m2"].counts.missing == 0
+
+
+# -- ages
+
+
+def test_without_jitter_the_effective_delay_is_the_stated_one():
+    for use in link_uses(logs.simulated("paper")):
+        assert use.plain
+        assert use.age_ms == spread([200.0])
+        assert use.drawn_ms == spread([200.0])
+        assert (use.ticks_without_new, use.silence_ms, use.first_use_s) == (0.0, 5.0, 0.2)
+        assert sum(use.ages.ticks) == 400 - 40
+
+
+@pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
+def test_ages_in_the_records_are_what_the_fates_of_the_samples_make_them(link):
+    peer, site = link.split("->")
+    log, part = logs.busy().log, logs.busy().log[site]
+    fate = fates(log, peer, site, log.scenario.ticks(peer))
+    release = fate.release(part.rate_hz)
+    usable = np.full(len(part), -1)
+    for sample, tick in enumerate(release):
+        if 0 <= tick < len(part):
+            usable[tick] = max(usable[tick], sample)
+    in_use = np.maximum.accumulate(usable)
+    t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
+    ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
+    assert tuple(busy()[link].age_ms) == pytest.approx(tuple(spread(ages)))
+
+
+def newest_wins(cdf, h_ms):
+    """Mean and deviation of the age in use: it exceeds n h where none of the last n samples is there yet."""
+    none_yet = np.cumprod(1.0 - cdf(h_ms * np.arange(1, 20_000)))
+    return moments(np.concatenate([[1.0], none_yet]), h_ms)
+
+
+def in_order(cdf, h_ms):
+    """The same where none overtakes: it exceeds n h unless the n-th sample back and all older are there."""
+    all_there = np.cumprod(cdf(h_ms * np.arange(1, 20_000))[::-1])[::-1]
+    return moments(np.concatenate([[1.0], 1.0 - all_there]), h_ms)
+
+
+def moments(exceeds, h_ms):
+    """Mean and deviation of n h, n >= 1, from the probabilities of n > 0, 1, 2..."""
+    n = np.arange(len(exceeds))
+    mean = h_ms * exceeds.sum()
+    return mean, math.sqrt(h_ms**2 * ((2 * n + 1) * exceeds).sum() - mean**2)
+
+
+MODELS = {
+    "m1->m2": ({"model": "uniform", "delay_ms": 200.0, "half_width_ms": 50.0}, stats.uniform(150, 100)),
+    "m1->s": ({"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}, stats.uniform(0, 400)),
+    "m2->m1": ({"model": "gamma", "delay_ms": 120.0, "deviation_ms": 40.0}, stats.gamma(9, scale=120 / 9)),
+    "m2->s": ({"model": "normal", "delay_ms": 80.0, "deviation_ms": 20.0}, stats.norm(80, 20)),
+    "s->m1": (
+        {"model": "hyperexponential", "floor_ms": 30.0, "fast_ms": 5.0, "slow_ms": 60.0, "slow_share": 0.3},
+        None,
+    ),
+    "s->m2": ({"model": "lognormal", "delay_ms": 60.0, "deviation_ms": 30.0}, None),
+}
+
+
+def hyperexponential(t_ms):
+    above = np.maximum(t_ms - 30.0, 0.0)
+    return 0.7 * -np.expm1(-above / 5.0) + 0.3 * -np.expm1(-above / 60.0)
+
+
+def lognormal():
+    variance = math.log1p(0.25)
+    return stats.lognorm(math.sqrt(variance), scale=60.0 * math.exp(-variance / 2)).cdf
+
+
+def cdf_of(link):
+    model = MODELS[link][1]
+    return model.cdf if model is not None else {"s->m1": hyperexponential, "s->m2": lognormal()}[link]
+
+
+@cache
+def jittery(order):
+    links = {f"links.{name}": {**table, "order": order} for name, (table, _) in MODELS.items()}
+    return trilat_net.simulate(load("free", {"duration_s": 4.0, **links}))
+
+
+@pytest.mark.parametrize("link", MODELS)
+@pytest.mark.parametrize(
+    ("order", "theory", "margin"), [("newest", newest_wins, 0.1), ("in_order", in_order, 0.2)]
+)
+def test_the_effective_delay_under_jitter_is_that_of_theory(link, order, theory, margin):
+    """P(age > n h) is a product over independent samples, summed here; the run draws and simulates.
+
+    A run of four seconds begins with nothing older to wait for, and the largest of many delays varies.
+    """
+    log = jittery(order)
+    mean_ms, deviation_ms = theory(cdf_of(link), PERIOD_MS)
+    use = uses(log)[link]
+    assert use.age_ms.mean == pytest.approx(mean_ms, rel=margin)
+    peer, site = link.split("->")
+    release = fates(log, peer, site, 300_000).release(1000)
+    ages = long_ages(release)[2000:-2000]
+    assert ages.mean() == pytest.approx(mean_ms, rel=0.01)
+    assert ages.std() == pytest.approx(deviation_ms, rel=0.05)
+
+
+def long_ages(release):
+    """Ages at the ticks of a receiver that every sample reaches in time, in periods."""
+    newest = np.full(len(release), -1)
+    np.maximum.at(newest, np.minimum(release, len(release) - 1), np.arange(len(release)))
+    return np.arange(len(release)) - np.maximum.accumulate(newest)
+
+
+def test_the_figures_that_are_quoted():
+    """200 ms +- 50 ms at 1 kHz becomes 162 ms, 0-400 ms becomes 25 ms; in order it is longer than stated."""
+    assert newest_wins(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(162.2, abs=0.05)
+    assert newest_wins(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(24.74, abs=0.05)
+    assert in_order(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(238.8, abs=0.05)
+
+
+# -- losses
+
+
+def test_loss_and_bursts_as_seen_are_those_of_the_model():
+    scenario = load(
+        "two_sites", {"duration_s": 60.0, "rate_hz": 200, "link.loss": 0.2, "link.loss_burst": 5.0}
+    )
+    for use in link_uses(trilat_net.simulate(scenario)):
+        bursts = use.counts.lost / 5.0
+        assert use.loss == pytest.approx(0.2, abs=4 * 0.2 * math.sqrt(2.0 / bursts))
+        assert use.burst == pytest.approx(5.0, abs=4 * 5.0 / math.sqrt(bursts))
+        assert use.counts.missing == 0
+
+
+def test_playout_makes_jitter_below_its_budget_constant():
+    use = busy()["b->c"]
+    assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
+    assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
+    assert use.stated[0].link.moments().deviation_ms < 21.0
+
+
+# -- spreads and histograms
+
+
+def test_a_histogram_counts_every_tick_in_few_bins_of_a_round_width():
+    for use in busy().values():
+        bins = use.ages
+        assert sum(bins.ticks) == pytest.approx((6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz)
+        assert len(bins.ticks) <= 50
+        assert bins.first_ms <= use.age_ms.min
+        assert use.age_ms.max < bins.first_ms + len(bins.ticks) * bins.width_ms
+        assert f"{bins.width_ms:e}"[0] in "125"
+
+
+def test_one_age_is_one_bin():
+    assert histogram(np.full(7, 200_000_000)).ticks == [7]
+    assert histogram(np.zeros(0, dtype=np.int64)) is None
+    assert spread([]) is None
+
+
+# -- logs that cannot tell
+
+
+def test_an_empty_log_tells_nothing():
+    log = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
+    for use in link_uses(log):
+        assert use.stated[0].link.delay_ms == 200.0
+        assert use.plain
+        assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (None,) * 6
+
+
+def test_virtual_time_measures_no_delay_on_the_way():
+    assert all(use.one_way_us is None for use in link_uses(logs.simulated("paper")))
+
+
+def test_measured_delays_are_those_in_the_records():
+    def timed(state):
+        return logs.replaced(state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx])
+
+    log = logs.rewritten(logs.simulated("paper"), change=timed, driver="live")
+    use = uses(log)["m2->m1"]
+    assert (use.one_way_us.min, use.one_way_us.max) == (100.0, 100.0 + 398)
+    old = logs.rewritten(log, change=lambda s: logs.replaced(s, v=1), driver="live")
+    assert uses(old)["m2->m1"].one_way_us is None  # before version 2 it was the age of the stamp

@@ -1,0 +1,109 @@
+"""What a terminal is told of links, changes, modes and clocks."""
+
+import trilat_net
+from trilat_net.analysis import notes
+from trilat_net.analysis.clocks import clock_use
+from trilat_net.analysis.notes import clock_lines, link_lines, run_lines
+from trilat_net.net.messages import Event, LinkStats
+
+from . import logs
+
+
+def test_a_run_of_constant_links_without_loss_is_not_worth_a_line():
+    for name in ("paper", "free", "two_sites", "four"):
+        assert run_lines(logs.simulated(name)) == []
+
+
+def test_a_link_says_what_was_stated_and_what_was_seen():
+    log = trilat_net.simulate(
+        "two_sites",
+        {"duration_s": 2, "link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50},
+    )
+    line = link_lines(log)[0]
+    assert line.startswith("link s->m: stated uniform 200 +- 28.9 ms; effective 16")
+    assert " superseded " in line
+    assert "lost" not in line
+
+
+def test_what_happened_is_told_once():
+    lines = run_lines(logs.busy().log)
+    assert "change at 3 s, ordered at tick 500: c->a: uniform 30 +- 17.3 ms" in lines
+    assert "change at 4 s: shares of c: a 0.9, b 0.1 within 1 s" in lines
+    assert "b: braked 2.200-3.053 s, returned 3.053-3.553 s" in lines
+    (link,) = (line for line in lines if line.startswith("link b->a"))
+    assert "loss 20 % in bursts of 5" in link
+    assert "in a row" in link
+
+
+def test_of_many_lines_the_first_are_shown(monkeypatch):
+    monkeypatch.setattr(notes, "MOST", 2)
+    lines = link_lines(logs.busy().log)
+    assert len(lines) == 3
+    assert lines[-1] == "and 4 more of this kind: see summary.json"
+
+
+def statistics(tick, **clock):
+    none = {"m1": 0, "s": 0}
+    fields = {
+        "accepted": none,
+        "late": none,
+        "duplicate": none,
+        "refused": none,
+        "dropped": {},
+        "overruns": 0,
+    }
+    return LinkStats(
+        v=2,
+        site="m2",
+        boot=1,
+        tick=tick,
+        t_ns=tick * 5_000_000,
+        mode="run",
+        age_us=none,
+        late_max_us=0,
+        busy_max_us=0,
+        **fields,
+        **clock,
+    )
+
+
+def clocked():
+    """Two statistics and an estimate of m2: the clock of m1 is another one, that of s is its own."""
+    first = {"offset_us": {"m1": 3_000_000, "s": 0}, "bound_us": {"m1": 200, "s": 0}, "rtt_us": {"m1": -1}}
+    last = {"offset_us": {"m1": 3_000_100, "s": 0}, "bound_us": {"m1": 60, "s": 0}, "rtt_us": {"m1": 180}}
+    faults = {"clock_faults": {"m1": 2}}
+    estimate = Event(
+        member="m2",
+        boot=1,
+        kind="clock",
+        text="",
+        about="m1",
+        ticks=20,
+        drift_ppb=50_000,
+        drift_bound_ppb=900,
+    )
+    return logs.rewritten(
+        logs.simulated("paper"),
+        driver="live",
+        others=[statistics(20, **first), estimate, statistics(380, **last, **faults)],
+    )
+
+
+def test_a_clock_is_told_as_it_stood_at_the_end():
+    use = clock_use(clocked(), "m1", "m2")
+    assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
+    assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (130.0, 200, 180, 2)
+    assert (use.drift_ppm, use.drift_bound_ppm) == (50.0, 0.9)
+    (line,) = clock_lines(clocked())
+    assert line == (
+        "clock of m1 seen by m2: +3000.100 ms at the end, known to 60 us (p50 130, max 200), "
+        "drift +50.00 ppm, 2 samples came before they were sent: a clock has stepped"
+    )
+
+
+def test_a_shared_clock_and_a_log_without_one_are_not_worth_a_line():
+    shared = clock_use(clocked(), "s", "m2")
+    assert shared is not None
+    assert shared.shared
+    assert clock_use(clocked(), "m2", "m1") is None
+    assert clock_lines(logs.simulated("paper")) == []

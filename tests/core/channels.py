@@ -1,0 +1,71 @@
+"""Channels by themselves: the fates of a link's samples as an array."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.core.channel import foresee
+from trilat_net.core.delay import MODEL, Model, Points
+from trilat_net.core.draw import link_key
+from trilat_net.core.link import LINK, SAMPLE
+from trilat_net.scenario.link import LinkBase
+
+Ints = NDArray[np.int64]
+SEEDS = (1, 2, 3, 20_240_229, 2**63 - 1)
+LINK_NAME = "m1->s"
+_BLOCK = 8192
+
+
+class Channel(NamedTuple):
+    """The arguments of `foresee`: a link's row, its models, its pages and its points."""
+
+    row: Any
+    models: NDArray[Any]
+    pages: NDArray[Any]
+    points: Points
+
+
+def channel(
+    models: Sequence[Model],
+    seed: int = 1,
+    name: str = LINK_NAME,
+    rate_hz: int = 1000,
+    points: Points | None = None,
+    outages: int = 0,
+    pages: int = _BLOCK,
+) -> Channel:
+    """A channel at its beginning; of the points the last `outages` are such."""
+    table = np.empty((0, 2), dtype=np.int64) if points is None else points
+    row: Any = np.zeros(1, LINK)[0]
+    row.rate_hz, row.key, row.models = rate_hz, link_key(seed, name), len(models)
+    row.used = row.foreseen = -1
+    row.outage_first, row.outage_count = len(table) - outages, outages
+    return Channel(row, np.array([tuple(model) for model in models], MODEL), np.zeros(pages, SAMPLE), table)
+
+
+def due(made: Channel, count: int) -> Ints:
+    """When the next samples up to `count` are due, ns, or LOST; shape (count,) from a fresh channel."""
+    row, models, pages, points = made
+    first = int(row.foreseen) + 1
+    parts = []
+    for start in range(first, count, len(pages)):
+        end = min(start + len(pages), count)
+        foresee(end - 1, row, models, pages, points)
+        parts.append(pages["due_ns"][np.arange(start, end) % len(pages)])
+    return np.concatenate(parts)
+
+
+def stamps(count: int, rate_hz: int = 1000) -> Ints:
+    return np.arange(count, dtype=np.int64) * 10**9 // rate_hz
+
+
+def delays_us(link: LinkBase, seed: int, count: int) -> Ints:
+    """The delays that a link gives to its first samples, us; none may be lost."""
+    points = link.points
+    model = link.core()._replace(trace_count=0 if points is None else len(points))
+    ns = due(channel([model], seed, points=points), count) - stamps(count)
+    assert (ns >= 0).all()
+    assert (ns % 1000 == 0).all()
+    return ns // 1000

@@ -1,0 +1,36 @@
+"""Tables of draws, and the generator once more, in integers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.core.draw import normal, standard_gamma, uniforms
+from trilat_net.core.jit import leaf
+
+U32 = 2**32 - 1
+
+
+def philox_in_integers(counter: tuple[int, ...], key: tuple[int, int]) -> list[int]:
+    """The paper's definition, in Python's own integers."""
+    c, k = list(counter), list(key)
+    for _ in range(10):
+        a, b = 0xD2511F53 * c[0], 0xCD9E8D57 * c[2]
+        c = [(b >> 32) ^ c[1] ^ k[0], b & U32, (a >> 32) ^ c[3] ^ k[1], a & U32]
+        k = [(k[0] + 0x9E3779B9) & U32, (k[1] + 0xBB67AE85) & U32]
+    return c
+
+
+@leaf
+def _table(key: np.uint64, count: int, kind: int, shape: float, numbers: NDArray[np.float64]) -> None:
+    for n in range(count):
+        if kind == 0:
+            numbers[n], numbers[count + n] = uniforms(key, n, 3, 0)
+        elif kind == 1:
+            numbers[n] = normal(key, n, 2, 0)
+        else:
+            numbers[n] = standard_gamma(key, n, 2, shape)
+
+
+def table(count: int, kind: int, shape: float = 0.0, key: int = 77) -> NDArray[np.float64]:
+    numbers = np.zeros(2 * count)
+    _table(np.uint64(key), count, kind, shape, numbers)
+    return numbers if kind == 0 else numbers[:count]

@@ -1,0 +1,260 @@
+"""Samples in any order behind any link: the same fates, the newest wins, everything is counted."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.channels import channel, due
+from tests.core.kinds import KINDS, POINTS
+from tests.core.sites import linked, sample, stepped
+from trilat_net.core.channel import LOST
+from trilat_net.core.delay import Delay, Model
+from trilat_net.core.grid import first_tick_at, tick_ns
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Arrival, Command, Output, Tick
+
+TICKS = 500
+every_kind = pytest.mark.parametrize("name", KINDS)
+quick = settings(max_examples=12)
+
+
+def behind(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
+    return linked(rate_hz, peer_rate_hz, [KINDS[name]], POINTS)
+
+
+def releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
+    """The first tick of the receiver that may use each sample, or LOST, from a channel by itself."""
+    made = due(channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count).tolist()
+    return [
+        LOST if ns == LOST else first_tick_at(max(ns, tick_ns(m, peer_rate_hz) + 1), rate_hz)
+        for m, ns in enumerate(made)
+    ]
+
+
+arrivals = st.lists(st.lists(st.integers(0, 250), max_size=8), min_size=1, max_size=80)
+
+
+@every_kind
+@quick
+@given(came=arrivals, rates=st.sampled_from([(1000, 1000), (1000, 333), (700, 1000)]))
+def test_in_use_is_the_newest_sample_that_is_due_and_has_come(
+    name: str, came: list[list[int]], rates: tuple[int, int]
+) -> None:
+    """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
+    release = releases(name, 251, *rates)
+    site = behind(name, *rates)
+    there: set[int] = set()
+    before = -1
+    for k in range(TICKS):
+        now = came[k] if k < len(came) else []
+        there.update(now)
+        output = site.step(Tick(k, [sample(m) for m in now]))
+        assert output.used == [max((m for m in there if LOST < release[m] <= k), default=-1)]
+        assert output.used[0] >= before
+        before = output.used[0]
+        if before >= 0:
+            assert (output.q_des, output.qd_des) == (list(sample(before).q), list(sample(before).qd))
+
+
+@every_kind
+@quick
+@given(came=arrivals)
+def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> None:
+    """Accepted = refused + duplicate + lost + superseded + used, once none waits any more."""
+    site = behind(name)
+    release = releases(name, 251, 1000, 1000)
+    used: set[int] = set()
+    for k in range(max(release) + len(came) + 1):
+        now = came[k] if k < len(came) else []
+        used.add(site.step(Tick(k, [sample(m) for m in now])).used[0])
+    counts = site.counts()[0]
+    gone = counts.refused + counts.duplicate + counts.lost + counts.superseded
+    assert counts.accepted == sum(map(len, came)) == gone + len(used - {-1})
+    assert counts.lost == sum(release[m] == LOST for now in came for m in now)
+    late = sum(LOST < release[m] < k for k, m in first_arrivals(came) if name != "measured")
+    assert counts.late == late
+
+
+def first_arrivals(came: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    """(tick of the receiver, sample) without repetitions."""
+    seen: dict[int, int] = {}
+    for k, now in enumerate(came):
+        for m in now:
+            seen.setdefault(m, k)
+    return [(k, m) for m, k in seen.items()]
+
+
+@every_kind
+@quick
+@given(
+    order=st.permutations(range(20, 60)),
+    at=st.lists(st.integers(0, 20), min_size=40, max_size=40),
+    twice=st.sets(st.integers(20, 59)),
+)
+def test_the_order_of_arrival_changes_no_bit(
+    name: str, order: list[int], at: list[int], twice: set[int]
+) -> None:
+    """Samples that come before they are due, in any order, some twice, one batch or many."""
+
+    def run_with(schedule: dict[int, list[int]]) -> list[Output]:
+        ticks = [Tick(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
+        return [output._replace(rx_crc=0) for output in stepped(behind(name), ticks)]
+
+    scattered: dict[int, list[int]] = {}
+    for m, k in zip(order, at, strict=True):
+        scattered.setdefault(k, []).extend([m] * (1 + (m in twice)))
+    assert run_with(scattered) == run_with({0: list(range(20, 60))})
+
+
+@every_kind
+@pytest.mark.parametrize("k", [1, 40, 333])
+def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> None:
+    """Fresh or used for something else before: what a channel remembers follows from the beginning."""
+    ticks = [Tick(n, [sample(n - 1)] if n else []) for n in range(TICKS)]
+    whole = stepped(behind(name), ticks)
+    before, last = whole[max(0, k - 2)], whole[k - 1]
+    in_use = [sample(last.used[0]) if last.used[0] >= 0 else None]
+    waiting = [sample(m) for m in range(last.used[0] + 1, k - 1)]
+    worn = behind(name)
+    stepped(worn, ticks[: k + 100])
+    for site in (behind(name), worn):
+        site.prime(k, in_use, waiting)
+        site.resume(before, last)
+        assert stepped(site, ticks[k:]) == whole[k:]
+
+
+@every_kind
+def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
+    """The channel goes on by index while nothing comes."""
+    silent = stepped(behind(name), [Tick(k, [sample(k - 1)] if k > 600 else []) for k in range(900)])
+    heard = stepped(behind(name), [Tick(k, [sample(k - 1)] if k else []) for k in range(900)])
+    settled = next(k for k in range(601, 900) if silent[k].used[0] >= 600)
+    assert [o.used for o in silent[settled:]] == [o.used for o in heard[settled:]]
+
+
+# Hostile and ancient.
+
+hostile = st.one_of(
+    st.integers(-(2**63), 2**63 - 1),
+    st.integers(-5, 60_000),
+    st.sampled_from([2**40 - 1, -1, 2**63 - 1, -(2**63), 10_000, 10_001]),
+)
+
+
+@every_kind
+@quick
+@given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
+def test_whatever_number_a_sample_claims_the_work_is_bounded(name: str, came: list[list[int]]) -> None:
+    """A channel looks no further ahead than ten seconds, and nobody else's samples suffer."""
+    site = behind(name)
+    for k, now in enumerate(came):
+        output = site.step(Tick(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
+        assert site._links["foreseen"][0] <= k + 10_000
+        assert output.used[0] < k
+    k = len(came)
+    counts = site.counts()[0]
+    assert counts.refused == sum(not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now)
+    assert site.release_tick(0, 200) == behind(name).release_tick(0, 200)
+
+
+@pytest.mark.parametrize("name", ["constant", "uniform", "measured", "in order"])
+def test_an_ancient_sample_counts_as_lost(name: str) -> None:
+    """Its page has been turned; at 1 Hz there are 32 of them."""
+    site = behind(name, 1, 1)
+    stepped(site, [Tick(k, [sample(k - 1)] if k else []) for k in range(60)])
+    before = site.counts()[0]
+    output = site.step(Tick(60, [sample(59), sample(3), sample(27), sample(40)]))
+    after = site.counts()[0]
+    assert output.used == [59]
+    assert after.lost - before.lost == 2
+    assert after.duplicate - before.duplicate == 1
+    assert site.release_tick(0, 3) is None
+
+
+# Single kinds.
+
+
+def test_in_order_samples_come_into_use_one_after_the_other_and_not_before_their_time() -> None:
+    release = np.array(releases("in order", 2000, 1000, 1000))
+    assert (np.diff(release) >= 0).all()
+    free = np.array(releases("in order", 1, 1000, 1000))
+    assert free[0] == release[0]
+
+
+def test_newest_wins_under_jitter_shortens_the_age_and_in_order_lengthens_it() -> None:
+    """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
+
+    def mean_age(in_order: int) -> float:
+        model = Model(kind=Delay.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order)
+        outputs = stepped(
+            linked(1000, 1000, [model]), (Tick(k, [sample(k - 1)] if k else []) for k in range(5000))
+        )
+        return float(np.mean([o.tick - o.used[0] for o in outputs[1000:]]))
+
+    assert mean_age(0) == pytest.approx(162, abs=3)
+    assert mean_age(1) == pytest.approx(240, abs=5)
+
+
+@given(
+    came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
+    rates=st.sampled_from([(1000, 1000), (400, 900)]),
+)
+def test_a_measured_sample_is_in_use_from_the_tick_it_came_in_and_never_late(
+    came: list[int], rates: tuple[int, int]
+) -> None:
+    """But not at its own stamp: one that comes from ahead waits for the first tick behind it."""
+    site = linked(*rates, [Model(kind=Delay.MEASURED)])
+    for k in range(80):
+        now = [m for m, at in enumerate(came) if at == k]
+        usable = [m for m, at in enumerate(came) if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])]
+        assert site.step(Tick(k, [sample(m) for m in now])).used == [max(usable, default=-1)]
+    assert site.counts()[0].late == 0
+    assert site.measures(0)
+
+
+def test_a_measured_link_may_have_a_play_out_buffer_of_its_own() -> None:
+    """Real jitter below the budget becomes a constant delay."""
+    site = linked(1000, 1000, [Model(kind=Delay.MEASURED, playout_us=20_000)])
+    jitter = [1, 7, 3, 19, 12, 5, 20, 2]
+    at: dict[int, list[int]] = {}
+    for m in range(200):
+        at.setdefault(m + jitter[m % 8], []).append(m)
+    outputs = stepped(site, [Tick(k, [sample(m) for m in at.get(k, [])]) for k in range(200)])
+    assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
+
+
+def test_a_copy_with_an_earlier_delay_makes_its_sample_due_earlier() -> None:
+    alone, twice = (linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0))
+    pairs = [(twice.release_tick(0, m), alone.release_tick(0, m)) for m in range(300)]
+    assert all(a is not None and b is not None and a <= b for a, b in pairs)
+    assert any(a != b for a, b in pairs)
+    assert (twice.counts()[0].copies, alone.counts()[0].copies) == (300, 0)
+
+
+def test_a_link_that_is_cut_ages_and_heals() -> None:
+    """`used` stands still, never decreases, and is back to nominal with the first fresh sample."""
+    model = Model(location=20_000.0)
+    site = linked(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
+    used = [o.used[0] for o in stepped(site, [Tick(k, [sample(k - 1)] if k else []) for k in range(300)])]
+    assert used[20:120] == list(range(100))
+    assert used[120:220] == [99] * 100
+    assert used[220:] == list(range(200, 280))
+    assert site.counts()[0].lost == 100
+
+
+# Changes of a link while it runs.
+
+
+def test_a_command_holds_for_samples_stamped_from_then_on() -> None:
+    site = linked(1000, 1000, [Model(location=5_000.0)])
+    change = Command("slower", 0, Model(from_ns=30_000_000, location=20_000.0))
+    used = []
+    for k in range(80):
+        commands = [change] if k == 10 else []
+        used.append(site.step(Tick(k, [sample(k - 1)] if k else [], commands)).used[0])
+    assert used[:35] == [max(k - 5, -1) for k in range(35)]
+    assert used[35:50] == [29] * 15
+    assert used[50:] == list(range(30, 60))

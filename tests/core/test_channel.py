@@ -1,0 +1,247 @@
+"""What a channel does to each sample: loss, bursts, copies, outages, order; golden fates (L4)."""
+
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.channels import SEEDS, Ints, channel, due, stamps
+from tests.core.kinds import KINDS, POINTS, fates
+from trilat_net.core.channel import LOST
+from trilat_net.scenario.link import LinkBase
+from trilat_net.scenario.links import Constant, Gamma, NoDelay, Uniform
+
+COUNT = 1_000_000
+SIGMAS = 4.0
+
+# Loss.
+
+LOSSES: list[LinkBase] = [
+    NoDelay(loss=0.05),
+    NoDelay(loss=0.5),
+    NoDelay(loss=0.05, loss_burst=1),
+    NoDelay(loss=0.02, loss_burst=8),
+    NoDelay(loss=0.3, loss_burst=3),
+    NoDelay(loss=0.5, loss_burst=1),
+    NoDelay(loss=0.05, loss_burst=2, loss_bad=0.8),
+    NoDelay(loss=0.1, loss_burst=1.2, loss_bad=0.5),
+]
+
+
+def bursts(lost: np.ndarray) -> Ints:
+    """Lengths of runs of losses, without one that the end cuts off."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost]).astype(np.int8)))
+    begin, end = edges[::2], edges[1::2]
+    return end - begin[: len(end)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("link", LOSSES, ids=lambda link: f"{link.loss}-{link.loss_burst}-{link.loss_bad}")
+def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: int) -> None:
+    """Gilbert and Elliott; single losses are the chain without memory, whose mean burst is 1 / (1 - p).
+
+    The variance of the rate has the chain's correlation 1 - enter - leave in it; lengths are geometric.
+    """
+    model = link.core()
+    lost = due(channel([model], seed), COUNT) == LOST
+    p, h = link.loss, link.loss_bad
+    variance = p * (1 - p)
+    if link.loss_burst:
+        memory = 1 - model.enter - model.leave
+        share = model.enter / (model.enter + model.leave)
+        assert share * h == pytest.approx(p, rel=1e-12)
+        variance += 2 * h * h * share * (1 - share) * memory / (1 - memory)
+    assert abs(lost.mean() - p) <= SIGMAS * math.sqrt(variance / COUNT)
+    lengths = bursts(lost)
+    mean = link.loss_burst or 1 / (1 - p)
+    allowed = SIGMAS / math.sqrt(len(lengths))
+    assert abs(lengths.mean() - mean) <= allowed * math.sqrt(mean * (mean - 1))
+    for length in (1, 2, 3):
+        share = (1 - 1 / mean) ** (length - 1) / mean
+        assert abs(np.mean(lengths == length) - share) <= allowed * math.sqrt(share * (1 - share))
+
+
+def test_nothing_is_lost_without_loss_and_all_with_all() -> None:
+    assert (due(channel([NoDelay().core()]), 1000) == stamps(1000)).all()
+    assert (due(channel([NoDelay(loss=1.0).core()]), 1000) == LOST).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_first_sample_is_as_likely_to_be_lost_as_any(seed: int) -> None:
+    """A chain begins in its stationary distribution, over links of one seed."""
+    model = NoDelay(loss=0.4, loss_burst=50).core()
+    first = [due(channel([model], seed, f"a{n}->s"), 1)[0] == LOST for n in range(4000)]
+    assert abs(np.mean(first) - 0.4) <= SIGMAS * math.sqrt(0.24 / 4000)
+
+
+def test_directions_and_seeds_lose_independently() -> None:
+    model = NoDelay(loss=0.5).core()
+    series = [
+        due(channel([model], seed, name), 100_000) == LOST
+        for seed, name in ((1, "m1->s"), (1, "s->m1"), (2, "m1->s"))
+    ]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert abs(np.corrcoef(series[a], series[b])[0, 1]) < SIGMAS / math.sqrt(100_000)
+
+
+def test_what_is_lost_and_how_long_the_others_take_are_independent() -> None:
+    """So the delays of what comes through are those of the link without loss."""
+    link = Uniform(delay_ms=100, half_width_ms=50)
+    whole = due(channel([link.core()]), 10_000)
+    holed = due(channel([Uniform(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]), 10_000)
+    kept = holed != LOST
+    assert 0.6 < kept.mean() < 0.8
+    assert (holed[kept] == whole[kept]).all()
+
+
+# Duplicates.
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_share_of_duplicates(seed: int) -> None:
+    made = channel([NoDelay(duplicate=0.07).core()], seed)
+    due(made, COUNT)
+    assert abs(int(made.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(0.07 * 0.93 / COUNT)
+
+
+def test_the_earlier_of_sample_and_copy_counts() -> None:
+    """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
+    link = Uniform(delay_ms=100, half_width_ms=60)
+    single = due(channel([link.core()]), 100_000)
+    made = channel([Uniform(delay_ms=100, half_width_ms=60, duplicate=1.0).core()])
+    doubled = due(made, 100_000)
+    assert made.row.copies == 100_000
+    assert (doubled <= single).all()
+    smaller_ms = (doubled - stamps(100_000)) / 1e6
+    assert smaller_ms.mean() == pytest.approx(40 + 120 / 3, abs=SIGMAS * 120 / math.sqrt(18 * 100_000))
+
+
+# Outages, order, play-out.
+
+
+def test_an_outage_takes_the_samples_stamped_within_it() -> None:
+    cut = np.array([(10_000_000, 20_000_000), (15_000_000, 25_500_000), (40_000_000, 40_000_001)])
+    lost = np.flatnonzero(due(channel([NoDelay().core()], points=cut, outages=3), 60) == LOST)
+    assert lost.tolist() == [*range(10, 26), 40]
+
+
+def test_in_order_no_sample_overtakes_an_older_one_and_none_comes_earlier() -> None:
+    keys = {"delay_ms": 50.0, "deviation_ms": 30.0, "loss": 0.1}
+    free = due(channel([Gamma(**keys).core()]), 20_000)
+    ordered = due(channel([Gamma(**keys, order="in_order").core()]), 20_000)
+    kept = free != LOST
+    assert ((ordered == LOST) == ~kept).all()
+    assert (ordered[kept] == np.maximum.accumulate(free[kept])).all()
+    assert (np.diff(free[kept]) < 0).any()
+
+
+def test_a_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
+    first, then = Constant(delay_ms=50.0), Constant(delay_ms=1.0, order="in_order")
+    made = due(channel([first.core(), then.core(10_000_000)]), 80)
+    assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
+    assert made[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
+
+
+@given(playout_ms=st.floats(0, 300))
+def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None:
+    free = due(channel([Uniform(delay_ms=100, half_width_ms=100).core()]), 500)
+    held = due(channel([Uniform(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]), 500)
+    assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
+
+
+# Changes of model.
+
+
+def test_a_model_holds_from_its_first_stamp_on() -> None:
+    models = [
+        Constant(delay_ms=d).core(n) for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
+    ]
+    delays = due(channel(models), 10) - stamps(10)
+    assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
+
+
+def test_a_delay_without_memory_does_not_notice_that_the_loss_changed() -> None:
+    keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
+    whole = due(channel([Gamma(**keys).core()]), 2000)
+    changed = due(channel([Gamma(**keys).core(), Gamma(**keys, loss=0.2).core(500 * 10**6)]), 2000)
+    assert (changed[:500] == whole[:500]).all()
+    kept = changed != LOST
+    assert (changed[kept] == whole[kept]).all()
+    assert not kept[500:].all()
+
+
+# The same whatever asks, and in what steps.
+
+
+@pytest.mark.parametrize("name", KINDS)
+@settings(max_examples=15)
+@given(steps=st.lists(st.integers(1, 60), min_size=1, max_size=30), pages=st.sampled_from([64, 128, 8192]))
+def test_fates_are_the_same_in_whatever_steps_they_are_foreseen(
+    name: str, steps: list[int], pages: int
+) -> None:
+    made = channel([KINDS[name]], points=POINTS, pages=pages)
+    parts = [due(made, int(n)) for n in np.cumsum(steps)]
+    assert np.concatenate(parts).tolist() == fates(name, sum(steps)).tolist()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_same_fates_once_more_and_others_with_another_seed(name: str) -> None:
+    chance = name not in ("constant", "sine", "trace", "measured")
+    assert (fates(name, 500) == fates(name, 500)).all()
+    assert (fates(name, 500) != fates(name, 500, seed=2)).any() == chance
+
+
+GOLDEN = {
+    "constant": [200000, 201000, 202000, 203000, 204000, 205000, 206000, 207000],
+    "uniform": [252402, 74689, 251295, 207262, 69951, 55734, 292243, 201240],
+    "normal": [12830, 40710, 44349, 27078, 71582, 76766, 46118, 33932],
+    "gamma": [36671, 6209, 71172, 21077, 112805, 121568, 72225, 57498],
+    "gamma below 1": [26014, 1495, 13849, 4859, 38016, 142075, 34033, 58040],
+    "lognormal": [42472, 13812, 78648, 28089, 130962, 143044, 79304, 63311],
+    "hyperexponential": [27262, 114240, 18009, 24154, 40996, 288369, 53441, 24477],
+    "ar1": [192830, 165301, 179612, 168253, 193468, 218086, 226546, 228513],
+    "sine": [138354, 159172, 174295, 182342, 182623, 175207, 160918, 141254],
+    "trace": [7000, 8000, -1, 14000, 11000, 12000, -1, 18000],
+    "measured": [0, 1000, 2000, 3000, 4000, 5000, 6000, 7000],
+    "bursts": [-1, 6000, 7000, -1, 9000, -1, 11000, 12000],
+    "single losses": [5000, 6000, -1, -1, 9000, 10000, -1, -1],
+    "copies": [252402, 74689, 251295, 66003, 69951, 55734, 291384, 201240],
+    "in order": [67467, 67467, 68432, 68432, 68432, 68432, 84748, 84748],
+    "play-out": [67467, 61000, 68432, 63000, 64000, 65000, 84748, 67000],
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_golden_fates(name: str) -> None:
+    """When the first eight samples of m1->s are due with seed 1, us; LOST where they are lost."""
+    made = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
+    assert made == GOLDEN[name]
+
+
+_PROGRAM = """
+from tests.core.draws import table
+from tests.core.kinds import fates, KINDS
+for kind, shape in ((0, 0.0), (1, 0.0), (2, 0.3), (2, 4.0)):
+    print(" ".join(number.hex() for number in table(300, kind, shape).tolist()))
+for name in KINDS:
+    print(name, fates(name, 200).tolist())
+"""
+
+
+def test_without_the_compiler_draws_and_fates_have_the_same_bits() -> None:
+    def text(disabled: str) -> str:
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        done = subprocess.run(
+            [sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout
+
+    plain = text("1")
+    assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
+    assert plain.count("[") == len(KINDS)
+    assert plain == text("0")

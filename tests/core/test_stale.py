@@ -1,0 +1,205 @@
+"""What a site does about a stale peer: its modes, and a reference without steps on the way back."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.sites import setup, stepped
+from tests.virtual_runs import trajectories
+from trilat_net.core.delay import Model
+from trilat_net.core.setup import LinkSetup, Stale, StaleRule
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Arrival, Mode, Output, Tick
+from trilat_net.scenario import load
+
+MS = 1_000_000
+RULE = StaleRule(Stale.HOLD, 20 * MS, 30 * MS)
+
+
+def site(rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0) -> Site:
+    """Two peers behind 5 ms; what it follows it gets from `moving`."""
+    links = tuple(
+        LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(Model(location=5_000.0),))
+        for n, (name, share) in enumerate(zip("ab", shares, strict=True))
+    )
+    return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
+
+
+def at(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Where a peer is and how fast it moves: straight on, each its own way."""
+    speed = (0.6, -0.2) if peer else (-0.3, 0.5)
+    return (0.4 * peer + speed[0] * tick / 1000, -0.3 + speed[1] * tick / 1000), speed
+
+
+def moving(peer: int, tick: int) -> Arrival:
+    return Arrival(peer, tick, *at(peer, tick))
+
+
+def cut(rule: StaleRule, start: int, end: int, count: int = 200) -> list[Output]:
+    """Both peers heard every tick, but not peer 1 in samples from `start` to `end`."""
+    ticks = [
+        Tick(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and start <= k - 1 < end)])
+        for k in range(count)
+    ]
+    return stepped(site(rule), ticks)
+
+
+def runs_of(outputs: Sequence[Output]) -> list[tuple[Mode, int]]:
+    """(mode, first tick) of every stretch."""
+    edges = [0, *(k for k in range(1, len(outputs)) if outputs[k].mode is not outputs[k - 1].mode)]
+    return [(outputs[k].mode, k) for k in edges]
+
+
+def followed(output: Output, shares: Sequence[float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
+    """What the peers ask for, from the samples in use."""
+    poses = [((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)]
+    q, qd = (np.array([pose[n] for pose in poses]) for n in (0, 1))
+    return np.array(shares) @ q, np.array(shares) @ qd
+
+
+# The modes.
+
+
+@pytest.mark.parametrize(("action", "mode"), [(Stale.HOLD, Mode.HOLD), (Stale.BRAKE, Mode.BRAKE)])
+def test_a_cut_leads_to_hold_or_brake_and_back_by_a_return(action: Stale, mode: Mode) -> None:
+    """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
+    outputs = cut(RULE._replace(action=action), 50, 90)
+    assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
+
+
+def test_to_use_is_to_go_on() -> None:
+    assert runs_of(cut(RULE._replace(action=Stale.USE), 50, 90)) == [(Mode.RUN, 0)]
+
+
+def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() -> None:
+    ticks = [
+        Tick(k, [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])] if k else [])
+        for k in range(200)
+    ]
+    outputs = stepped(site(RULE._replace(return_ns=50 * MS)), ticks)
+    assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 70), (Mode.RETURN, 95), (Mode.HOLD, 111)]
+    assert outputs[111].q_des == outputs[110].q_des
+    assert outputs[110].q_des != outputs[70].q_des
+
+
+def test_a_peer_that_was_never_heard_is_as_old_as_the_run() -> None:
+    outputs = stepped(site(RULE), [Tick(k) for k in range(40)])
+    assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
+
+
+def test_a_peer_without_a_share_may_be_as_stale_as_it_likes() -> None:
+    ticks = [Tick(k, [moving(0, k - 1)] if k else []) for k in range(100)]
+    assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
+    assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
+
+
+@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
+def test_diverged_is_final_from_every_mode(action: Stale) -> None:
+    """And forgets what it held: a record that says so holds nothing."""
+    made = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
+    outputs = stepped(
+        made, [Tick(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else []) for k in range(120)]
+    )
+    diverged = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
+    assert all(o.mode is Mode.DIVERGED and o.mem == [] for o in outputs[diverged:])
+    q, _ = followed(outputs[-1])
+    assert outputs[-1].q_des == pytest.approx(q, abs=1e-12)
+
+
+arrivals = st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(1, 30)), min_size=1, max_size=12).map(
+    lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n]
+)
+
+
+@settings(max_examples=60)
+@given(
+    heard=arrivals,
+    action=st.sampled_from(list(Stale)),
+    age_ms=st.integers(1, 40),
+    return_ms=st.integers(1, 60),
+    shares=st.sampled_from([(0.5, 0.5), (0.25, 0.75), (1.0, 0.0)]),
+)
+def test_modes_and_references_are_those_of_the_law(
+    heard: list[tuple[bool, bool]], action: Stale, age_ms: int, return_ms: int, shares: tuple[float, float]
+) -> None:
+    """Whatever comes and stays away: the edges of `Mode`, and the reference of each mode."""
+    made = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
+    mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
+    for k, flags in enumerate(heard):
+        output = made.step(Tick(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k]))
+        ages = [k - max(used, 0) for used in output.used]
+        stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
+        if action is not Stale.USE:
+            if stale and mode in (Mode.RUN, Mode.RETURN):
+                mode = Mode.HOLD if action is Stale.HOLD else Mode.BRAKE
+                held = before if action is Stale.HOLD else np.array(output.q)
+            elif not stale and mode in (Mode.HOLD, Mode.BRAKE):
+                mode, since = Mode.RETURN, k
+            if mode is Mode.RETURN and k - since >= return_ms:
+                mode = Mode.RUN
+        q, qd = followed(output, shares)
+        if mode is Mode.RETURN:
+            x = (k - since) / return_ms
+            q, qd = (
+                held + (3 * x**2 - 2 * x**3) * (q - held),
+                (3 * x**2 - 2 * x**3) * qd + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
+            )
+        elif mode is not Mode.RUN:
+            q, qd = held, np.zeros(2)
+        assert output.mode is mode
+        assert output.q_des == pytest.approx(q, abs=1e-12)
+        assert output.qd_des == pytest.approx(qd, abs=1e-9)
+        remembered = [] if mode is Mode.RUN else [*held, since * MS if mode is Mode.RETURN else 0.0]
+        assert output.mem == pytest.approx(remembered, abs=1e-12)
+        before = np.array(output.q_des)
+
+
+# The way back.
+
+
+@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
+def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own(action: Stale) -> None:
+    """Central differences of the reference from the last tick of holding to well within RUN."""
+    outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 50, 90, 700)
+    q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
+    assert runs_of(outputs)[2:] == [(Mode.RETURN, 95), (Mode.RUN, 495)]
+    assert (q[95] == q[94]).all()
+    assert (qd[94:96] == 0.0).all()
+    central = (q[2:] - q[:-2]) / 2e-3
+    assert np.abs(central[95:598] - qd[96:599]).max() < 5e-3
+    assert np.abs(np.diff(q[90:600], axis=0)).max() < 2e-3
+
+
+@pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
+@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
+def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: Stale, k: int) -> None:
+    """Whatever its mode was: the records hold what it remembers."""
+    rule = RULE._replace(action=action)
+    whole = cut(rule, 50, 90)
+    made = site(rule)
+    last = whole[k - 1]
+    in_use = [moving(j, m) for j, m in enumerate(last.used)]
+    heard = [(j, m) for j in (0, 1) for m in range(last.used[j] + 1, k - 1) if not (j and 50 <= m < 90)]
+    made.prime(k, in_use, [moving(j, m) for j, m in heard])
+    made.resume(whole[k - 2], last)
+    ticks = [
+        Tick(n, [moving(j, n - 1) for j in (0, 1) if not (j and 50 <= n - 1 < 90)]) for n in range(k, 200)
+    ]
+    assert stepped(made, ticks) == whole[k:]
+
+
+# What it is good for.
+
+
+def test_a_ramped_return_takes_the_kick_out_of_a_healed_link() -> None:
+    """Scenario `outage`: the slave is cut off while its master moves, and hears of it all at once."""
+
+    def kick(action: str) -> float:
+        made = trajectories(load("outage", {"on_stale.action": action}))
+        healed = made.sites["s"].t_s >= made.scenario.links["m1->s"].outages_s[0][1]
+        return float(np.abs(made.sites["s"].qd[healed]).max())
+
+    assert kick("hold") < 0.3 * kick("use")

@@ -1,0 +1,104 @@
+"""The canonical text of a scenario, over everything that a scenario may have."""
+
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.scenario.links import links
+from trilat_net.scenario import load, parse, shipped, shipped_text
+
+TEXT = shipped_text("paper")
+NAMES = ("m1", "m2", "s")
+EVERY = [f"{j}->{i}" for i in NAMES for j in NAMES if i != j]
+pair = st.tuples(st.floats(0.01, 50), st.floats(0.01, 50)).map(list)
+vector = st.floats(0.01, 50) | pair
+
+laws = st.fixed_dictionaries(
+    {"law": st.just("adaptive")},
+    optional={"Lambda": vector, "Kp": vector, "Kd": vector, "theta_hat0": st.floats(-5, 5)},
+) | st.fixed_dictionaries({"law": st.just("p_d")}, optional={"K": vector, "d": vector})
+stale = st.fixed_dictionaries(
+    {},
+    optional={
+        "action": st.sampled_from(["use", "hold", "brake"]),
+        "age_ms": st.floats(1, 1e5),
+        "return_s": st.floats(0.001, 100),
+    },
+)
+
+
+@st.composite
+def rows(draw: st.DrawFn, site: str) -> dict[str, float]:
+    share = draw(st.floats(0, 1))
+    one, other = (name for name in NAMES if name != site)
+    return {one: share, other: 1 - share}
+
+
+@st.composite
+def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
+    """A timeline: links and shares, in order, as an author may write them."""
+    times = sorted(draw(st.lists(st.floats(0, 100) | st.integers(0, 100), max_size=4)))
+    made = []
+    for at_s in times:
+        if draw(st.booleans()):
+            to = draw(links(without=("trace",)))
+            to.pop("outages_s", None)
+            made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
+        else:
+            site = draw(st.sampled_from(NAMES))
+            made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
+            made[-1] |= draw(st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)}))
+    return made
+
+
+overrides = st.fixed_dictionaries(
+    {},
+    optional={
+        "link": links(),
+        "links": st.dictionaries(st.sampled_from(EVERY), links(), max_size=3),
+        "control": laws,
+        "sites.s.control": laws,
+        "on_stale": stale,
+        "sites.m2.on_stale": stale,
+        "dominance.m1": rows("m1"),
+        "timeline": changes(),
+        "seed": st.integers(0, 2**63 - 1),
+        "expect": st.fixed_dictionaries({}, optional={"stable": st.booleans()}),
+        "title": st.text(max_size=30),
+    },
+)
+
+
+@settings(max_examples=200)
+@given(changed=overrides)
+def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) -> None:
+    scenario = parse(TEXT, overrides=changed)
+    again = parse(scenario.text)
+    assert again.text == scenario.text
+    assert again == scenario
+    assert msgspec.to_builtins(again.timeline) == msgspec.to_builtins(scenario.timeline)
+    for name in scenario.names:
+        one, other = scenario.setup(name), again.setup(name)
+        assert [link.models for link in one.links] == [link.models for link in other.links]
+        assert [link.key for link in one.links] == [link.key for link in other.links]
+        assert (one.ramps, one.on_stale, one.law) == (other.ramps, other.on_stale, other.law)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
+    """So the hash of an experiment does not change when another feature comes."""
+    text = load("paper", {"expect": {}}).text
+    assert not any(word in text for word in ("on_stale", "timeline", "expect", "loss", "playout"))
+    assert ("timeline" in load(name).text) == bool(load(name).timeline)
+
+
+def test_350_and_350_point_0_are_one_experiment_in_a_timeline_too() -> None:
+    def sha256(delay_ms: float, at_s: float) -> str:
+        change = {"at_s": at_s, "link": "m1->s", "to": {"delay_ms": delay_ms}}
+        return load("paper", {"timeline": [change]}).sha256
+
+    assert sha256(350, 8) == sha256(350.0, 8.0)
+    assert sha256(350, 8) != sha256(351, 8)

@@ -1,0 +1,241 @@
+"""Links as people write them: what each model states, and what cannot be is refused with its key."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.core.channels import Ints, channel, due
+from tests.scenario.links import links
+from trilat_net.core.channel import LOST
+from trilat_net.core.delay import LIMIT_US, Delay
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load
+from trilat_net.scenario.link import LinkBase
+from trilat_net.scenario.links import LINKS, NoDelay
+
+
+def link(keys: dict[str, Any]) -> LinkBase:
+    made: LinkBase = load("paper", {"link": keys}).links["m1->s"]
+    return made
+
+
+def refused(keys: dict[str, Any]) -> ScenarioError:
+    with pytest.raises(ScenarioError) as error:
+        load("paper", {"link": keys})
+    assert error.value.exit_code == 2
+    return error.value
+
+
+def test_the_models_are_eleven() -> None:
+    assert set(LINKS) == {
+        *("none", "constant", "uniform", "normal", "gamma", "lognormal", "hyperexponential"),
+        *("ar1", "sine", "trace", "measured"),
+    }
+
+
+@given(keys=links())
+def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> None:
+    made = link(keys)
+    mean_ms, deviation_ms = made.moments()
+    if not made.measured and not math.isnan(mean_ms):
+        assert 0.0 <= mean_ms <= LIMIT_US / 1000
+        assert 0.0 <= deviation_ms < math.inf
+    assert made.describe()
+    points = made.points
+    model = made.core()._replace(trace_count=0 if points is None else len(points))
+    fates: Ints = due(channel([model], points=points), 50)
+    kept = fates[fates != LOST]
+    assert (kept >= 0).all()
+
+
+@given(keys=links())
+def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
+    """Probabilities, and the stationary loss that the author wrote."""
+    made = link(keys)
+    model = made.core()
+    assert all(0.0 <= p <= 1.0 + 1e-12 for p in (model.loss_good, model.loss_bad, model.enter, model.leave))
+    bad = model.enter / (model.enter + model.leave)
+    assert bad * model.loss_bad + (1 - bad) * model.loss_good == pytest.approx(made.loss, abs=1e-12)
+    if made.loss_burst and made.loss:
+        assert 1 / (1 - (1 - model.leave) * model.loss_bad) == pytest.approx(made.loss_burst, rel=1e-9)
+
+
+def test_it_says_in_a_few_words_what_a_link_does() -> None:
+    keys = {"loss": 0.05, "loss_burst": 8, "duplicate": 0.01, "outages_s": [[1, 2.5]], "order": "in_order"}
+    words = link({"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}).describe()
+    assert words == (
+        "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
+    )
+    assert link({"model": "none"}).describe() == "no delay"
+    assert link({"delay_ms": 200}).describe() == "200 ms"
+    assert link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
+
+
+def test_a_table_without_a_model_changes_single_keys_and_one_with_a_model_begins_anew() -> None:
+    base = {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 50.0, "loss": 0.1}
+    own = {
+        "m1->s": {"half_width_ms": 5.0},
+        "m2->s": {"model": "constant", "delay_ms": 7},
+        "s->m1": {"preset": "5g"},
+    }
+    made = load("paper", {"link": base, "links": own}).links
+    assert made["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
+    assert made["m2->s"].describe() == "7 ms"
+    assert made["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
+    assert made["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
+
+
+def test_links_draw_from_keys_of_their_own_and_of_the_seed() -> None:
+    def keys(seed: int) -> set[int]:
+        scenario = load("paper", {"seed": seed})
+        return {link.key for name in scenario.names for link in scenario.setup(name).links}
+
+    assert len(keys(1) | keys(2)) == 12
+
+
+@pytest.mark.parametrize(
+    ("keys", "random", "measured"),
+    [
+        ({"delay_ms": 5}, False, False),
+        ({"model": "sine", "delay_ms": 5, "amplitude_ms": 5, "period_s": 1}, False, False),
+        ({"model": "trace", "trace": "0 5"}, False, False),
+        ({"model": "measured"}, False, True),
+        ({"delay_ms": 5, "loss": 0.1}, True, False),
+        ({"delay_ms": 5, "loss": 1.0}, False, False),
+        ({"model": "uniform", "delay_ms": 5, "half_width_ms": 1}, True, False),
+    ],
+)
+def test_whether_anything_is_drawn_and_whether_the_network_decides(
+    keys: dict[str, Any], random: bool, measured: bool
+) -> None:
+    assert (load("paper", {"link": keys}).random, load("paper", {"link": keys}).measured) == (
+        random,
+        measured,
+    )
+    later = [{"at_s": 1, "link": "m1->s", "to": keys}]
+    if keys.get("model") != "trace":
+        changed = load("paper", {"timeline": later})
+        assert (changed.random, changed.measured) == (random, measured)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("keys", "path", "words"),
+    [
+        ({"model": "unifrom"}, "link.model", "did you mean 'uniform'"),
+        ({"model": ["uniform"]}, "link.model", "must be one of"),
+        ({"model": 3}, "link.model", "must be one of"),
+        ({"preset": "5G"}, "link.preset", "did you mean '5g'"),
+        ({"preset": "frankfurt-banglore"}, "link.preset", "did you mean 'frankfurt-bangalore'"),
+        ({"preset": 4}, "link.preset", "must be one of"),
+        ({"preset": "4g", "model": "uniform"}, "link.model", "the preset '4g' is 'hyperexponential'"),
+        ({"preset": "4g", "delay_ms": 5}, "link.delay_ms", "unknown key"),
+        ({"model": "uniform", "delay_ms": 5, "deviation_ms": 1}, "link.deviation_ms", "unknown key"),
+        ({"model": "measured", "delay_ms": 5}, "link.delay_ms", "unknown key"),
+        ({"delay_ms": 5, "los": 0.1}, "link.los", "did you mean 'loss'"),
+        ({"model": "constant", "delay_ms": 5, "file": "x.csv"}, "link.file", "unknown key"),
+        ({"model": "gamma", "delay_ms": 5}, "deviation_ms", "is missing"),
+        ({"model": "hyperexponential", "floor_ms": 5}, "fast_ms", "is missing"),
+    ],
+)
+def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) -> None:
+    error = refused(keys)
+    assert path in error.path
+    assert words in error.problem
+
+
+@pytest.mark.parametrize(
+    ("keys", "key"),
+    [
+        ({"delay_ms": -1}, "delay_ms"),
+        ({"delay_ms": 10_001}, "delay_ms"),
+        ({"delay_ms": "much"}, "delay_ms"),
+        ({"delay_ms": True}, "delay_ms"),
+        ({"delay_ms": 5, "loss": 1.1}, "loss"),
+        ({"delay_ms": 5, "loss": -0.1}, "loss"),
+        ({"delay_ms": 5, "duplicate": 2}, "duplicate"),
+        ({"delay_ms": 5, "loss_bad": 0}, "loss_bad"),
+        ({"delay_ms": 5, "loss_burst": -1}, "loss_burst"),
+        ({"delay_ms": 5, "playout_ms": 10_001}, "playout_ms"),
+        ({"delay_ms": 5, "order": "oldest"}, "order"),
+        ({"delay_ms": 5, "order": "in order"}, "order"),
+        ({"delay_ms": 5, "outages_s": [[1, 2, 3]]}, "outages_s[0]"),
+        ({"delay_ms": 5, "outages_s": [1, 2]}, "outages_s[0]"),
+        ({"delay_ms": 5, "outages_s": [[-1, 2]]}, "outages_s[0][0]"),
+        ({"delay_ms": 5, "outages_s": [[n, n + 0.5] for n in range(1001)]}, "outages_s"),
+        ({"model": "normal", "delay_ms": 5, "deviation_ms": 0}, "deviation_ms"),
+        ({"model": "gamma", "delay_ms": 0, "deviation_ms": 1}, "delay_ms"),
+        ({"model": "ar1", "delay_ms": 5, "deviation_ms": 1, "correlation": 1.0}, "correlation"),
+        ({"model": "ar1", "delay_ms": 5, "deviation_ms": 1, "correlation": -0.1}, "correlation"),
+        ({"model": "sine", "delay_ms": 5, "amplitude_ms": 1, "period_s": 0}, "period_s"),
+        ({"model": "trace", "trace": "0 5", "at_end": "stop"}, "at_end"),
+        ({"model": "trace", "trace": 5}, "trace"),
+        ({"delay_ms": math.nan}, "delay_ms"),
+        ({"delay_ms": 5, "loss": math.inf}, "loss"),
+        # what no range of a single key shows
+        ({"model": "uniform", "delay_ms": 5, "half_width_ms": 6}, "half_width_ms"),
+        ({"model": "sine", "delay_ms": 5, "amplitude_ms": 6, "period_s": 1}, "amplitude_ms"),
+        ({"model": "uniform", "delay_ms": 9000, "half_width_ms": 2000}, "model"),
+        ({"model": "gamma", "delay_ms": 5000, "deviation_ms": 2000}, "model"),
+        ({"model": "gamma", "delay_ms": 1e-300, "deviation_ms": 1e4}, "deviation_ms"),
+        ({"model": "gamma", "delay_ms": 1e4, "deviation_ms": 1e-300}, "deviation_ms"),
+        ({"model": "lognormal", "delay_ms": 1e-300, "deviation_ms": 1e4}, "deviation_ms"),
+        ({"delay_ms": 5, "outages_s": [[2, 2]]}, "outages_s[0]"),
+        ({"delay_ms": 5, "outages_s": [[1, 2], [5, 3]]}, "outages_s[1]"),
+        ({"delay_ms": 5, "loss": 0.1, "loss_burst": 0.5}, "loss_burst"),
+        ({"delay_ms": 5, "loss": 0.9, "loss_burst": 2}, "loss_burst"),
+        ({"delay_ms": 5, "loss": 1.0, "loss_burst": 2}, "loss"),
+        ({"delay_ms": 5, "loss": 0.1, "loss_bad": 0.5, "loss_burst": 2}, "loss_burst"),
+        ({"delay_ms": 5, "loss": 0.5, "loss_bad": 0.5, "loss_burst": 1.5}, "loss"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_with_its_key(keys: dict[str, Any], key: str) -> None:
+    error = refused(keys)
+    assert error.path.endswith(key)
+    assert error.path.startswith("link")
+    assert error.problem
+
+
+def test_choices_are_named_where_one_is_wrong() -> None:
+    assert refused({"delay_ms": 5, "order": "in order"}).problem == (
+        "is 'in order', must be 'newest' or 'in_order'"
+    )
+    assert "'hold' or 'loop'" in refused({"model": "trace", "trace": "0 5", "at_end": "x"}).problem
+
+
+def test_the_longest_burst_that_holes_allow_is_named() -> None:
+    problem = refused({"delay_ms": 5, "loss": 0.1, "loss_bad": 0.75, "loss_burst": 9}).problem
+    assert problem == "must be below 4 with loss_bad = 0.75"
+
+
+@given(
+    model=st.sampled_from(["normal", "ar1", "gamma", "lognormal"]),
+    delay_ms=st.floats(0, 1e4),
+    deviation_ms=st.floats(0, 1e4, exclude_min=True),
+)
+def test_extreme_numbers_are_refused_or_have_moments(
+    model: str, delay_ms: float, deviation_ms: float
+) -> None:
+    """Nothing overflows, divides by zero, or takes the root of a negative number."""
+    keys = {"delay_ms": delay_ms, "deviation_ms": deviation_ms}
+    if model == "ar1":
+        keys["correlation"] = 0.5
+    try:
+        made = msgspec.convert({"model": model, **keys}, LINKS[model])
+    except msgspec.ValidationError:
+        return
+    if made.fault() is None:
+        assert all(math.isfinite(number) and number >= 0 for number in made.moments())
+        assert made.core().kind in set(Delay)
+        assert due(channel([made.core()]), 3).min() >= 0
+
+
+def test_loss_without_bursts_is_by_itself() -> None:
+    model = NoDelay(loss=0.3).core()
+    assert (model.loss_good, model.enter) == (0.3, 0.0)

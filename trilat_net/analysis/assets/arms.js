@@ -1,0 +1,89 @@
+// Draws the arms of a report at a time: that of the slider, or of the pointer in any chart.
+(() => {
+  "use strict";
+  const { page, tables } = window.trilat;
+  const SVG = "http://www.w3.org/2000/svg";
+  const row = document.querySelector("#arms .row");
+  const slider = document.querySelector("#arms input");
+  const clock = document.querySelector("#arms output");
+  const button = document.querySelector("#arms button");
+  const [left, right, bottom, top] = page.bounds_m;
+  row.style.gridTemplateColumns = `repeat(${page.arms.length}, 1fr)`;
+  const element = (parent, name, attributes) => {
+    const made = document.createElementNS(SVG, name);
+    Object.entries(attributes).forEach(([key, value]) => made.setAttribute(key, value));
+    parent.append(made);
+    return made;
+  };
+  const drawn = page.arms.map((arm) => {
+    const cell = document.createElement("div");
+    const name = document.createElement("span");
+    name.textContent = arm.site;
+    cell.append(name);
+    row.append(cell);
+    const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
+      "aria-label": arm.site });
+    element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
+    const desired = element(svg, "polyline", { class: "desired" });
+    const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
+    const joints = [0, 1].map(() => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
+    element(svg, "rect", { class: "base", x: -0.05, y: -0.05, width: 0.1, height: 0.1 });
+    return { arm, desired, actual, joints };
+  });
+  const at = (table, time) => {
+    const { t, columns } = tables[table];
+    if (!t.length || time < t[0]) return null;
+    let low = 0;
+    let high = t.length - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (t[middle] <= time) low = middle; else high = middle - 1;
+    }
+    const next = Math.min(low + 1, t.length - 1);
+    const share = next > low ? (time - t[low]) / (t[next] - t[low]) : 0;
+    const values = columns.map((column) => column[low] + share * (column[next] - column[low]));
+    return columns.some((column) => column[low] === null || column[next] === null) ? null : values;
+  };
+  const bends = ([l1, l2], q1, q2) => {  // elbow and tip, in SVG whose y grows downwards
+    const [x, y] = [l1 * Math.cos(q1), -l1 * Math.sin(q1)];
+    return [[x, y], [x + l2 * Math.cos(q1 + q2), y - l2 * Math.sin(q1 + q2)]];
+  };
+  function show(time) {
+    const now = Math.max(0, Math.min(page.end_s, time));
+    slider.value = (1000 * now) / page.end_s;
+    clock.textContent = `${now.toFixed(3)} s`;
+    for (const { arm, desired, actual, joints } of drawn) {
+      const q = at(arm.table, now) || [NaN, NaN, NaN, NaN];
+      const known = !Number.isNaN(q[0]);
+      const points = bends(arm.links_m, q[0], q[1]);
+      actual.setAttribute("points", known ? `0,0 ${points.join(" ")}` : "");
+      desired.setAttribute("points", known ? `0,0 ${bends(arm.links_m, q[2], q[3]).join(" ")}` : "");
+      joints.forEach((joint, n) => {
+        joint.setAttribute("visibility", known ? "visible" : "hidden");
+        if (known) { joint.setAttribute("cx", points[n][0]); joint.setAttribute("cy", points[n][1]); }
+      });
+    }
+  }
+  let started = null;
+  function frame(stamp) {
+    if (started === null) return;
+    const time = (stamp - started) / 1000;
+    show(time);
+    if (time < page.end_s) requestAnimationFrame(frame); else stop();
+  }
+  function stop() {
+    started = null;
+    button.textContent = "play";
+  }
+  button.addEventListener("click", () => {
+    if (started !== null) return stop();
+    const from = (slider.value / 1000) * page.end_s;
+    started = performance.now() - 1000 * (from >= 0.999 * page.end_s ? 0 : from);
+    button.textContent = "stop";
+    requestAnimationFrame(frame);
+  });
+  slider.addEventListener("input", () => { stop(); show((slider.value / 1000) * page.end_s); });
+
+  window.trilat.show = show;
+  show(0);
+})();

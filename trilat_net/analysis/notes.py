@@ -1,0 +1,132 @@
+"""What a run's links did and what happened in it, in lines for a terminal.
+
+Law: a link that gave one constant delay and lost nothing is not worth a line.
+"""
+
+from collections.abc import Sequence
+
+from ..log.reader import Log
+from .clocks import ClockUse, clock_use
+from .happenings import Span, Stated, changes, spans
+from .link_use import Counts, LinkUse, Spread, link_uses
+
+MOST = 12
+"""Lines of each kind; what is more stands in summary.json."""
+
+
+def run_lines(log: Log) -> list[str]:
+    """Returns what there is to say of a run besides its numbers: its links, changes, modes and clocks.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    return [*link_lines(log), *change_lines(log), *mode_lines(log), *clock_lines(log)]
+
+
+def link_lines(log: Log) -> list[str]:
+    """Returns a line per link that was not said to be constant without loss, or was not."""
+    return _first([link_line(use) for use in link_uses(log) if not use.plain])
+
+
+def change_lines(log: Log) -> list[str]:
+    """Returns a line per change of a link or of a site's shares."""
+    lines = []
+    for changed in changes(log):
+        tick = changed.taken_at_tick
+        how = "" if tick is None else f", ordered at tick {tick}"
+        lines.append(f"change at {changed.change.at_s:g} s{how}: {changed.about}: {changed.text}")
+    return _first(lines)
+
+
+def mode_lines(log: Log) -> list[str]:
+    """Returns a line per site that held, braked or returned."""
+    lines = []
+    for site in log.sites:
+        if found := spans(log[site]):
+            words = [_span(span) for span in found[:MOST]]
+            more = [f"and {len(found) - MOST} more"] if len(found) > MOST else []
+            lines.append(f"{site}: {', '.join([*words, *more])}")
+    return lines
+
+
+def clock_lines(log: Log) -> list[str]:
+    """Returns a line per link between two clocks."""
+    lines = []
+    for site in log.sites:
+        for peer in log[site].peers:
+            use = clock_use(log, peer, site)
+            if use is not None and not use.shared:
+                lines.append(f"clock of {peer} seen by {site}: {clock_text(use)}")
+    return _first(lines)
+
+
+def link_line(use: LinkUse) -> str:
+    """Returns what one link did, in a line."""
+    measured = any(state.link.measured for state in use.stated)
+    parts = [f"link {use.name}: {'' if measured else 'stated '}{stated_text(use.stated)}"]
+    if use.one_way_us is not None and measured:
+        parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
+    parts.append("no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}")
+    if use.counts is not None:
+        parts.append(_losses(use, use.counts))
+    return "; ".join(parts)
+
+
+def stated_text(states: Sequence[Stated]) -> str:
+    """Returns what a link was said to do; of many changes the last one."""
+    first, *later = states
+    words = [first.link.describe()]
+    if len(later) > 2:
+        words.append(f"{len(later) - 1} changes")
+        later = later[-1:]
+    words += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
+    return ", then ".join(words)
+
+
+def clock_text(use: ClockUse) -> str:
+    """Returns where a clock stood, in a few words."""
+    known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
+    words = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
+    if use.drift_ppm is not None:
+        words.append(f"drift {use.drift_ppm:+.2f} ppm")
+    if use.faults:
+        words.append(f"{use.faults} samples came before they were sent: a clock has stepped")
+    return ", ".join(words)
+
+
+def _ms(spread: Spread, factor: float = 1.0) -> str:
+    values = (spread.mean, spread.deviation, spread.p99, spread.max)
+    mean, deviation, p99, largest = (_number(factor * value) for value in values)
+    return f"{mean} +- {deviation} ms (p99 {p99}, max {largest})"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+def _losses(use: LinkUse, counts: Counts) -> str:
+    said = {
+        "missing on the way": counts.missing,
+        "lost": counts.lost,
+        "late": counts.late,
+        "superseded": counts.superseded,
+        "duplicates": counts.duplicate + counts.copies,
+    }
+    words = [f"{name} {_share(count, counts.judged)}" for name, count in said.items() if count]
+    if use.burst is not None and use.burst > 1.005:
+        words.append(f"{_number(use.burst)} in a row")
+    return ", ".join(words) or "nothing lost"
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count} ({100 * count / max(of, 1):.2g} %)"
+
+
+def _span(span: Span) -> str:
+    doing = {"hold": "held", "brake": "braked", "return": "returned"}
+    return f"{doing.get(span.mode, span.mode)} {span.from_s:.3f}-{span.to_s:.3f} s"
+
+
+def _first(lines: list[str]) -> list[str]:
+    more = len(lines) - MOST
+    return lines if more <= 0 else [*lines[:MOST], f"and {more} more of this kind: see summary.json"]
