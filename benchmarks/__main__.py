@@ -2,9 +2,9 @@
 
 import sys
 
-from . import clocks, machine, presets, tick, virtual
+from . import clocks, links, machine, presets, tick, virtual
 
-BENCHMARKS = {"tick": tick.run, "virtual": virtual.run}
+BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run}
 LONG = {"clocks": clocks.run, "presets": presets.run}
 """Only when they are named."""
 

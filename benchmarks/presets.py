@@ -1,7 +1,4 @@
-"""Every preset as a live session over Zenoh, against virtual time.
-
-    python -m benchmarks presets            # all; ten seconds each
-"""
+"""Every preset as a live session over Zenoh, ten seconds each, against virtual time."""
 
 import shutil
 import tempfile

@@ -80,5 +80,3 @@ class Changes:
         if change.link:
             self._links[change.link] = change.to
         return command(self._scenario, change)
-
-

@@ -164,6 +164,9 @@ def _checks(log: Log, *, virtual: bool) -> Iterator[VerdictLine]:
     if virtual:
         twins = compare_with_virtual(log)
         yield _twin_line("virtual time fed with the log's arrivals", twins.fed, None)
+        if log.scenario.measured and log.driver == "live":
+            yield VerdictLine("plain virtual time", "is another run: a link was measured, not modelled", True)
+            return
         late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
         yield _twin_line(
             f"plain virtual time ({late})", twins.plain, twins.late[0].due_tick if twins.late else None

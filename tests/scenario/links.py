@@ -39,7 +39,7 @@ def _besides(draw: st.DrawFn) -> dict[str, Any]:
 
 @st.composite
 def _spread(draw: st.DrawFn) -> dict[str, Any]:
-    mean = draw(st.floats(0.01, 900.0))
+    mean = draw(st.floats(0.5, 900.0))
     return {"delay_ms": mean, "deviation_ms": mean * draw(st.floats(0.01, 2.0))}
 
 

@@ -42,10 +42,11 @@ class Asked:
 
 @given(st.integers(0, 10_000))
 def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k: int) -> None:
-    """What the next tick's record says makes the same command again, and it holds from the tick of the answer on."""
+    """What the next record says makes the same command again; it holds from the tick of the answer on."""
     asked = Asked()
     (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
-    assert reply.accepted and reply.tick == k + AHEAD_MS
+    assert reply.accepted
+    assert reply.tick == k + AHEAD_MS
     assert command_from(asked.scenario, "s", taken.text) == taken
     assert taken.model is not None
     assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
@@ -121,7 +122,8 @@ def test_what_is_no_order_is_answered_and_harmless() -> None:
 
 def test_a_change_that_the_run_does_not_live_to_see_is_refused() -> None:
     taken, reply = Asked().ask(19_950, link="m1->s", to={"delay_ms": 1.0})
-    assert taken == [] and "20000" in reply.text
+    assert taken == []
+    assert "20000" in reply.text
 
 
 def test_a_run_takes_a_bounded_number_of_changes() -> None:

@@ -27,7 +27,7 @@ def trial_test(
     scenarios: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[SCENARIO]...", help="Names or paths; none: all that are shipped with [expect]."
+            metavar="[SCENARIO]...", help="Names or paths; none: all that are shipped with \\[expect]."
         ),
     ] = None,
     live: Annotated[
@@ -46,7 +46,7 @@ def trial_test(
     ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """Runs scenarios and says which of their [expect] held, by how much, and how to repeat what did not."""
+    r"""Runs scenarios and says which of their \[expect] held, by how much, and how to repeat what did not."""
     from ..net.clock import SystemClock
     from ..trial.junit import junit_xml
 

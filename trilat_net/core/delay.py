@@ -22,7 +22,7 @@ class Delay(IntEnum):
     """The kinds of delay, and what the four parameters of a `Model` mean in each; times in us.
 
     CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`, drawn again
-    where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of a normal of `location`, `scale`.
+    where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of normal (`location`, `scale`).
     HYPER_EXPONENTIAL: `location` + Exp(`scale`), or with probability `weight` + Exp(`extra`).
     AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off at zero.
     SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none is

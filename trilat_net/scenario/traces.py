@@ -53,12 +53,14 @@ def _csv_rows(path: Path, link: str) -> list[Row]:  # noqa: ARG001 - a table is 
 
 
 def _is_head(cells: Sequence[str]) -> bool:
-    """True where no cell is a number."""
-    for cell in cells:
-        try:
-            float(cell)
-        except ValueError:
-            continue
+    """True of two cells that are no numbers."""
+    return len(cells) == 2 and not any(map(_is_number, cells))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
         return False
     return True
 

@@ -1,0 +1,254 @@
+"""Changes during a run, by a script and by command: complete in themselves, and the same either way."""
+
+import json
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.scenario.links import links
+from trilat_net.core.delay import Delay, Model
+from trilat_net.core.grid import first_tick_at
+from trilat_net.core.tick import Ramp
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import (
+    Scenario,
+    command,
+    command_from,
+    load,
+    owner,
+    present_links,
+    resolve_change,
+    shipped_text,
+)
+from trilat_net.scenario.reader import parse
+from trilat_net.sim import virtual
+
+S = 10**9
+LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}
+ROW = {"at_s": 10.0, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 2.0}
+
+
+def scripted(*changes: Any, **overrides: Any) -> Scenario:
+    return load("paper", {"timeline": list(changes), **overrides})
+
+
+def refused(*changes: Any, **overrides: Any) -> ScenarioError:
+    with pytest.raises(ScenarioError) as error:
+        parse(shipped_text("paper"), "mine", {"timeline": list(changes), **overrides})
+    return error.value
+
+
+def test_a_change_of_a_link_is_its_model_from_then_on() -> None:
+    setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
+    assert setup.links[0].models == (
+        Model(location=200_000.0),
+        Model(from_ns=8 * S, location=350_000.0),
+        Model(from_ns=9 * S, location=350_000.0, loss_good=0.5),
+    )
+    assert setup.links[1].models == (Model(location=200_000.0),)
+
+
+def test_a_change_of_shares_is_a_ramp() -> None:
+    scenario = scripted(LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}})
+    assert scenario.setup("s").ramps == (
+        Ramp(10 * S, 12 * S, (0.9, 0.1)),
+        Ramp(11 * S, 11 * S, (0.0, 1.0)),
+    )
+    assert scenario.setup("m1").ramps == ()
+
+
+def test_a_change_keeps_what_it_does_not_name_unless_it_names_a_kind() -> None:
+    base = {"model": "gamma", "delay_ms": 50.0, "deviation_ms": 10.0, "loss": 0.1, "outages_s": [[1, 2]]}
+    first = {"at_s": 1, "link": "m1->s", "to": {"deviation_ms": 5}}
+    then = {"at_s": 2, "link": "m1->s", "to": {"preset": "4g"}}
+    last = {"at_s": 3, "link": "m1->s", "to": {"model": "measured", "loss": 0.2}}
+    scenario = scripted(first, then, last, link=base)
+    assert [change.after.describe() for change in scenario.timeline] == [
+        "gamma 50 +- 5 ms, loss 10 %, cut 1-2 s",
+        "hyperexponential 53 +- 87.8 ms, cut 1-2 s",
+        "measured, loss 20 %, cut 1-2 s",
+    ]
+    assert scenario.setup("s").links[0].outages == ((S, 2 * S),)
+
+
+def test_a_trace_may_be_left_and_its_loss_changed_but_no_other_begun() -> None:
+    base = {"model": "trace", "trace": "0 7000, 1000 9000"}
+    left = [
+        {"at_s": 1, "link": "m1->s", "to": {"loss": 0.5}},
+        {"at_s": 2, "link": "m1->s", "to": {"preset": "lan"}},
+    ]
+    links_of_s = scripted(*left, link=base).setup("s").links
+    assert [model.kind for model in links_of_s[0].models] == [Delay.TRACE, Delay.TRACE, Delay.GAMMA]
+    assert [trace is not None for trace in links_of_s[0].traces] == [True, True, False]
+    other = {"at_s": 1, "link": "m1->s", "to": {"model": "trace", "trace": "0 8000"}}
+    assert refused(other, link=base).path == "timeline[0].to.model"
+    assert refused(other).path == "timeline[0].to.model"
+    file = {"at_s": 1, "link": "m1->s", "to": {"model": "trace", "file": "x.csv"}}
+    assert refused(file).path == "timeline[0].to.file"
+
+
+@pytest.mark.parametrize(
+    ("change", "path", "words"),
+    [
+        ({**LINK, "link": "m1->ss"}, "timeline[0].link", "there is no link 'm1->ss'; did you mean 'm1->s'"),
+        ({**LINK, "link": "x"}, "timeline[0].link", "links are m2->m1"),
+        ({**LINK, "link": 5}, "timeline[0].link", "must be a name"),
+        ({**LINK, "link": ["m1->s"]}, "timeline[0].link", "must be a name"),
+        ({**ROW, "dominance": "ss"}, "timeline[0].dominance", "there is no site 'ss'; did you mean 's'"),
+        ({**ROW, "dominance": {}}, "timeline[0].dominance", "must be a name"),
+        ({**LINK, "dominance": "s"}, "timeline[0]", "either a link or, as dominance, a site"),
+        ({"at_s": 1.0, "to": {}}, "timeline[0]", "either a link or, as dominance, a site"),
+        ({**LINK, "att_s": 1}, "timeline[0].att_s", "did you mean 'at_s'"),
+        ({**LINK, "at_s": "soon"}, "timeline[0].at_s", "must be a time in s"),
+        ({**LINK, "at_s": True}, "timeline[0].at_s", "must be a time in s"),
+        ({"link": "m1->s", "to": {}}, "timeline[0].at_s", "must be a time in s"),
+        ({**LINK, "at_s": -1}, "timeline[0].at_s", "must not be before"),
+        ({**LINK, "at_s": 2e6}, "timeline[0].at_s", "<= 1000000"),
+        ({**LINK, "at_s": float("nan")}, "timeline[0].at_s", "finite"),
+        ({**LINK, "ramp_s": 2.0}, "timeline[0].ramp_s", "only shares have a ramp"),
+        ({**LINK, "to": {"delay_ms": -1}}, "timeline[0].to.delay_ms", ">= 0"),
+        ({**LINK, "to": {"delay": 1}}, "timeline[0].to.delay", "did you mean 'delay_ms'"),
+        ({**LINK, "to": {"preset": "6g"}}, "timeline[0].to.preset", "did you mean"),
+        ({**LINK, "to": {"model": "unifrom"}}, "timeline[0].to.model", "did you mean 'uniform'"),
+        ({**LINK, "to": {"model": "uniform", "delay_ms": 5}}, "timeline[0].to", "half_width_ms is missing"),
+        ({**LINK, "to": {"order": "last"}}, "timeline[0].to.order", "'newest' or 'in_order'"),
+        ({**LINK, "to": {"loss": 1.0, "loss_burst": 3}}, "timeline[0].to.loss", "must be below"),
+        ({**LINK, "to": {"outages_s": [[1, 2]]}}, "timeline[0].to.outages_s", "cannot change"),
+        ({**LINK, "to": 5}, "timeline[0].to", "must be a table"),
+        ({**ROW, "to": {"m1": 0.9, "m2": 0.2}}, "timeline[0].to", "sum to 1.1"),
+        ({**ROW, "to": {"m1": 0.9}}, "timeline[0].to", "sum to 0.9"),
+        ({**ROW, "to": {}}, "timeline[0].to", "sum to 0"),
+        ({**ROW, "to": {"s": 0.5, "m1": 0.5}}, "timeline[0].to", "does not follow itself"),
+        ({**ROW, "to": {"m1": 1.5, "m2": -0.5}}, "timeline[0].to", "between 0 and 1"),
+        ({**ROW, "to": {"m1": "all"}}, "timeline[0].to.m1", "must be a number"),
+        ({**ROW, "to": {"m3": 1.0}}, "timeline[0].to.m3", "unknown key"),
+        ({**ROW, "ramp_s": -1}, "timeline[0].ramp_s", ">= 0"),
+        (5, "timeline[0]", "must be a table"),
+    ],
+)
+def test_a_change_that_cannot_be_is_refused_with_its_path(change: Any, path: str, words: str) -> None:
+    error = refused(change)
+    assert error.path == path
+    assert words in error.problem
+
+
+def test_changes_stand_in_the_order_of_their_times() -> None:
+    assert scripted(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
+    error = refused(ROW, LINK)
+    assert error.path == "timeline[1].at_s"
+    assert "must not be before the change above it, 10 s" in error.problem
+    with pytest.raises(ScenarioError, match="list of tables"):
+        load("paper", {"timeline": 5})
+
+
+# By command.
+
+
+def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
+    return resolve_change(scenario, present_links(scenario), written, from_ns)
+
+
+def test_a_command_holds_from_its_tick_and_belongs_to_the_receiver() -> None:
+    scenario = load("paper")
+    change = ordered(scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789)
+    assert (owner(change), change.start_ns) == ("s", 123_456_789)
+    made = command(scenario, change)
+    assert (made.peer, made.model) == (0, Model(from_ns=123_456_789, location=350_000.0, loss_good=0.05))
+    change = ordered(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
+    assert owner(change) == "m2"
+    assert command(scenario, change).ramp == Ramp(2 * S, 2_500_000_000, (0.0, 1.0))
+
+
+@settings(max_examples=60)
+@given(to=links(without=("trace",)), from_ns=st.integers(0, 10**14))
+def test_a_record_that_names_a_command_makes_the_same_command(to: dict[str, Any], from_ns: int) -> None:
+    scenario = load("paper")
+    to.pop("outages_s", None)
+    made = command(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    assert command_from(scenario, "m1", made.text) == made
+    assert made.model is not None
+    assert made.model.from_ns == from_ns
+
+
+@pytest.mark.parametrize("change", [LINK, ROW], ids=["link", "shares"])
+def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) -> None:
+    """The same trajectories, bit for bit, and the record of its tick names it."""
+    at_ns = 300_000_000
+    short = {"duration_s": 1.0, "link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
+    script = {**change, "at_s": at_ns / S, **({"ramp_s": 0.2} if "dominance" in change else {})}
+    if "link" in change:
+        script["to"] = {"model": "constant", "delay_ms": 60.0}
+    plain, planned = load("free", short), load("free", {**short, "timeline": [script]})
+    written = {key: value for key, value in script.items() if key != "at_s"}
+    made = command(plain, ordered(plain, written, at_ns))
+    k = first_tick_at(at_ns, 1000) - 100
+    commanded = list(virtual.run(plain, commands={"s": {k: [made]}}))
+    scripted_run = list(virtual.run(planned))
+    assert [step.output._replace(cmd=[]) for step in commanded] == [step.output for step in scripted_run]
+    named = [step.output for step in commanded if step.output.cmd]
+    assert [(output.tick, output.cmd) for output in named] == [(k, [made.text])]
+    assert commanded != list(virtual.run(plain))
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        ({"link": "m1->x", "to": {}}, "no link 'm1->x'"),
+        ({"dominance": "x", "to": {}}, "no site 'x'"),
+        ({"link": "m1->s", "dominance": "s"}, "either a link or"),
+        ({}, "either a link or"),
+        ({"link": "m1->s", "to": {"delay_ms": -5}}, "delay_ms"),
+        ({"link": "m1->s", "to": {"model": "trace", "trace": "0 5"}}, "trace"),
+        ({"link": "m1->s", "to": {"delay_ms": 5}, "ramp_s": 1.0}, "only shares have a ramp"),
+        ({"dominance": "s", "to": {"m1": 0.9}}, "sum to 0.9"),
+        ({"dominance": "s", "to": {"m1": 1}, "ramp_s": -1.0}, "ramp_s"),
+    ],
+)
+def test_an_order_that_cannot_be_is_refused(written: dict[str, Any], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        ordered(load("paper"), written)
+
+
+def test_a_link_with_a_trace_takes_no_orders_that_a_record_could_not_hold() -> None:
+    scenario = load("paper", {"link": {"model": "trace", "trace": "0 7000"}})
+    with pytest.raises(ScenarioError, match="can only be given another model"):
+        ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
+    assert command(scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})).model is not None
+
+
+good = {"at_s": 1.0, "link": "m1->s", "to": {"model": "constant", "delay_ms": 5.0}}
+row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "delay 5",
+        "[]",
+        "{}",
+        json.dumps({**good, "more": 1}),
+        json.dumps({**good, "link": "m1->m2"}),
+        json.dumps({**good, "link": "x->s"}),
+        json.dumps({**good, "dominance": "s"}),
+        json.dumps({**good, "to": {"model": "constant"}}),
+        json.dumps({**good, "to": {"model": "constant", "delay_ms": -5}}),
+        json.dumps({**good, "to": {"model": "wormhole"}}),
+        json.dumps({**good, "to": {"model": "constant", "delay_ms": 5, "loss": 1, "loss_burst": 2}}),
+        json.dumps({**good, "at_s": -1}),
+        json.dumps({**row, "dominance": "m1"}),
+        json.dumps({**row, "dominance": "x"}),
+        json.dumps({**row, "to": {"m1": "half"}}),
+        json.dumps({**row, "to": {"m1": 0.5}}),
+        json.dumps({**row, "to": {"m3": 1.0}}),
+    ],
+)
+def test_a_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
+    scenario = load("paper")
+    for valid in (good, row):
+        assert command_from(scenario, "s", json.dumps(valid)).text == msgspec.json.encode(valid).decode()
+    with pytest.raises(ScenarioError):
+        command_from(scenario, "s", text)

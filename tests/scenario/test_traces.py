@@ -1,0 +1,183 @@
+"""Traces from tables: what a person's file may look like, and what is no trace."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.core.channel import LOST
+from trilat_net.core.delay import LIMIT_US, AtEnd
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load, parse, shipped_text
+from trilat_net.scenario.traces import MAX_POINTS, points_of, read_trace, text_of
+
+POINTS = [[0, 41_200], [1_000, LOST], [2_500, 0]]
+TEXT = "0 41200, 1000 lost, 2500 0"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t_s,delay_ms\n0.000,41.2\n0.001,lost\n0.0025,0\n",
+        "0.000,41.2\n0.001,lost\n0.0025,0",
+        "time,delay\r\n0.000,41.2\r\n0.001,lost\r\n0.0025,0\r\n",
+        "# measured in May\n\nt_s,delay_ms\n# by hand\n 0.000 , 41.2\n0.001, lost \n\n0.0025,0.0\n",
+        '"t_s","delay_ms"\n"0.000","41.2"\n"0.001","lost"\n"0.0025","0"\n',
+        "\ufefft_s,delay_ms\n0,41.2\n1e-3,lost\n2.5e-3,0\n",
+        "\ufeff0,41.2\n1e-3,lost\n2.5e-3,0\n",
+        "t_s,delay_ms\n17.000,41.2\n17.001,lost\n17.0025,0\n",  # times count from the first point
+    ],
+)
+def test_tables_as_people_have_them(tmp_path: Path, content: str) -> None:
+    (tmp_path / "delays.csv").write_bytes(content.encode())
+    text = read_trace(tmp_path / "delays.csv", "m1->s")
+    assert text == TEXT
+    assert points_of(text).tolist() == POINTS
+
+
+rows = st.lists(
+    st.tuples(st.integers(1, 10**8), st.integers(0, LIMIT_US) | st.just(LOST)), min_size=1, max_size=30
+)
+
+
+@given(rows=rows)
+def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]) -> None:
+    t_us = np.cumsum([gap for gap, _ in rows])
+    delays = [delay for _, delay in rows]
+    table = [
+        (t / 1e6, math.inf if us == LOST else us / 1e3) for t, us in zip(t_us.tolist(), delays, strict=True)
+    ]
+    text = text_of(table)
+    assert points_of(text).tolist() == [[t - t_us[0], us] for t, us in zip(t_us, delays, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "has no points"),
+        ("t_s,delay_ms\n# nothing\n", "has no points"),
+        ("0,5\n1,nan\n", "point 2: its delay must be from 0 to 10000 ms or 'lost', is nan"),
+        ("0,-1\n", "point 1: its delay"),
+        ("0,10000.1\n", "point 1: its delay"),
+        ("nan,5\n", "point 1: its time must be finite"),
+        ("0,5\ninf,5\n", "point 2: its time must be finite"),
+        ("-1,5\n", "point 1: its time must be finite and not negative"),
+        ("0,5\n2,5\n1,5\n", "point 3: its time, 1 s, must be later"),
+        ("0,5\n1,5\n1,6\n", "point 3: its time, 1 s, must be later"),
+        ("0,5\n1e-7,5\n", "point 2"),
+        ("0,5\n1,many\n", "line 2 reads '1,many'; a line is t_s,delay_ms or t_s,lost"),
+        ("0,5\nt_s,delay_ms\n1,6\n", "line 2 reads 't_s,delay_ms'"),
+        ("0,5\n1,6,7\n", "line 2 reads '1,6,7'"),
+        ("0,5\n1\n", "line 2 reads '1'"),
+        ("0 5\n1 6\n", "line 1 reads '0 5'"),
+        ("O.0,41\n1,5\n", "line 1 reads 'O.0,41'"),  # a broken first line is no head
+        ("0,5\n1,\n", "line 2"),
+    ],
+)
+def test_what_is_no_trace_is_refused_where_it_is_wrong(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
+    with pytest.raises(ScenarioError) as error:
+        load("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}})
+    assert error.value.path == "links.m1->s.file"
+    assert words in error.value.problem
+    assert "delays.csv" in error.value.problem
+
+
+def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "latin.csv").write_bytes(b"t_s,delay_ms # \xe4\n0,5\n")
+    (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
+    for name, words in (
+        ("none.csv", "cannot be read: No such file"),
+        ("", "cannot be read: Is a directory"),
+        ("latin.csv", "can't decode"),
+        ("long.csv", "field larger than field limit"),
+        ("a\0b.csv", "null byte"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            read_trace(tmp_path / name, "m1->s")
+
+
+def test_a_trace_that_is_too_long_is_refused() -> None:
+    with pytest.raises(ValueError, match="has 200001 points, at most 200000"):
+        text_of([(n / 1000, 5.0) for n in range(MAX_POINTS + 1)])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "0",
+        "0 5,1 5",
+        "0 5, x 5",
+        "0 5, 0 6",
+        "5 5",
+        "0 -2",
+        "0 10000001",
+        "0 5, 1 gone",
+        "0 5 6",
+        "0 5, ",
+    ],
+)
+def test_a_text_that_is_none_of_ours_is_refused(text: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        load("paper", {"link": {"model": "trace", "trace": text}})
+    assert error.value.path.endswith(".trace")
+
+
+# In a scenario.
+
+
+def scenario(folder: Path, link: str) -> Any:
+    text = shipped_text("paper").replace("[link]\ndelay_ms = 200.0", link)
+    return parse(text, "mine", folder=folder)
+
+
+def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "delays.csv").write_text("0,41.2\n0.001,lost\n0.0025,0\n", encoding="utf-8")
+    made = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
+    assert {link.trace for link in made.links.values()} == {TEXT}
+    assert "delays.csv" not in made.text
+    assert parse(made.text) == made
+    (path := tmp_path / "mine.toml").write_text(
+        shipped_text("paper").replace("delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'), "utf-8"
+    )
+    assert load(path).links["m1->s"].trace == TEXT
+    setup = made.setup("s").links[0]
+    assert setup.models[0].at_end == AtEnd.LOOP
+    assert setup.traces[0] is not None
+    assert setup.traces[0].tolist() == POINTS
+
+
+def test_a_trace_written_out_replaces_a_file_and_a_file_a_trace(tmp_path: Path) -> None:
+    (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
+    file = 'file = "delays.csv"'
+    made = scenario(tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"')
+    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 7", "0 41200")
+    made = scenario(tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}')
+    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 41200", "0 7")
+    made = scenario(tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"')
+    assert (made.links["m1->s"].at_end, made.links["m2->s"].at_end) == ("loop", "hold")
+
+
+@pytest.mark.parametrize(
+    ("link", "path", "words"),
+    [
+        ('[link]\nmodel = "trace"', "links.m2->m1.file", "is missing"),
+        ('[link]\nmodel = "trace"\ntrace = "0 7"\nfile = "a.csv"', "link.file", "either trace or file"),
+        (
+            '[link]\nmodel = "trace"\ntrace = "0 7"\nof = "m1->s"',
+            "links.m2->m1.of",
+            "the log that file names",
+        ),
+        ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
+    ],
+)
+def test_where_a_trace_comes_from_is_said_once(tmp_path: Path, link: str, path: str, words: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        scenario(tmp_path, link)
+    assert error.value.path == path
+    assert words in error.value.problem
