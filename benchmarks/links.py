@@ -1,4 +1,4 @@
-"""What a link costs: a site's tick with five peers against one with a single peer, each with a sample per tick.
+"""What a link costs: a tick of a site with five peers against one with a single peer, a sample from each.
 
 The difference, over four, is one link in one tick: its arrival taken in, its channel's draws, the sample
 brought into use, its part of the reference and of the record.

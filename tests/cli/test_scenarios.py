@@ -43,7 +43,7 @@ def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
     assert "m1 0.42" in text
     assert "20000 ticks of m1" in text
-    assert "m2->s 310 ms" in text
+    assert "m2->s: 310 ms" in text
     assert "assumed: " in text
 
 

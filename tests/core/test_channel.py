@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.channel import LOST
+from trilat_net.scenario.distributions import Gamma, Uniform
 from trilat_net.scenario.link import LinkBase
-from trilat_net.scenario.links import Constant, Gamma, NoDelay, Uniform
+from trilat_net.scenario.links import Constant, NoDelay
 
 COUNT = 1_000_000
 SIGMAS = 4.0

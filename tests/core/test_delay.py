@@ -13,17 +13,16 @@ from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
 from tests.core.draws import philox_in_integers
 from trilat_net.core.delay import LIMIT_US, AtEnd, Delay, Model, traced_us, whole_us
 from trilat_net.core.draw import link_key
-from trilat_net.scenario.link import LinkBase
-from trilat_net.scenario.links import (
+from trilat_net.scenario.distributions import (
     Correlated,
     Gamma,
     HyperExponential,
     LogNormal,
     Normal,
-    Sine,
-    Trace,
     Uniform,
 )
+from trilat_net.scenario.link import LinkBase
+from trilat_net.scenario.links import Sine, Trace
 from trilat_net.scenario.presets import PRESETS
 from trilat_net.scenario.traces import points_of, text_of
 

@@ -258,7 +258,7 @@ def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
         opened(edited(recorded("paper"), scenario=scenario))
 
 
-@pytest.mark.parametrize("change", [{"v": 2}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
+@pytest.mark.parametrize("change", [{"v": 3}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
 def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) -> None:
     data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
     with pytest.raises(LogError, match="record of m1"):

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from trilat_net.scenario import load
-from trilat_net.scenario.links import HyperExponential
+from trilat_net.scenario.distributions import HyperExponential
 from trilat_net.scenario.presets import _FILE, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS, PRESETS
 
 ROUND_TRIPS_MS = {

@@ -52,7 +52,9 @@ def pairs(texts: list[str], example: str) -> dict[str, Any]:
 @app.callback()
 def changes(
     context: typer.Context,
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session.")],
+    session: Annotated[
+        str | None, typer.Option("--session", metavar="ID", help="Which session; required.")
+    ] = None,
     connect: ConnectOption = None,
     router: RouterOption = None,
     zenoh_config: ZenohConfigOption = None,
@@ -112,6 +114,8 @@ def _place(context: typer.Context, site: str, order: dict[str, Any]) -> None:
     from ..scenario import parse
 
     session, connection = context.obj
+    if session is None:
+        raise UsageError("which session? say trilat set --session ID ...")
     reply = place_order(
         connection, SystemClock(), session, site, Order(**order), lambda text: parse(text, session).names
     )

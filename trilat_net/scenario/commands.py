@@ -10,9 +10,9 @@ import msgspec
 from ..core.grid import NS_PER_S
 from ..core.tick import Command
 from ..errors import ScenarioError
+from .connections import change_link, change_shares
 from .conversion import check_change
 from .model import Scenario
-from .resolution import change_link, change_shares
 from .timeline import Change
 
 Present = dict[str, dict[str, Any]]

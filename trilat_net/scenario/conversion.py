@@ -11,7 +11,7 @@ from . import expectation
 from .link import LinkBase
 from .links import Link, Trace
 from .model import OnStale, Pulse, Scenario, SiteSpec
-from .resolution import Table
+from .tables import Table
 from .timeline import Change
 
 _CHOICES = {

@@ -9,7 +9,8 @@ from typing import Any
 from ..errors import ScenarioError
 from .conversion import convert
 from .model import Scenario, SiteSpec
-from .resolution import Table, nearest, resolve
+from .resolution import resolve
+from .tables import Table, nearest
 
 _KINDS = ("model", "preset", "law")
 """Keys that say which other keys a table has."""

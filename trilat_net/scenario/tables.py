@@ -1,0 +1,63 @@
+"""Tables as people write them: what every check of them needs.
+
+Law: an error names the path of the key in the shape in which it was written, and the nearest valid name.
+"""
+
+import difflib
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from ..errors import ScenarioError
+
+Table = dict[str, Any]
+
+
+def nearest(word: str, valid: Sequence[str]) -> str:
+    """Returns "; did you mean ...?", or "" where nothing valid is near."""
+    match = difflib.get_close_matches(word, valid, n=1, cutoff=0.5)
+    return f"; did you mean {match[0]!r}?" if match else ""
+
+
+def known(table: Any, valid: Sequence[str], path: str) -> Table:
+    """Returns the table if it is one and has no key but the valid ones.
+
+    Args:
+        table: what the author wrote.
+        valid: the keys that it may have.
+        path: what errors call it.
+    """
+    if not isinstance(table, dict):
+        raise ScenarioError("must be a table", path=path)
+    for key in table:
+        if key not in valid:
+            where = f"{path}.{key}" if path else key
+            hint = nearest(key, valid) or f"; valid are {', '.join(valid)}"
+            raise ScenarioError(f"unknown key{hint}", path=where)
+    return table
+
+
+def fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
+    """Returns the keys that a type has."""
+    return kind.__struct_fields__
+
+
+def one_of(word: Any, valid: Sequence[str], path: str) -> None:
+    """Refuses a word that is none of the valid ones."""
+    if word not in valid:
+        hint = nearest(str(word), valid)
+        raise ScenarioError(f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path)
+
+
+def finite(value: Any, path: str) -> None:
+    """Refuses a number that is not finite, however deep it lies."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ScenarioError(f"must be a finite number, is {value}", path=path)
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            finite(entry, f"{path}.{key}" if path else key)
+    if isinstance(value, list):
+        for n, entry in enumerate(value):
+            finite(entry, f"{path}[{n}]")
