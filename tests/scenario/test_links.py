@@ -236,6 +236,10 @@ def test_extreme_numbers_are_refused_or_have_moments(
         assert due(channel([made.core()]), 3).min() >= 0
 
 
+def test_a_trace_may_reach_the_limit_whatever_its_deviation() -> None:
+    assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None
+
+
 def test_loss_without_bursts_is_by_itself() -> None:
     model = NoDelay(loss=0.3).core()
     assert (model.loss_good, model.enter) == (0.3, 0.0)

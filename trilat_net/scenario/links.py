@@ -123,6 +123,10 @@ class Trace(LinkBase, frozen=True, kw_only=True, tag="trace"):
         variance = float(np.average((delay_us - mean) ** 2, weights=weights))
         return Moments(mean / 1e3, math.sqrt(variance) / 1e3)
 
+    def reach_ms(self) -> float:
+        """See `LinkBase`: that of its points, which are within bounds."""
+        return float(self.points[:, 1].max()) / 1e3
+
     def fault(self) -> Fault | None:
         """See `LinkBase`."""
         try:
