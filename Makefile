@@ -38,7 +38,8 @@ $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 test: pytest live lint
 
 pytest: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
+	$(BIN)/python -m pytest -q -m live
 
 live: setup
 	rm -rf runs/check

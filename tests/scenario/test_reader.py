@@ -148,7 +148,7 @@ def test_an_override_of_the_law_takes_that_laws_gains() -> None:
 def test_what_to_do_about_a_stale_peer() -> None:
     assert load("paper").setup("s").on_stale == StaleRule(Stale.USE, 350_000_000, 1_000_000_000)
     keys = {"on_stale": {"action": "hold", "age_ms": 120.5}, "sites.s.on_stale": {"action": "brake"}}
-    scenario = load("paper", keys)
+    scenario = load("paper", {**keys, "link.delay_ms": 100.0})
     assert scenario.setup("m1").on_stale == StaleRule(Stale.HOLD, 120_500_000, 1_000_000_000)
     assert scenario.setup("s").on_stale == StaleRule(Stale.BRAKE, 120_500_000, 1_000_000_000)
     for value in (0, -1, "soon"):
@@ -417,3 +417,12 @@ def test_a_name_that_is_not_shipped_is_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
         load("papre")
     assert "./mine.toml" in str(error.value)
+
+
+def test_a_stale_rule_below_the_links_delay_would_hold_for_ever_and_is_refused() -> None:
+    rule = {"on_stale.action": "hold", "on_stale.age_ms": 350.0}
+    assert load("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action == "hold"
+    for link in ({"link.delay_ms": 350.0}, {"link.playout_ms": 400.0}):
+        with pytest.raises(ScenarioError, match=r"sites\.m1\.on_stale\.age_ms.*never follow"):
+            load("paper", {**rule, **link})
+    load("paper", {"on_stale.age_ms": 1.0})  # nothing follows from it

@@ -10,6 +10,7 @@ from dataclasses import replace
 from ..errors import SessionError, WireError
 from . import topics
 from .answers import Order, Reply
+from .asking import Asking
 from .bus import Bus
 from .clock import Clock
 from .connection import Connection, open_bus
@@ -60,17 +61,17 @@ def _open(connection: Connection, clock: Clock) -> Bus:
 
 def _infos(bus: Bus, clock: Clock, session: str) -> Iterator[Info]:
     """Yields what members say of themselves, for `PATIENCE_S`."""
+    asking = Asking(bus, clock, topics.key(session, "*", topics.INFO))
     give_up_ns = clock.monotonic_ns() + int(PATIENCE_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
-        replies = bus.ask(topics.key(session, "*", topics.INFO))
-        again_ns = clock.monotonic_ns() + ASK_EVERY_NS
+        again_ns = asking.ask() + ASK_EVERY_NS
         while clock.monotonic_ns() < again_ns:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-            while (reply := replies.poll()) is not None:
+            while (answer := asking.poll()) is not None:
                 try:
-                    yield decode(reply[1], Info)
+                    yield decode(answer.payload, Info)
                 except WireError as error:
-                    raise SessionError(f"the answer of {reply[0]} cannot be understood: {error}") from None
+                    raise SessionError(f"the answer of {answer.key} cannot be understood: {error}") from None
 
 
 def _anyone(bus: Bus, clock: Clock, session: str) -> Info:

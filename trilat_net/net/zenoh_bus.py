@@ -19,7 +19,7 @@ from .bus import RING, Inbox, Presence, Questions, StampedInbox, StampingRing
 from .zenoh_config import Endpoint, Mode, configuration
 from .zenoh_file import ZenohFile, understood
 
-ASK_TIMEOUT_S = 1.0
+ASK_TIMEOUT_S = 3.0
 MAX_DEPTH = 100
 """Of a configuration; Zenoh's parser recurses, and overflows its stack where that goes deep."""
 

@@ -7,8 +7,9 @@ the path of the key and the nearest valid name.
 from .commands import command, command_from, later_tables, owner, present_links, resolve_change
 from .expectation import Expect
 from .links import Link
-from .model import Adaptive, Arm, Limits, OnStale, ProportionalDamped, Pulse, Scenario, SiteSpec
+from .model import Scenario
 from .reader import load, override, parse, shipped, shipped_text, site_named, template_text
+from .site import Adaptive, Arm, Limits, OnStale, ProportionalDamped, Pulse, SiteSpec
 
 __all__ = [
     "Adaptive",

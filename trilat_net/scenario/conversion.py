@@ -9,8 +9,9 @@ from ..core.arm import positive_definite
 from ..errors import ScenarioError
 from . import expectation
 from .link import LinkBase
-from .links import Link, Trace
-from .model import OnStale, Pulse, Scenario, SiteSpec
+from .links import Constant, Link, Trace
+from .model import Scenario
+from .site import OnStale, Pulse, SiteSpec
 from .tables import Table
 from .timeline import Change
 
@@ -50,6 +51,7 @@ def convert(resolved: Table) -> Scenario:
     for name, link in scenario.links.items():
         if found := link.fault():
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
+    _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
     scenario = msgspec.structs.replace(scenario, timeline=tuple(map(_spelt, scenario.timeline)))
@@ -64,6 +66,21 @@ def _spelt(change: Change) -> Change:
     if not change.link:
         return change
     return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
+
+
+def _check_stale_rules(scenario: Scenario) -> None:
+    """Refuses a rule by which a site would hold for ever: its links' delay alone is older than that."""
+    for name, site in scenario.sites.items():
+        for peer in scenario.peers(name):
+            link = scenario.links[f"{peer}->{name}"]
+            delay_ms = max(link.playout_ms, link.delay_ms if isinstance(link, Constant) else 0.0)
+            follows = scenario.dominance[name].get(peer, 0.0) > 0.0
+            if site.on_stale.action != "use" and follows and delay_ms >= site.on_stale.age_ms:
+                raise ScenarioError(
+                    f"must be above the {delay_ms:g} ms of {peer}->{name}, is {site.on_stale.age_ms:g}: "
+                    f"the site would never follow {peer}",
+                    path=f"sites.{name}.on_stale.age_ms",
+                )
 
 
 def check_change(change: Change, path: str) -> None:

@@ -15,29 +15,16 @@ import tomli_w
 from msgspec import Meta
 
 from ..core import dominance
-from ..core.arm import Array, Links, parameters
+from ..core.arm import Array
 from ..core.draw import link_key
-from ..core.setup import Law, LinkSetup, Scheme, SiteSetup, Stale, StaleRule
+from ..core.setup import Law, LinkSetup, Scheme, SiteSetup
 from ..core.tick import Ramp
 from .expectation import Expect
 from .frozen import Frozen
 from .link import LinkBase
 from .links import Link
+from .site import Adaptive, ProportionalDamped, SiteSpec
 from .timeline import Change, later_links
-
-LARGEST = 1e9
-"""Beyond this no quantity of an arm, a gain or a torque is meant; arithmetic stays far from its limits."""
-
-Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
-NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
-Real = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-Joints = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
-PositiveJoints = Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)]
-NotNegativeJoints = Annotated[tuple[NotNegative, ...], Meta(min_length=2, max_length=2)]
-Parameters = Annotated[tuple[Real, ...], Meta(min_length=5, max_length=5)]
-NotNegativeParameters = Annotated[tuple[NotNegative, ...], Meta(min_length=5, max_length=5)]
-Rate = Annotated[int, Meta(ge=1, le=20_000)]
-
 
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 
@@ -45,145 +32,6 @@ _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 def _one_line(numbers: re.Match[str]) -> str:
     """Puts a list of numbers on one line."""
     return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
-
-
-class Arm(Frozen, frozen=True):
-    """The two links of a planar arm; defaults are the paper's, as point masses at the link ends.
-
-    Attributes:
-        l1_m: length of link 1, m.
-        m1_kg: mass of link 1, kg.
-        lc1_m: distance of its centre of mass from joint 1, m.
-        I1_kg_m2: inertia about its centre of mass, kg m^2.
-        l2_m: length of link 2, m.
-        m2_kg: mass of link 2, kg.
-        lc2_m: distance of its centre of mass from joint 2, m.
-        I2_kg_m2: inertia about its centre of mass, kg m^2.
-        g_m_s2: gravitational acceleration, m/s^2.
-    """
-
-    l1_m: Positive = 1.0
-    m1_kg: Positive = 1.0
-    lc1_m: NotNegative = 1.0
-    I1_kg_m2: NotNegative = 0.0
-    l2_m: Positive = 1.0
-    m2_kg: Positive = 1.0
-    lc2_m: Positive = 1.0
-    I2_kg_m2: NotNegative = 0.0
-    g_m_s2: NotNegative = 9.81
-
-    @property
-    def theta(self) -> Array:
-        """True parameters of Eq. (24), shape (5,)."""
-        return parameters(Links(**{name: getattr(self, name) for name in Links._fields}))
-
-
-class Adaptive(Frozen, frozen=True, tag_field="law", tag="adaptive"):
-    """The paper's adaptive law, Eq. (13) and (15), and its gains, all diagonal.
-
-    Attributes:
-        Lambda: per joint, 1/s.
-        Kp: per joint, N m s/rad.
-        Kd: per joint, N m s/rad.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
-    """
-
-    Lambda: PositiveJoints = (1.0, 1.0)
-    Kp: PositiveJoints = (1.0, 1.0)
-    Kd: NotNegativeJoints = (3.0, 3.0)
-    Gamma: NotNegativeParameters = (1.0,) * 5
-    theta_hat0: Parameters = (0.0,) * 5
-
-
-class ProportionalDamped(Frozen, frozen=True, tag_field="law", tag="p_d"):
-    """P+d with known gravity: tau = G(q) - K e - d qd.
-
-    Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping per joint, N m s/rad.
-    """
-
-    K: PositiveJoints = (10.0, 10.0)
-    d: NotNegativeJoints = (3.0, 3.0)
-
-
-Control = Adaptive | ProportionalDamped
-LAWS: dict[str, type[Frozen]] = {"adaptive": Adaptive, "p_d": ProportionalDamped}
-"""The laws by their names."""
-
-
-class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """What a site does about a peer whose sample in use is too old.
-
-    Attributes:
-        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is.
-        age_ms: older than this is too old, ms.
-        return_s: how long the way back takes once a fresh sample is in use, s.
-    """
-
-    action: Literal["use", "hold", "brake"] = "use"
-    age_ms: Annotated[float, Meta(gt=0.0, le=1e6)] = 350.0
-    return_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
-
-    @property
-    def rule(self) -> StaleRule:
-        """The same, as the core has it."""
-        return StaleRule(Stale[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9))
-
-
-class Limits(Frozen, frozen=True):
-    """Where a run stops being physics.
-
-    Attributes:
-        tau_limit_nm: largest control torque of a joint, N m; more is cut off.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s.
-    """
-
-    tau_limit_nm: Positive = 200.0
-    qd_limit_rad_s: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 100.0
-
-
-class Pulse(Frozen, frozen=True):
-    """A smooth push of an operator: peak * sin^2(pi (t - start) / (end - start)), ON the arm.
-
-    Attributes:
-        kind: "pulse".
-        start_s: when it begins, s after the epoch.
-        end_s: when it ends, s after the epoch.
-        peak_nm: its peak on each joint, N m.
-    """
-
-    kind: Literal["pulse"]
-    start_s: NotNegative
-    end_s: Positive
-    peak_nm: Joints
-
-
-class SiteSpec(Frozen, frozen=True):
-    """One manipulator.
-
-    Attributes:
-        role: what it is to a reader of figures; enters no formula.
-        rate_hz: tick rate of its loop, Hz.
-        q0_rad: start pose, rad.
-        qd0_rad_s: start velocity, rad/s.
-        arm: its links.
-        control: its law and gains.
-        limits: where it stops.
-        on_stale: what it does about a peer whose samples are too old.
-        hands: what its operator does.
-    """
-
-    role: Literal["master", "slave"]
-    rate_hz: Rate
-    q0_rad: Joints
-    qd0_rad_s: Joints
-    arm: Arm
-    control: Control
-    limits: Limits
-    on_stale: OnStale = OnStale()
-    hands: tuple[Pulse, ...] = ()
 
 
 class Scenario(Frozen, frozen=True, dict=True):

@@ -8,8 +8,9 @@ from typing import Any
 
 from ..errors import ScenarioError
 from .conversion import convert
-from .model import Scenario, SiteSpec
+from .model import Scenario
 from .resolution import resolve
+from .site import SiteSpec
 from .tables import Table, nearest
 
 _KINDS = ("model", "preset", "law")

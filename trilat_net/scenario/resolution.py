@@ -14,7 +14,7 @@ from ..core.arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
 from .connections import resolve_links, resolve_row, resolve_timeline
 from .expectation import Expect
-from .model import LAWS, Arm, Limits, OnStale, Pulse, SiteSpec
+from .site import LAWS, Arm, Limits, OnStale, Pulse, SiteSpec
 from .tables import Table, fields, finite, known, one_of
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")

@@ -1,0 +1,98 @@
+"""Asking a site of a running session for a change, over real connections."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+
+import msgspec
+import pytest
+
+from sites.changes import Changes
+from trilat_net.errors import SessionError
+from trilat_net.net import topics
+from trilat_net.net.answers import Order, Reply
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.connection import Connection
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.messages import Info
+from trilat_net.net.ordering import place_order
+from trilat_net.net.voice import Voice
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.scenario import load, parse
+
+SESSION = "o"
+CLOCK = SystemClock()
+
+
+class Answering:
+    """A site `s` that does nothing but answer."""
+
+    def __init__(self, *, running: bool, deaf: bool = False) -> None:
+        (self.endpoint,) = free_endpoints(1)
+        self._bus = ZenohBus([self.endpoint])
+        scenario = load("paper")
+        info = Info(
+            member="s",
+            boot=1,
+            scenario_sha256=scenario.sha256,
+            scenario=scenario.text,
+            host="h",
+            clock="c",
+            fingerprint="f",
+            running=running,
+        )
+        self._voice = Voice(self._bus, SESSION, info)
+        questions = self._bus.questions(topics.key(SESSION, "s" if not deaf else "x", topics.SET))
+        self._changes = Changes(scenario, "s", questions)
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._answer)
+        self._thread.start()
+
+    def _answer(self) -> None:
+        while not self._done.wait(0.002):
+            self._voice.answer()
+            self._changes.take(100)
+
+    def close(self) -> None:
+        self._done.set()
+        self._thread.join()
+        self._bus.close()
+
+    def asked(self, site: str, **order: object) -> Reply:
+        wanted = msgspec.convert({"to": {}, **order}, Order)
+        connection = Connection(connect=[self.endpoint])
+        return place_order(connection, CLOCK, SESSION, site, wanted, lambda text: parse(text).names)
+
+
+@pytest.fixture
+def running() -> Iterator[Answering]:
+    with closing(Answering(running=True)) as site:
+        yield site
+
+
+def test_a_change_is_answered_by_the_site_that_carries_it_out(running: Answering) -> None:
+    reply = running.asked("s", link="m1->s", to={"delay_ms": 350.0})
+    assert (reply.member, reply.accepted, reply.tick) == ("s", True, 200)
+    refused = running.asked("s", link="m1->s", to={"delay_ms": -1.0})
+    assert (refused.accepted, refused.tick) == (False, -1)
+    assert "delay_ms" in refused.text
+
+
+def test_a_site_that_does_not_exist_is_told_with_those_that_do(running: Answering) -> None:
+    with pytest.raises(SessionError, match="m1, m2, s"):
+        running.asked("x", dominance="x", to={"m1": 1.0})
+
+
+def test_a_site_of_the_scenario_that_is_not_there_does_not_answer(running: Answering) -> None:
+    with pytest.raises(SessionError, match="'m1' of session 'o' does not answer"):
+        running.asked("m1", dominance="m1", to={"s": 1.0})
+
+
+def test_a_session_that_has_not_begun_takes_no_changes() -> None:
+    with closing(Answering(running=False)) as site, pytest.raises(SessionError, match="has not begun"):
+        site.asked("s", link="m1->s", to={"delay_ms": 350.0})
+
+
+def test_whoever_gives_no_answer_is_named() -> None:
+    with closing(Answering(running=True, deaf=True)) as site, pytest.raises(SessionError, match="no answer"):
+        site.asked("s", link="m1->s", to={"delay_ms": 350.0})
