@@ -1,7 +1,7 @@
 """Logs of every released schema version stay readable, and execute to the same numbers.
 
-`v1.mcap` is 0.4 s of `asymmetric` in virtual time, with shorter delays so that samples come into use. `v2.mcap` has
-random links, a loss in bursts, an outage, a stale peer, and changes of a link and of shares besides.
+`v1.mcap` is 0.4 s of `asymmetric` in virtual time, with shorter delays so that samples come into use;
+`v2.mcap` has random links, a loss in bursts, an outage, a stale peer, and changes of a link and of shares.
 """
 
 from pathlib import Path
