@@ -16,7 +16,7 @@ from trilat_net.core.jit import is_cached
 from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.endpoints import session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import Scenario
 
@@ -82,6 +82,11 @@ class _Child:
         return f"{self.name} ended with code {code}: {last}"
 
 
+def session_name(scenario: Scenario) -> str:
+    """Returns what the session of a demo is called, for `trilat set` and `trilat ping`."""
+    return f"{scenario.name}-demo"
+
+
 def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
     """Runs a session of all sites and a recorder, from start to end.
 
@@ -99,8 +104,8 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
             display.say("compiling, once for this machine ...")
             with interrupt.raising():
                 warm_up(scenario, scenario.names[0])  # once for all children
-        endpoints = free_endpoints(len(scenario.names))
-        session = f"{scenario.name}-demo"
+        session = session_name(scenario)
+        endpoints = session_endpoints(session, scenario.names)
         children, recorder = _start(scenario, folder, session, endpoints)
         clock = SystemClock()
         try:

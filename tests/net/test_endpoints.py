@@ -4,7 +4,12 @@ import socket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.endpoints import default_endpoint, default_endpoints, free_endpoints
+from trilat_net.net.endpoints import (
+    default_endpoint,
+    default_endpoints,
+    free_endpoints,
+    session_endpoints,
+)
 
 NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=40)
 
@@ -48,3 +53,16 @@ def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
     finally:
         for probe in sockets:
             probe.close()
+
+
+def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
+    """So that `trilat set` and `trilat ping` find it without being told."""
+    sites = ("a", "b", "c")
+    places = list(default_endpoints("endpoints-test", sites).values())
+    assert session_endpoints("endpoints-test", sites) == places
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port(places[1])))
+        taken.listen()
+        others = session_endpoints("endpoints-test", sites)
+    assert len(set(others)) == 3
+    assert not set(others) & set(places)

@@ -45,7 +45,7 @@ def demo(
     force: ForceOption = False,
 ) -> None:
     """Runs a scenario live: every site and a recorder as processes over Zenoh, then verifies and reports."""
-    from sites.demo import run_demo
+    from sites.demo import run_demo, session_name
     from sites.display import Display
 
     from ..conclusion import conclude, results_folder
@@ -54,7 +54,10 @@ def demo(
     chosen = chosen_scenario(scenario, overrides, duration, seed)
     results = results_folder(folder, chosen.name, force=force)
     out.print(f"{escape(chosen.title or chosen.name)}")
-    out.print(f"{chosen.duration_s:g} s live: {', '.join(chosen.names)} and a recorder; Ctrl-C ends it")
+    out.print(
+        f"{chosen.duration_s:g} s live: {', '.join(chosen.names)} and a recorder, "
+        f"session {session_name(chosen)}; Ctrl-C ends it"
+    )
     with Display(chosen, out) as display:
         outcome = run_demo(chosen, results, display)
     for problem in outcome.problems:

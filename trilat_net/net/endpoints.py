@@ -22,6 +22,23 @@ def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
     return {site: default_endpoint(session, index) for index, site in enumerate(sites)}
 
 
+def session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
+    """Returns where the sites of a session may listen: by default, or elsewhere if a port of those is taken."""
+    default = [default_endpoint(session, index) for index in range(len(sites))]
+    return default if all(map(_is_free, default)) else free_endpoints(len(sites))
+
+
+def _is_free(endpoint: str) -> bool:
+    """True where nobody has the port of a loopback endpoint at this moment."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
+        except OSError:
+            return False
+    return True
+
+
 def free_endpoints(count: int) -> list[str]:
     """Returns loopback endpoints whose ports nobody has at this moment."""
     sockets = [socket.socket() for _ in range(count)]
