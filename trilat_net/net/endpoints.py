@@ -23,7 +23,7 @@ def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
 
 
 def session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
-    """Returns where the sites of a session may listen: by default, or elsewhere if a port of those is taken."""
+    """Returns where the sites of a session may listen: by default, or elsewhere where a port is taken."""
     default = [default_endpoint(session, index) for index in range(len(sites))]
     return default if all(map(_is_free, default)) else free_endpoints(len(sites))
 
