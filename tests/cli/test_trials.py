@@ -135,4 +135,4 @@ def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err
-    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids), timeout_s=20)

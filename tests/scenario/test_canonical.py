@@ -21,10 +21,9 @@ laws = st.fixed_dictionaries(
     optional={"Lambda": vector, "Kp": vector, "Kd": vector, "theta_hat0": st.floats(-5, 5)},
 ) | st.fixed_dictionaries({"law": st.just("p_d")}, optional={"K": vector, "d": vector})
 stale = st.fixed_dictionaries(
-    {},
+    {"age_ms": st.floats(10_001, 1e5)},  # above every delay
     optional={
         "action": st.sampled_from(["use", "hold", "brake"]),
-        "age_ms": st.floats(1, 1e5),
         "return_s": st.floats(0.001, 100),
     },
 )

@@ -134,12 +134,15 @@ def accept(
         if model.kind != _MEASURED:
             link.late += 1
         release = k
-    if slot.tick > tick or tick <= link.used:
+    if slot.tick > tick:
         link.superseded += 1
         return
     slot.tick = tick
     slot.q[:] = q
     slot.qd[:] = qd
+    if tick <= link.used:  # filed all the same: so that it is known when it comes again
+        link.superseded += 1
+        return
     page = release % calendar.shape[0]
     if calendar[page] >= 0:
         link.superseded += 1
