@@ -10,7 +10,6 @@ from .delay import (
     DELAY,
     DUPLICATE,
     LOSS,
-    AtEnd,
     Delay,
     Points,
     Row,
@@ -28,11 +27,6 @@ LOST = -1
 """In the place of a time: the sample is lost."""
 
 _AR1, _SINE, _TRACE, _MEASURED = int(Delay.AR1), int(Delay.SINE), int(Delay.TRACE), int(Delay.MEASURED)
-
-Samples = Row
-Models = Row
-
-__all__ = ["LOST", "AtEnd", "foresee"]
 
 
 @leaf
@@ -103,7 +97,7 @@ def _due_ns(sample: int, fresh: bool, link: Row, model: Row, points: Points) -> 
 
 
 @leaf
-def foresee(sample: int, link: Row, models: Models, samples: Samples, points: Points) -> None:
+def foresee(sample: int, link: Row, models: Row, samples: Row, points: Points) -> None:
     """Decides the fate of every sample up to one and writes it into its page, `due_ns`.
 
     Args:

@@ -15,11 +15,11 @@ from .bus import Bus
 from .clock import Clock
 from .connection import Connection, open_bus
 from .endpoints import default_endpoint, default_endpoints
+from .meeting import ASK_EVERY_NS
 from .messages import Info
 from .wire import decode, encode
 
 POLL_NS = 5_000_000
-ASK_EVERY_NS = 200_000_000
 PATIENCE_S = 3.0
 
 Names = Callable[[str], tuple[str, ...]]
