@@ -36,7 +36,7 @@ def run() -> list[str]:
         writer = LogWriter(io.BytesIO(), scenario, scenario.name, "virtual", 0)
         keys = {name: topics.key(scenario.name, name, topics.STATE) for name in scenario.names}
         for name, payload, t_ns, tick in payloads:
-            writer.add_state(name, keys[name], payload, t_ns, t_ns, tick)
+            writer.add(keys[name], payload, t_ns, t_ns, tick)
         writer.finish({})
 
     writing = best_s(write)

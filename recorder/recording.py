@@ -8,10 +8,12 @@ from collections import Counter
 from typing import BinaryIO
 
 from trilat_net.errors import WireError
+from trilat_net.log.accounting import Account
 from trilat_net.log.writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.session import Epoch
+from trilat_net.net.stats import ticks_between
 from trilat_net.net.voice import Voice
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario
@@ -46,6 +48,7 @@ class Recording:
         self._stored: set[str] = set()
         self._gone: set[str] = set()
         self._gone_since_ns: dict[str, int] = {}
+        self._accounts = {key: Account() for key in self._writer.keys}
         self._overflowed = 0
         self.dropped: Counter[str] = Counter()
 
@@ -57,7 +60,7 @@ class Recording:
             except WireError as error:
                 self.dropped[error.reason] += 1
         for site, ticks in self._ends.items():
-            if site not in self._stored and self._writer.accounts[site].received >= ticks:
+            if site not in self._stored and self._account(site).received >= ticks:
                 self._stored.add(site)
                 self._say("stored", f"every record of {site} is stored", now_ns, about=site, ticks=ticks)
 
@@ -70,19 +73,20 @@ class Recording:
         if where.channel == topics.STATE:
             state = decode(arrived.payload, State)
             _belongs(state.site == where.member and state.boot == boot, arrived.key)
-            fresh = self._writer.add_state(
-                where.member, arrived.key, arrived.payload, state.t_ns, log_time_ns, state.tick
-            )
-            self.dropped["duplicate"] += not fresh
+            if self._accounts[arrived.key].take(state.tick):
+                self._writer.add(arrived.key, arrived.payload, state.sent_ns, log_time_ns, state.tick, state)
         elif where.channel == topics.LINK:
             stats = decode(arrived.payload, LinkStats)
             _belongs(stats.site == where.member and stats.boot == boot, arrived.key)
-            self._writer.add(arrived.key, arrived.payload, stats.t_ns, log_time_ns, stats.tick)
+            every = ticks_between(self._scenario.sites[where.member].rate_hz)
+            if self._accounts[arrived.key].take(stats.tick // every):
+                self._writer.add(arrived.key, arrived.payload, stats.t_ns, log_time_ns, stats.tick, stats)
         else:
             event = decode(arrived.payload, Event)
             _belongs(event.member == where.member and event.boot == boot, arrived.key)
             t_ns = event.t_ns if event.t_ns >= 0 else log_time_ns - self._epoch.unix_ns
-            self._writer.add(arrived.key, arrived.payload, t_ns, log_time_ns, event.ticks)
+            if event.n < 0 or self._accounts[arrived.key].take(event.n):
+                self._writer.add(arrived.key, arrived.payload, t_ns, log_time_ns, event.n, event)
             if event.kind == "end":
                 self._ends[where.member] = event.ticks
 
@@ -91,7 +95,11 @@ class Recording:
         t_ns = now_ns - self._epoch.mono_ns
         event = self._voice.say(kind, text, t_ns=t_ns, **facts)
         key = topics.key(self._session, topics.RECORDER, topics.EVENT)
-        self._writer.add(key, encode(event), t_ns, self._epoch.unix_ns + t_ns, event.ticks)
+        self._accounts[key].take(event.n)
+        self._writer.add(key, encode(event), t_ns, self._epoch.unix_ns + t_ns, event.n, event)
+
+    def _account(self, site: str) -> Account:
+        return self._accounts[topics.key(self._session, site, topics.STATE)]
 
     def presence(self, key: str, alive: bool) -> None:
         """Takes note of a member's token that appeared or disappeared."""
@@ -132,12 +140,19 @@ class Recording:
                 self.dropped[error.reason] += 1
         self._overflowed = sum(tap.overflowed.values())
         counts = {f"dropped: {reason}": str(count) for reason, count in self.dropped.items() if count}
-        self._writer.finish(self._ends, tap.overflowed, counts)
+        for site, ticks in self._ends.items():
+            self._account(site).expect(ticks)
+        texts = {
+            f"/{key}": f"{account.as_text()}, overflowed {tap.overflowed[key]}"
+            for key, account in self._accounts.items()
+        }
+        self._writer.finish({**texts, **counts})
 
     def summary(self) -> list[str]:
         """Returns what was recorded, a line per site, for people."""
         lines = []
-        for site, account in self._writer.accounts.items():
+        for site in self._scenario.names:
+            account = self._account(site)
             made = self._ends.get(site)
             of = f" of {made} records" if made is not None else " records of a number that it never said"
             lines.append(
@@ -153,7 +168,8 @@ class Recording:
 
     def problem(self) -> str | None:
         """Says what is missing, or None where everything is there."""
-        for site, account in self._writer.accounts.items():
+        for site in self._scenario.names:
+            account = self._account(site)
             if site not in self._ends:
                 return f"{site} disappeared after {account.received} records"
             if account.missing:

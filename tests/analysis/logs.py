@@ -161,7 +161,7 @@ def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[
     for site, arrivals, output in virtual.run(scenario, network, ordered):
         payload = encode_state(site.name, 1, site.peers, output, arrivals, 0, 0)
         key = topics.key(scenario.name, site.name, topics.STATE)
-        writer.add_state(site.name, key, payload, output.t_ns, output.t_ns, output.tick)
+        writer.add(key, payload, output.t_ns, output.t_ns, output.tick, output)
         counts[site.name] = site.counts()
     writer.finish({})
     stream.seek(0)
@@ -200,13 +200,11 @@ def rewritten(
     for site in log.sites:
         for state in filter(keep, log[site].states):
             payload = encode(change(state))
-            writer.add_state(
-                site, topics.key("again", site, topics.STATE), payload, state.t_ns, 0, state.tick
-            )
+            writer.add(topics.key("again", site, topics.STATE), payload, state.t_ns, 0, state.tick, state)
     for message in others:
         stats = isinstance(message, LinkStats)
         member, channel = (message.site, topics.LINK) if stats else (message.member, topics.EVENT)
-        writer.add(topics.key("again", member, channel), encode(message), 0, 0, 0)
+        writer.add(topics.key("again", member, channel), encode(message), 0, 0, 0, message)
     writer.flush()
     if finished:
         writer.finish({})

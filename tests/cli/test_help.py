@@ -24,7 +24,7 @@ COMMANDS = [
     ["scenario", "new"],
 ]
 
-GROUPS = ("scenario", "set")
+GROUPS = ("scenario", "set", "log")
 
 
 def printed(*arguments: str) -> str:

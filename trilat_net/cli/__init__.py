@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 from ..errors import TrilatError
 from ..interrupt import Interrupt
-from . import changes, logs, pings, routers, scenarios, sessions, trials
+from . import changes, log, logs, pings, replays, reruns, routers, scenarios, sessions, trials
 from .options import err
 
 
@@ -50,6 +50,9 @@ app.add_typer(sessions.app)
 app.add_typer(routers.app)
 app.add_typer(pings.app)
 app.add_typer(logs.app)
+app.add_typer(replays.app)
+app.add_typer(reruns.app)
+app.add_typer(log.app, name="log")
 app.add_typer(trials.app)
 app.add_typer(scenarios.app, name="scenario")
 app.add_typer(changes.app, name="set")

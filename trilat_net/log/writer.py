@@ -13,15 +13,23 @@ from typing import Any, BinaryIO
 import msgspec
 from mcap.writer import CompressionType, Writer
 
+from ..core.tick import Output
 from ..errors import LogRefused, UsageError
 from ..net import topics
-from ..net.messages import VERSION, Event, LinkStats, State, json_schema
+from ..net.messages import VERSION, Event, LinkStats, RecorderStats, State, json_schema
 from ..scenario import Scenario
-from .accounting import Account
 from .provenance import provenance
 
 SESSION, ACCOUNTS, SCENARIO = "trilat.session", "trilat.accounts", "scenario.toml"
-SCHEMAS: dict[str, type[msgspec.Struct]] = {topics.STATE: State, topics.LINK: LinkStats, topics.EVENT: Event}
+SCHEMAS: dict[str, type[msgspec.Struct]] = {
+    topics.STATE: State,
+    topics.LINK: LinkStats,
+    topics.EVENT: Event,
+    topics.STATS: RecorderStats,
+}
+CHANNELS = (topics.STATE, topics.LINK, topics.EVENT)
+"""Channels of a site, each with a number per message that tells what is missing."""
+RECORDER_CHANNELS = (topics.EVENT, topics.STATS)
 
 _CHUNK_BYTES = 1 << 20
 _LAST_NS = (1 << 64) - 1  # of the file's time stamps; a stranger's may be anything
@@ -64,9 +72,6 @@ class LogWriter:
         driver: "live" or "virtual".
         epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
         facts: what else to say of the session.
-
-    Attributes:
-        accounts: per site the account of its records.
     """
 
     def __init__(
@@ -78,7 +83,6 @@ class LogWriter:
         epoch_unix_ns: int,
         facts: Mapping[str, str] | None = None,
     ) -> None:
-        self.accounts = {site: Account() for site in scenario.names}
         self._epoch_unix_ns = epoch_unix_ns
         self._stream = stream
         self._writer: Any = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -100,8 +104,6 @@ class LogWriter:
         )
         self._writer.add_attachment(0, 0, SCENARIO, "application/toml", scenario.text.encode())
         self._channels = self._register(scenario, session)
-        self._session = session
-        self._written = dict.fromkeys(self._channels, 0)
         stream.flush()
 
     def _register(self, scenario: Scenario, session: str) -> dict[str, int]:
@@ -113,7 +115,7 @@ class LogWriter:
         }
         channels = {}
         for member in (*scenario.names, topics.RECORDER):
-            for name in SCHEMAS if member != topics.RECORDER else (topics.EVENT,):
+            for name in CHANNELS if member != topics.RECORDER else RECORDER_CHANNELS:
                 key = topics.key(session, member, name)
                 rate = {"rate_hz": str(scenario.sites[member].rate_hz)} if name == topics.STATE else {}
                 channels[key] = self._writer.register_channel(
@@ -121,19 +123,29 @@ class LogWriter:
                 )
         return channels
 
-    def knows(self, key: str) -> bool:
-        """True where messages of this key have a channel in the file."""
-        return key in self._channels
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the messages that have a channel in the file."""
+        return tuple(self._channels)
 
-    def add(self, key: str, payload: bytes, t_ns: int, log_time_ns: int, tick: int) -> None:
-        """Writes one message that is no record of a tick.
+    def add(
+        self,
+        key: str,
+        payload: bytes,
+        t_ns: int,
+        log_time_ns: int,
+        number: int,
+        message: State | Output | LinkStats | Event | None = None,  # noqa: ARG002 - the views to come
+    ) -> None:
+        """Writes one message.
 
         Args:
-            key: its key, one that `knows` knows.
+            key: its key, one of `keys`.
             payload: its bytes.
-            t_ns: its nominal time, ns since the epoch.
+            t_ns: when it was sent, ns since the epoch.
             log_time_ns: when it arrived, Unix ns.
-            tick: its sequence number.
+            number: its sequence number.
+            message: what it says, for those who cannot read its bytes.
 
         Raises:
             LogRefused: the disk refused.
@@ -144,18 +156,10 @@ class LogWriter:
                 log_time=log_time_ns,
                 data=payload,
                 publish_time=min(max(0, self._epoch_unix_ns + t_ns), _LAST_NS),
-                sequence=max(0, tick) & 0xFFFFFFFF,
+                sequence=max(0, number) & 0xFFFFFFFF,
             )
         except OSError as error:
             raise _refused(error) from None
-        self._written[key] += 1
-
-    def add_state(self, site: str, key: str, payload: bytes, t_ns: int, log_time_ns: int, tick: int) -> bool:
-        """Writes the record of one tick and books it; False, and nothing written, where it is a duplicate."""
-        if not self.accounts[site].take(tick):
-            return False
-        self.add(key, payload, t_ns, log_time_ns, tick)
-        return True
 
     def flush(self) -> None:
         """Closes the open chunk and hands it to the operating system: a crash loses nothing before it."""
@@ -165,29 +169,14 @@ class LogWriter:
         except OSError as error:
             raise _refused(error) from None
 
-    def finish(
-        self,
-        ticks: Mapping[str, int],
-        overflowed: Mapping[str, int] | None = None,
-        counts: Mapping[str, str] | None = None,
-    ) -> None:
-        """Writes the accounts of every channel, the index and the end mark. The stream stays open.
+    def finish(self, accounts: Mapping[str, str]) -> None:
+        """Writes the accounts, the index and the end mark. The stream stays open.
 
         Args:
-            ticks: per site, how many ticks it said that it made.
-            overflowed: per key, messages that were lost before they could be written.
-            counts: what else was counted, by name.
+            accounts: per topic what arrived and what is missing; and what else was counted, by name.
         """
-        lost = dict(overflowed or {})
-        for site, count in ticks.items():
-            self.accounts[site].expect(count)
-        texts = {key: f"received {count}" for key, count in self._written.items()}
-        for site, account in self.accounts.items():
-            texts[topics.key(self._session, site, topics.STATE)] = account.as_text()
-        accounts = {f"/{key}": f"{text}, overflowed {lost.pop(key, 0)}" for key, text in texts.items()}
-        others = {"overflowed elsewhere": str(sum(lost.values()))} if lost else {}
         try:
-            self._writer.add_metadata(ACCOUNTS, {**accounts, **others, **(counts or {})})
+            self._writer.add_metadata(ACCOUNTS, dict(accounts))
             self._writer.finish()
             self._stream.flush()
         except OSError as error:

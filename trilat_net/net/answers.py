@@ -1,13 +1,14 @@
-"""What members are asked and answer, besides who they are: pings, and changes while a session runs.
+"""What members are asked and answer, besides who they are: pings, changes while a session runs, the past.
 
-Law: these pass between two and are not logged; what they change or teach is, as events.
+Law: these pass between two and are not logged; what they change or teach is, as events, and what they bring
+back, as what it was.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
-from .messages import U64, VERSION, Instant
+from .messages import U64, VERSION, Instant, TickNumber
 
 
 class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,3 +65,43 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     accepted: bool
     text: str
     tick: int = -1
+
+
+class Wanted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Messages that a recorder lacks and asks their site for.
+
+    A message's number is its tick for a record, its place from 0 for statistics and events.
+
+    Attributes:
+        v: version of this schema.
+        channel: of which channel.
+        first: number of the first one wanted.
+        last: number of the last one, the same or more.
+    """
+
+    v: int = VERSION
+    channel: Literal["state", "link", "event"]
+    first: TickNumber
+    last: TickNumber
+
+
+class Past(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a site still has of what it was asked for: consecutive messages, as they were published.
+
+    Attributes:
+        v: version of this schema.
+        member: the site.
+        boot: its process start.
+        channel: of which channel.
+        first: number of the first message here: the one asked for, or the oldest that is left.
+        payloads: the messages, at most a bounded chunk; none where there is nothing (yet, or any more).
+        made: how many messages of this channel the site has published so far.
+    """
+
+    v: int = VERSION
+    member: str
+    boot: U64
+    channel: Literal["state", "link", "event"]
+    first: TickNumber
+    payloads: list[bytes]
+    made: TickNumber

@@ -11,9 +11,9 @@ from msgspec import Meta
 
 from ..core.arm import JOINTS, PARAMETERS
 
-VERSION = 2
+VERSION = 3
 """What is sent, and all that is accepted from others."""
-READABLE = (1, 2)
+READABLE = (1, 2, 3)
 """What is read in files: every version that was released."""
 
 U64 = Annotated[int, Meta(ge=0)]
@@ -188,6 +188,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         bound_ns: how far that offset is from the truth at most, for a second from there; then it grows.
         drift_ppb: by how much the offset grows, ns/s.
         drift_bound_ppb: how far that is from the truth at most.
+        n: which event of this boot it is, from 0; -1 before version 3.
     """
 
     v: int = VERSION
@@ -210,6 +211,51 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     bound_ns: int = 0
     drift_ppb: int = 0
     drift_bound_ppb: int = 0
+    n: Annotated[int, Meta(ge=-1, lt=2**40)] = -1
+
+
+class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a recorder knows of its own work, once a second; what is counted, is since its start.
+
+    Attributes:
+        v: version of this schema.
+        boot: the recorder's process start.
+        t_ns: when, ns since the epoch, on its own clock.
+        expected: per channel (as in "m1/state") the messages that there should be by now, as far as known.
+        received: those that are in the file.
+        missing: those that are not.
+        gaps: the missing ones as ranges of numbers, "first-last", at most twenty.
+        duplicate: those that came twice, not written again.
+        reordered: those that came after a later one.
+        refilled: those that came from a site's memory, after they had been missing.
+        overflowed: those lost because the recorder's queue was full.
+        silence_us: the longest time between two of them, as they came.
+        dropped: messages that were none of the session's, by reason.
+        queued: messages that wait to be written.
+        written_bytes: size of the file.
+        flush_max_us: the longest that handing it to the operating system has taken since the last statistics.
+        mono_ns: the recorder's monotonic clock.
+        unix_ns: its wall clock at that instant.
+    """
+
+    v: int = VERSION
+    boot: U64
+    t_ns: Annotated[int, _unit("ns", "time since the session's epoch")]
+    expected: dict[str, int]
+    received: dict[str, int]
+    missing: dict[str, int]
+    gaps: dict[str, list[str]] = {}
+    duplicate: dict[str, int] = {}
+    reordered: dict[str, int] = {}
+    refilled: dict[str, int] = {}
+    overflowed: dict[str, int] = {}
+    silence_us: Annotated[dict[str, int], _unit("us", "longest time between two messages")] = {}
+    dropped: dict[str, int] = {}
+    queued: int = 0
+    written_bytes: Annotated[int, _unit("byte", "size of the file")] = 0
+    flush_max_us: Annotated[int, _unit("us", "longest flush since the last statistics")] = 0
+    mono_ns: Instant = 0
+    unix_ns: int = 0
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -227,6 +273,9 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         needs_recorder: whether it waits for a recorder.
         running: whether its session's epoch is fixed.
         ticks: how many ticks it has made.
+        epoch_mono_ns: the epoch on its clock, once it is fixed.
+        epoch_unix_ns: the epoch in Unix time.
+        boots: the members of the session and their boots.
     """
 
     v: int = VERSION
@@ -240,6 +289,9 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     needs_recorder: bool = False
     running: bool = False
     ticks: int = 0
+    epoch_mono_ns: Instant = 0
+    epoch_unix_ns: int = 0
+    boots: dict[str, int] = {}
 
 
 SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}

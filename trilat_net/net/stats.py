@@ -12,6 +12,11 @@ from .messages import VERSION, LinkStats
 PER_SECOND = 10
 
 
+def ticks_between(rate_hz: int) -> int:
+    """Returns how many ticks lie between two statistics; the first are those of tick 0."""
+    return max(1, rate_hz // PER_SECOND)
+
+
 class LoopStats:
     """Counts what a loop does, between two statistics and since the start.
 
@@ -29,7 +34,7 @@ class LoopStats:
         self._site = site
         self._boot = boot
         self._rates = rates
-        self._every = max(1, site.rate_hz // PER_SECOND)
+        self._every = ticks_between(site.rate_hz)
         self._period_us = 1_000_000 / site.rate_hz
         self._late_max_us = 0
         self._busy_max_us = 0

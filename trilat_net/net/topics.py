@@ -5,6 +5,7 @@ from typing import NamedTuple
 ROOT = "trilat"
 RECORDER = "recorder"
 STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
+PAST, STATS = "past", "stats"
 
 
 class Address(NamedTuple):

@@ -1,7 +1,7 @@
 """One start of a member: its boot, its token, and what it says of itself."""
 
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import msgspec
 
@@ -38,22 +38,30 @@ class Voice:
         bus: its connection.
         session: the session's name.
         info: what it answers when asked who it is.
+        keep: takes every event as it is published.
 
     Attributes:
         info: what it answers when asked who it is.
+        said: how many events it has published.
     """
 
-    def __init__(self, bus: Bus, session: str, info: Info) -> None:
+    def __init__(
+        self, bus: Bus, session: str, info: Info, keep: Callable[[bytes], None] = lambda _: None
+    ) -> None:
         self.info = info
+        self.said = 0
+        self._keep = keep
         self._publish = bus.publisher(topics.key(session, info.member, topics.EVENT))
         self._questions = bus.questions(topics.key(session, info.member, topics.INFO))
 
     def say(self, kind: str, text: str, **facts: object) -> Event:
-        """Publishes an event and returns it."""
-        event = msgspec.convert(
-            {"member": self.info.member, "boot": self.info.boot, "kind": kind, "text": text, **facts}, Event
-        )
-        self._publish(encode(event))
+        """Publishes an event, numbered, and returns it."""
+        own = {"member": self.info.member, "boot": self.info.boot, "n": self.said}
+        event = msgspec.convert({**own, "kind": kind, "text": text, **facts}, Event)
+        self.said += 1
+        payload = encode(event)
+        self._keep(payload)
+        self._publish(payload)
         return event
 
     def answer(self) -> None:

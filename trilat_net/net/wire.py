@@ -17,7 +17,7 @@ import msgspec
 
 from ..core.tick import Arrival, Output
 from ..errors import WireError
-from .answers import Order, Pong, Reply
+from .answers import Order, Past, Pong, Reply, Wanted
 from .messages import (
     SAMPLE_VECTORS,
     STATE_VECTORS,
@@ -25,6 +25,7 @@ from .messages import (
     Event,
     Info,
     LinkStats,
+    RecorderStats,
     Sample,
     State,
 )
@@ -36,7 +37,7 @@ MAX_INFO_BYTES = 64 * 1024 * 1024
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind)
-    for kind in (State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
+    for kind in (State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past)
 }
 _isfinite = math.isfinite
 
@@ -105,13 +106,13 @@ def encode_state(
     return packed
 
 
-def encode(message: LinkStats | Event | Info | Pong | Order | Reply) -> bytes:
+def encode(message: LinkStats | Event | Info | RecorderStats | Pong | Order | Reply | Wanted | Past) -> bytes:
     """Returns the payload of any message but a `State`."""
     packed: bytes = _pack(msgspec.structs.asdict(message))
     return packed
 
 
-M = TypeVar("M", State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
+M = TypeVar("M", State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past)
 
 
 def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:

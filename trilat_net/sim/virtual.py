@@ -13,6 +13,7 @@ from .. import collector
 from ..core.grid import NS_PER_S
 from ..core.site import Site
 from ..core.tick import Arrival, Command, Mode, Output, Tick, diverged_text, mode_text
+from ..log.accounting import Account
 from ..log.writer import LogWriter
 from ..net import topics
 from ..net.messages import Event
@@ -83,6 +84,7 @@ class _Member:
             channel: topics.key(scenario.name, site.name, channel)
             for channel in (topics.STATE, topics.LINK, topics.EVENT)
         }
+        self._accounts = {channel: Account() for channel in self._keys}
         self._mode = Mode.RUN
         self.ticks = 0
 
@@ -90,10 +92,13 @@ class _Member:
         """Writes one record, and what goes with it."""
         site, t_ns, k = self._site, output.t_ns, output.tick
         payload = encode_state(site.name, self._boot, site.peers, output, arrivals, 0, 0)
-        self._writer.add_state(site.name, self._keys[topics.STATE], payload, t_ns, t_ns, k)
+        self._accounts[topics.STATE].take(k)
+        self._writer.add(self._keys[topics.STATE], payload, t_ns, t_ns, k, output)
         self.ticks = k + 1
         if self._stats.due(k):
-            self._writer.add(self._keys[topics.LINK], encode(self._stats.take(output)), t_ns, t_ns, k)
+            stats = self._stats.take(output)
+            self._accounts[topics.LINK].take(self._accounts[topics.LINK].received)
+            self._writer.add(self._keys[topics.LINK], encode(stats), t_ns, t_ns, k, stats)
         if output.mode is not self._mode:
             self._mode = output.mode
             diverged = output.mode is Mode.DIVERGED
@@ -102,10 +107,17 @@ class _Member:
 
     def say(self, kind: str, text: str, t_ns: int) -> None:
         """Writes one event."""
+        n = self._accounts[topics.EVENT].received
         event = Event(
-            member=self._site.name, boot=self._boot, kind=kind, text=text, t_ns=t_ns, ticks=self.ticks
+            member=self._site.name, boot=self._boot, n=n, kind=kind, text=text, t_ns=t_ns, ticks=self.ticks
         )
-        self._writer.add(self._keys[topics.EVENT], encode(event), t_ns, t_ns, self.ticks - 1)
+        self._accounts[topics.EVENT].take(n)
+        self._writer.add(self._keys[topics.EVENT], encode(event), t_ns, t_ns, n, event)
+
+    def accounts(self) -> dict[str, str]:
+        """Returns the accounts of its channels, by topic."""
+        texts = {channel: account.as_text() for channel, account in self._accounts.items()}
+        return {f"/{self._keys[channel]}": f"{text}, overflowed 0" for channel, text in texts.items()}
 
 
 def record(
@@ -145,5 +157,7 @@ def record(
     finally:  # whatever ends the run leaves a file that is finished
         for name, member in members.items():
             member.say("end", f"{name} made {member.ticks} ticks", t_ns)
-        writer.finish({name: member.ticks for name, member in members.items()})
+        writer.finish(
+            {topic: text for member in members.values() for topic, text in member.accounts().items()}
+        )
     return within

@@ -1,0 +1,5 @@
+"""Commands of `trilat log`."""
+
+import typer
+
+app = typer.Typer()

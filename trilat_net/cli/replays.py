@@ -1,0 +1,5 @@
+"""Commands that play a log again."""
+
+import typer
+
+app = typer.Typer()
