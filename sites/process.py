@@ -24,12 +24,14 @@ from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.stats import LoopStats
 from trilat_net.net.timing import News, Timing
-from trilat_net.net.voice import Voice, new_boot, said
+from trilat_net.net.voice import Voice, new_boot
 from trilat_net.scenario import Scenario
 
 from . import realtime
 from .changes import Changes
 from .clocks import peers_of
+from .company import Company
+from .history import History
 from .intake import Intake
 from .loop import Ports, run_loop
 from .warming import warm_up
@@ -124,15 +126,13 @@ class Member:
             for peer in self._site.peers
         ]
         self._intake = Intake(self._site.peers, rings, rates, self._stats.dropped)
-        self._publish_state = bus.publisher(topics.key(session, name, topics.STATE))
-        self._publish_link = bus.publisher(topics.key(session, name, topics.LINK))
-        self._peer_events = [bus.inbox(topics.key(session, p, topics.EVENT), 256) for p in self._site.peers]
+        questions = bus.questions(topics.key(session, name, topics.PAST))
+        self._history = History(name, self._boot, self._site.rate_hz, questions)
+        self._publish_state = self._kept(topics.STATE)
+        self._publish_link = self._kept(topics.LINK)
+        self._company = Company(bus, session, name, self._site.peers)
         self._changes = Changes(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
         self._mode = Mode.RUN
-        self._ended_by = ""
-        self._gone: set[str] = set()
-        self._ended: set[str] = set()
-        self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         warm_up(scenario, name)
         self._voice = Voice(
             bus,
@@ -147,9 +147,20 @@ class Member:
                 fingerprint=fingerprint(),
                 needs_recorder=options.needs_recorder,
             ),
+            self._history.rings[topics.EVENT].keep,
         )
         self._joining = Joining(bus, clock, session, self._voice, scenario.names)
-        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+
+    def _kept(self, channel: str) -> Callable[[bytes], None]:
+        """Returns what publishes on a channel of this site and keeps it for a while."""
+        keep = self._history.rings[channel].keep
+        publish = self._bus.publisher(topics.key(self._options.session, self._name, channel))
+
+        def keep_and_publish(payload: bytes) -> None:
+            keep(payload)
+            publish(payload)
+
+        return keep_and_publish
 
     def live(self) -> int:
         """Joins, runs, leaves."""
@@ -157,11 +168,18 @@ class Member:
         if epoch is None:
             return self._interrupt.exit_code
         self._epoch = epoch
+        self._company.admit(epoch.boots)
         peers = peers_of(self._scenario, self._name, epoch, self._joining.pinger)
         self._timing = Timing(epoch.mono_ns, self._site.rate_hz, peers, self._scenario.names[0])
         clocks = clock_texts(self._joining.pinger, epoch.boots, epoch.mono_ns)
         self._intake.admit([epoch.boots[peer] for peer in self._site.peers], self._timing.meters)
-        self._voice.info = msgspec.structs.replace(self._voice.info, running=True)
+        self._voice.info = msgspec.structs.replace(
+            self._voice.info,
+            running=True,
+            epoch_mono_ns=epoch.mono_ns,
+            epoch_unix_ns=epoch.unix_ns,
+            boots=epoch.boots,
+        )
         obtained = realtime.prepare(self._options.cpu)
         self._voice.say(
             "setup",
@@ -180,9 +198,10 @@ class Member:
             self._publish_state,
             self._publish_link,
             self._slack,
-            lambda: self._interrupt.requested() or bool(self._ended_by),
+            lambda: self._interrupt.requested() or bool(self._company.ended_by),
             self._changes.take,
             self._tell,
+            self._history.answer,
         )
         ticks = self._scenario.ticks(self._name)
         output = run_loop(self._site, self._boot, ticks, self._stats, ports)
@@ -216,7 +235,7 @@ class Member:
         self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
         self._voice.answer()
         self._report(self._timing.settle(k + 1, self._clock.monotonic_ns()), t_ns)
-        self._watch(t_ns)
+        self._company.watch(self._voice, t_ns)
 
     def _report(self, clocks: Iterable[News], t_ns: int) -> None:
         """Says what is new of the peers' clocks."""
@@ -232,28 +251,6 @@ class Member:
             self._mode = output.mode
             self._voice.say("mode", mode_text(self._name, output), t_ns=output.t_ns, ticks=output.tick)
 
-    def _hear(self) -> None:
-        """Takes what the peers say of their own end."""
-        for peer, inbox in zip(self._site.peers, self._peer_events, strict=True):
-            for event in said(inbox):
-                if event.boot != self._epoch.boots[peer]:
-                    continue
-                if event.kind == "diverged":
-                    self._ended_by = event.text
-                elif event.kind == "end":
-                    self._ended.add(peer)
-
-    def _watch(self, t_ns: int) -> None:
-        """Notes which members are gone, and says so of those that have not said their end."""
-        self._hear()
-        while (change := self._presence.poll()) is not None:
-            where = topics.address(change[0])
-            if where is None or str(self._epoch.boots.get(where.member)) != where.boot:
-                continue
-            (self._gone.discard if change[1] else self._gone.add)(where.member)
-            if not change[1] and where.member not in self._ended:
-                self._voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
-
     def _leave(self, output: Output | None) -> int:
         """Says how the run ended, and stays until the recorder has all of it."""
         ticks = 0 if output is None else output.tick + 1
@@ -263,8 +260,9 @@ class Member:
             self._voice.say("diverged", diverged_text(self._name, output), t_ns=t_ns, ticks=ticks)
         self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
         code = self._interrupt.exit_code if self._interrupt.requested() else 0  # later signals end the wait
-        if topics.RECORDER in self._epoch.boots:
-            self._await_recorder(ticks, t_ns)
+        self._company.watch(self._voice, t_ns)
+        if topics.RECORDER in self._epoch.boots or self._company.recorders:
+            self._await_recorders(ticks, t_ns)
         dropped = ", ".join(f"{count} {reason}" for reason, count in self._stats.dropped.items())
         self._say(
             f"{self._name}: {ticks} ticks, {self._stats.overruns} of them late by a period or more"
@@ -272,22 +270,25 @@ class Member:
         )
         if output is not None and diverged:
             raise RunFailed(diverged_text(self._name, output))
-        if self._ended_by:
-            raise RunFailed(f"{self._name} ended because {self._ended_by}")
+        if self._company.ended_by:
+            raise RunFailed(f"{self._name} ended because {self._company.ended_by}")
         return code
 
-    def _await_recorder(self, ticks: int, t_ns: int) -> None:
-        """Waits for the recorder's word that it has every record, at most `LINGER_S`, while it is there."""
-        clock = self._clock
+    def _await_recorders(self, ticks: int, t_ns: int) -> None:
+        """Waits for the word of every recorder that is there that it has all that it can have.
+
+        At most `LINGER_S` after the last question of one of them, and `stay_s` after their word.
+        """
+        clock, company = self._clock, self._company
         give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-        stored = False
-        while clock.monotonic_ns() < give_up_ns and not (stored and self._interrupt.requested()):
+        while clock.monotonic_ns() < give_up_ns and not (company.stored and self._interrupt.requested()):
             self._voice.answer()
-            self._watch(t_ns)
-            if topics.RECORDER in self._gone:  # its last word may still be under way; or its process ends
-                give_up_ns = min(give_up_ns, clock.monotonic_ns() + (PARTING_NS if stored else LAST_WORD_NS))
-            for event in said(self._recorder_events):
-                if event.kind == "stored" and event.about == self._name and event.ticks >= ticks:
-                    stored = True
-                    give_up_ns = clock.monotonic_ns() + int(self._options.stay_s * 1e9)
+            while self._history.answer():
+                give_up_ns = max(give_up_ns, clock.monotonic_ns() + LINGER_S * 1_000_000_000)
+            company.watch(self._voice, t_ns)
+            if not company.recorders:  # its last word may still be under way; or its process ends
+                patience_ns = PARTING_NS if company.stored else LAST_WORD_NS
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
+            if company.hear_recorders(ticks) and company.recorders <= company.stored:
+                give_up_ns = clock.monotonic_ns() + int(self._options.stay_s * 1e9)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)

@@ -32,13 +32,16 @@ from .messages import (
 
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
-"""Most bytes of a message; those of an `Info`, which holds a whole scenario, traces and all."""
+MAX_PAST_BYTES = 2 * MAX_BYTES
+"""Most bytes of a message; of an `Info`, which holds a whole scenario, traces and all; of a `Past`, which
+holds messages."""
 
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind)
     for kind in (State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past)
 }
+_LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Past: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 
 _SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
@@ -126,7 +129,7 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
     """
-    limit = MAX_INFO_BYTES if kind is Info else MAX_BYTES
+    limit = _LIMITS.get(kind, MAX_BYTES)
     if len(payload) > limit:
         raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
     try:

@@ -1,0 +1,86 @@
+"""Who else is in the session: who has come, who is gone, and what they say of their end.
+
+Law: only the starts of members that the session began with count, but a recorder may come at any time.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.voice import Voice, said
+
+
+class Company:
+    """The other members, as one site sees them.
+
+    Args:
+        bus: the site's connection.
+        session: the session's name.
+        site: the site's name.
+        peers: its peers, in scenario order.
+
+    Attributes:
+        recorders: boots of the recorders that are there.
+        stored: boots of those that have said that they have all of this site.
+        ended_by: why a peer has ended the run for all; "" while none has.
+    """
+
+    def __init__(self, bus: Bus, session: str, site: str, peers: Sequence[str]) -> None:
+        self.recorders: set[str] = set()
+        self.stored: set[str] = set()
+        self.ended_by = ""
+        self._site = site
+        self._events = {peer: bus.inbox(topics.key(session, peer, topics.EVENT), 256) for peer in peers}
+        self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
+        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._boots: Mapping[str, int] = {}
+        self._ended: set[str] = set()
+
+    def admit(self, boots: Mapping[str, int]) -> None:
+        """Says which start of each member belongs to the session."""
+        self._boots = boots
+
+    def watch(self, voice: Voice, t_ns: int) -> None:
+        """Takes what has come, and says who has come or is gone without having said its end.
+
+        Args:
+            voice: the site's own events.
+            t_ns: nominal time, ns since the epoch.
+        """
+        self._hear()
+        while (change := self._presence.poll()) is not None:
+            where = topics.address(change[0])
+            if where is None:
+                continue
+            known = str(self._boots.get(where.member)) == where.boot
+            if where.member == topics.RECORDER:
+                (self.recorders.add if change[1] else self.recorders.discard)(where.boot)
+                if change[1] and not known:  # in the middle, or once more after another one died
+                    voice.say("back", "a recorder has come", about=where.member, t_ns=t_ns)
+            elif not known:
+                continue
+            if not change[1] and where.member not in self._ended:
+                voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
+
+    def _hear(self) -> None:
+        """Takes what the peers say of their own end."""
+        for peer, inbox in self._events.items():
+            for event in said(inbox):
+                if event.boot != self._boots.get(peer):
+                    continue
+                if event.kind == "diverged":
+                    self.ended_by = event.text
+                elif event.kind == "end":
+                    self._ended.add(peer)
+
+    def hear_recorders(self, ticks: int) -> bool:
+        """Takes what the recorders say; True where one of them just said that it has all of this site.
+
+        Args:
+            ticks: how many ticks the site has made.
+        """
+        before = len(self.stored)
+        for event in said(self._recorder_events):
+            if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:
+                self.stored.add(str(event.boot))
+        return len(self.stored) > before

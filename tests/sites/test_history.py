@@ -1,0 +1,109 @@
+"""A site's memory of what it has published: bounded, exact, and told in bounded chunks."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sites.history import CHUNK, CHUNK_BYTES, EVENTS, KEPT_S, RECORDS, History, Ring
+from trilat_net.net import topics
+from trilat_net.net.answers import Past, Wanted
+from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.messages import VERSION
+from trilat_net.net.wire import MAX_BYTES, decode, encode
+
+KEY = topics.key("t", "m1", topics.PAST)
+BOOT = 7
+
+
+class Desk:
+    """A site's memory, and somebody who asks."""
+
+    def __init__(self, rate_hz: int = 1000) -> None:
+        network = LocalNetwork()
+        self._asker = network.join()
+        self.history = History("m1", BOOT, rate_hz, network.join().questions(KEY))
+
+    def ask(self, payload: bytes) -> Inbox:
+        replies = self._asker.ask(KEY, payload)
+        while self.history.answer():
+            pass
+        return replies
+
+    def told(self, channel: str, first: int, last: int) -> Past:
+        reply = self.ask(encode(Wanted(channel=channel, first=first, last=last))).poll()  # type: ignore[arg-type]
+        assert reply is not None
+        return decode(reply[1], Past)
+
+
+@given(
+    capacity=st.integers(1, 200),
+    made=st.integers(0, 400),
+    first=st.integers(0, 500),
+    length=st.integers(1, 500),
+    size=st.integers(1, 2000),
+)
+def test_a_ring_tells_what_it_still_has_in_chunks(
+    capacity: int, made: int, first: int, length: int, size: int
+) -> None:
+    """Asked again and again from behind what it has told, it tells exactly what is left of a range."""
+    ring = Ring(capacity)
+    payloads = [str(n).zfill(size).encode() for n in range(made)]
+    for payload in payloads:
+        ring.keep(payload)
+    last, told, at = first + length - 1, [], first
+    while True:
+        begun, chunk = ring.chunk(at, last)
+        assert begun == max(at, made - capacity)
+        assert len(chunk) <= CHUNK
+        assert sum(map(len, chunk)) <= max(CHUNK_BYTES, size)
+        if not chunk:
+            break
+        told += [(begun + n, payload) for n, payload in enumerate(chunk)]
+        at = begun + len(chunk)
+    left = range(max(first, made - capacity), min(last + 1, made))
+    assert told == [(n, payloads[n]) for n in left]
+
+
+def test_every_channel_is_told_apart() -> None:
+    desk = Desk()
+    for n, ring in enumerate(desk.history.rings.values()):
+        for m in range(n + 2):
+            ring.keep(b"%d %d" % (n, m))
+    for n, channel in enumerate(desk.history.rings):
+        past = desk.told(channel, 1, 9)
+        assert (past.member, past.boot, past.channel) == ("m1", BOOT, channel)
+        assert (past.first, past.made) == (1, n + 2)
+        assert past.payloads == [b"%d %d" % (n, m) for m in range(1, n + 2)]
+
+
+def test_memory_holds_a_minute_and_no_more() -> None:
+    rings = Desk(1000).history.rings
+    for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS), strict=True):
+        for _ in range(capacity + 5):
+            ring.keep(b"x")
+        assert ring.chunk(0, 10)[0] == 5
+    assert Desk(20_000).history.rings[topics.STATE].chunk(0, 0)[0] == 0
+    fast = Desk(20_000).history.rings[topics.STATE]
+    for _ in range(RECORDS + 1):
+        fast.keep(b"x")
+    assert fast.chunk(0, 10)[0] == 1
+
+
+def test_the_largest_messages_fit_an_answer() -> None:
+    """One message is always told, however large it is."""
+    desk = Desk()
+    for _ in range(3):
+        desk.history.rings[topics.EVENT].keep(b"x" * MAX_BYTES)
+    assert [len(payload) for payload in desk.told(topics.EVENT, 0, 9).payloads] == [MAX_BYTES]
+
+
+def test_nobody_is_answered_who_does_not_ask_properly() -> None:
+    desk = Desk()
+    good = Wanted(channel="state", first=0, last=3)
+    for payload in (
+        b"",
+        b"\xff",
+        encode(good)[:-1],
+        encode(Wanted(v=VERSION + 1, channel="state", first=0, last=0)),
+    ):
+        assert desk.ask(payload).poll() is None
+    assert desk.ask(encode(good)).poll() is not None
