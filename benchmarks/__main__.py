@@ -2,10 +2,15 @@
 
 import sys
 
-from . import clocks, links, machine, presets, tick, virtual
+from . import clocks, endurance, links, machine, presets, stalls, tick, virtual
 
 BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run}
-LONG = {"clocks": clocks.run, "presets": presets.run}
+LONG = {
+    "clocks": clocks.run,
+    "presets": presets.run,
+    "stalls": stalls.run,
+    "endurance": endurance.run,
+}
 """Only when they are named."""
 
 

@@ -1,0 +1,100 @@
+"""Who else is there: starts of other sessions do not count, but a recorder may come at any time."""
+
+from collections.abc import Sequence
+
+from sites.company import Company
+from trilat_net.net import topics
+from trilat_net.net.bus import LocalBus, LocalNetwork
+from trilat_net.net.messages import Event, Info
+from trilat_net.net.voice import Voice, said, token
+from trilat_net.net.wire import encode
+
+BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
+
+
+class Desk:
+    """The site m1, its company, and what it says of it."""
+
+    def __init__(self) -> None:
+        self.network = LocalNetwork()
+        self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
+        bus = self.network.join()
+        info = Info(member="m1", boot=1, scenario_sha256="", scenario="", host="", clock="", fingerprint="")
+        self._voice = Voice(bus, "t", info)
+        self.company = Company(bus, "t", "m1", ("m2", "s"))
+        self.company.admit(BOOTS)
+
+    def comes(self, member: str, boot: int) -> LocalBus:
+        bus = self.network.join()
+        bus.announce(token("t", member, boot))
+        return bus
+
+    def says(self, member: str, boot: int, kind: str, about: str = "", ticks: int = 0) -> None:
+        event = Event(member=member, boot=boot, kind=kind, text=f"{member} {kind}", about=about, ticks=ticks)
+        self.network.join().publisher(topics.key("t", member, topics.EVENT))(encode(event))
+
+    def told(self) -> Sequence[tuple[str, str]]:
+        self.company.watch(self._voice, 0)
+        return [(event.kind, event.about) for event in said(self._heard)]
+
+
+def test_a_peer_that_goes_without_a_word_is_lost() -> None:
+    desk = Desk()
+    bus = desk.comes("m2", 2)
+    assert desk.told() == []
+    bus.close()
+    assert desk.told() == [("lost", "m2")]
+
+
+def test_a_peer_that_has_said_its_end_may_go() -> None:
+    desk = Desk()
+    bus = desk.comes("m2", 2)
+    desk.says("m2", 2, "end")
+    bus.close()
+    assert desk.told() == []
+
+
+def test_other_starts_of_a_peer_are_nobody() -> None:
+    desk = Desk()
+    desk.comes("m2", 22).close()
+    desk.says("m2", 22, "diverged")
+    assert desk.told() == []
+    assert desk.company.ended_by == ""
+
+
+def test_a_peer_that_diverged_ends_the_run() -> None:
+    desk = Desk()
+    desk.says("s", 3, "diverged")
+    desk.told()
+    assert desk.company.ended_by == "s diverged"
+
+
+def test_the_recorder_of_the_beginning_is_no_news() -> None:
+    desk = Desk()
+    desk.comes(topics.RECORDER, 9)
+    assert desk.told() == []
+    assert desk.company.recorders == {"9"}
+
+
+def test_a_recorder_that_comes_later_is_told_of_and_counted_in() -> None:
+    desk = Desk()
+    first = desk.comes(topics.RECORDER, 9)
+    desk.told()
+    first.close()
+    assert desk.told() == [("lost", topics.RECORDER)]
+    assert desk.company.recorders == set()
+    desk.comes(topics.RECORDER, 10)
+    assert desk.told() == [("back", topics.RECORDER)]
+    assert desk.company.recorders == {"10"}
+
+
+def test_a_recorder_has_all_of_a_site_when_it_says_so_of_all_its_ticks() -> None:
+    desk = Desk()
+    desk.says(topics.RECORDER, 9, "stored", about="m1", ticks=4)
+    desk.says(topics.RECORDER, 9, "stored", about="m2", ticks=5)
+    assert not desk.company.hear_recorders(5)
+    desk.says(topics.RECORDER, 10, "stored", about="m1", ticks=5)
+    assert desk.company.hear_recorders(5)
+    assert desk.company.stored == {"10"}
+    desk.says(topics.RECORDER, 10, "stored", about="m1", ticks=5)
+    assert not desk.company.hear_recorders(5)
