@@ -21,7 +21,7 @@ STALL_S = 3.0
 
 def run() -> list[str]:
     print(
-        f"{PAIRS} pairs of runs of {DURATION_S} s, in one of each the recorder stands still for {STALL_S:g} s:"
+        f"{PAIRS} pairs of runs of {DURATION_S} s, in one of each the recorder stands still for {STALL_S:g} s"
     )
     ratios = []
     for pair in range(PAIRS):
