@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from pathlib import Path
 
+from trilat_net import collector
 from trilat_net.errors import RunFailed
 from trilat_net.interrupt import Interrupt
+from trilat_net.log.parts import Storage
 from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection, open_bus
 from trilat_net.net.voice import new_boot
@@ -17,7 +18,7 @@ from .recorder import Recorder
 
 def record_session(
     session: str,
-    path: Path,
+    storage: Storage,
     connection: Connection,
     join_timeout_s: float | None,
     clock: Clock,
@@ -28,7 +29,7 @@ def record_session(
 
     Args:
         session: the session's name.
-        path: where the log goes; must not exist.
+        storage: where the log goes.
         connection: how it takes part in the network; without endpoints to connect to it asks the session's
             first site, on this machine.
         join_timeout_s: how long to wait for the session to begin, s, or None.
@@ -58,7 +59,8 @@ def record_session(
         if bus is None:
             return interrupt.exit_code
         stack.callback(bus.close)
-        recorder = Recorder(bus, clock, session, boot, path, interrupt.requested, say)
+        recorder = Recorder(bus, clock, session, boot, storage, interrupt.requested, say)
+        collector.settle()  # in a session its pauses would be time that a crash can lose
         epoch = recorder.join(join_timeout_s)
         if epoch is None:
             say("recorder: ended before the session began; nothing was written")

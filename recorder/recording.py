@@ -1,23 +1,25 @@
 """What the recorder writes, and what it knows is missing.
 
-Law: a message is written byte for byte as it came, if it is a message of this session; whatever is not is
-counted by reason. The recorder says `stored` to a site when it has every record that the site made.
+Law: a message is written byte for byte as it came, once, if it is a message of this session; whatever is not
+is counted by reason. The recorder says `stored` to a site when it has all of it that can be had.
 """
 
 from collections import Counter
-from typing import BinaryIO
+from collections.abc import Mapping
+from typing import Protocol
 
 from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account
-from trilat_net.log.writer import LogWriter
 from trilat_net.net import topics
-from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.net.bus import Bus
+from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
 from trilat_net.net.session import Epoch
-from trilat_net.net.stats import ticks_between
 from trilat_net.net.voice import Voice
-from trilat_net.net.wire import decode, encode
+from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 
+from .filling import Filling
+from .sender import Message, Sender
 from .tap import Arrived, Tap
 
 SETTLE_NS = 1_000_000_000
@@ -28,78 +30,157 @@ LAST_NS = 6_000_000_000
 """How long after the last tick that is due there may still be a site: it stays for 5 s at most."""
 
 
+class Writer(Protocol):
+    """Where a recording goes: `log.writer.LogWriter`, and whatever stands in for it."""
+
+    def add(
+        self,
+        key: str,
+        payload: bytes,
+        t_ns: int,
+        log_time_ns: int,
+        number: int,
+        message: State | LinkStats | Event | None = None,
+    ) -> None:
+        """Writes one message."""
+
+    def flush(self) -> None:
+        """Hands everything so far to the operating system."""
+
+    def finish(self, accounts: Mapping[str, str]) -> None:
+        """Writes the accounts and the end mark."""
+
+
 class Recording:
-    """One file and its accounts.
+    """One log and its accounts.
 
     Args:
-        stream: the file, opened for writing.
+        writer: the log, begun.
         scenario: the scenario of the session.
         session: the session's name.
         epoch: its tick 0, and who its members are.
-        voice: the recorder's own events.
+        bus: the connection, over which sites are asked for what is missing.
+        voice: the recorder's own events; it keeps them in the same tap as what comes from others.
+
+    Attributes:
+        dropped: messages that were none of the session's, by reason.
+        accounts: of every channel, by its key.
     """
 
     def __init__(
-        self, stream: BinaryIO, scenario: Scenario, session: str, epoch: Epoch, voice: Voice
+        self, writer: Writer, scenario: Scenario, session: str, epoch: Epoch, bus: Bus, voice: Voice
     ) -> None:
-        self._writer = LogWriter(stream, scenario, session, "live", epoch.unix_ns)
-        self._scenario, self._session, self._epoch, self._voice = scenario, session, epoch, voice
-        self._ends: dict[str, int] = {}
+        self.dropped: Counter[str] = Counter()
+        self._writer = writer
+        self._session, self._epoch, self._voice = session, epoch, voice
+        self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
+        self._senders = {name: Sender(scenario, name, epoch.boots.get(name)) for name in scenario.names}
+        self._fillings = {
+            name: Filling(bus, session, sender, self.dropped, epoch.mono_ns)
+            for name, sender in self._senders.items()
+        }
+        self._places = {
+            topics.key(session, name, channel): (sender, channel)
+            for name, sender in self._senders.items()
+            for channel in sender.accounts
+        }
+        self._own = {
+            topics.key(session, topics.RECORDER, channel): Account()
+            for channel in (topics.EVENT, topics.STATS)
+        }
+        self.accounts = {
+            key: sender.accounts[channel] for key, (sender, channel) in self._places.items()
+        } | self._own
         self._stored: set[str] = set()
         self._gone: set[str] = set()
         self._gone_since_ns: dict[str, int] = {}
-        self._accounts = {key: Account() for key in self._writer.keys}
         self._overflowed = 0
-        self.dropped: Counter[str] = Counter()
+
+    def late(self, now_ns: int) -> None:
+        """Says that the recorder came into a session that was running, and asks every site for its past.
+
+        Args:
+            now_ns: the time.
+        """
+        at_ns = now_ns - self._epoch.mono_ns
+        there = [name for name in self._senders if name not in self._gone]
+        self._voice.say(
+            "late",
+            f"the recorder joins at t = {at_ns / 1e9:.3f} s; what was before is asked of {', '.join(there)}",
+            t_ns=at_ns,
+        )
+        for name in self._gone:
+            self._voice.say("lost", f"{name} is gone", about=name, t_ns=at_ns)
+        for filling in self._fillings.values():
+            filling.probe()
+
+    def away(self) -> None:
+        """Takes every site as gone until its token says otherwise."""
+        self._gone = set(self._senders)
 
     def write(self, tap: Tap, now_ns: int) -> None:
-        """Writes what has come in, and answers sites whose records are complete."""
-        for arrived in tap.drain():
+        """Writes what has come in, asks for what is missing, and answers sites of which all is here."""
+        self._drain(tap, now_ns)
+        log_time_ns = self._epoch.unix_ns + now_ns - self._epoch.mono_ns
+        for name, filling in self._fillings.items():
+            for filled in filling.poll(now_ns, alive=name not in self._gone):
+                key = topics.key(self._session, name, filled.channel)
+                sent_ns = max(filled.message.t_ns, 0)  # what was said before the epoch bears no time
+                self._add(key, filled.payload, filled.message, sent_ns, log_time_ns)
+        for name, sender in self._senders.items():
+            if name not in self._stored and sender.full:
+                self._stored.add(name)
+                self._say_stored(sender, now_ns)
+
+    def _drain(self, tap: Tap, until_ns: int | None) -> None:
+        for arrived in tap.drain(until_ns):
             try:
                 self._take(arrived)
             except WireError as error:
                 self.dropped[error.reason] += 1
-        for site, ticks in self._ends.items():
-            if site not in self._stored and self._account(site).received >= ticks:
-                self._stored.add(site)
-                self._say("stored", f"every record of {site} is stored", now_ns, about=site, ticks=ticks)
 
     def _take(self, arrived: Arrived) -> None:
-        where = topics.address(arrived.key)
-        if where is None or where.member not in self._scenario.sites:
-            raise WireError("stranger", arrived.key)
-        boot = self._epoch.boots.get(where.member)
-        log_time_ns = self._epoch.unix_ns + arrived.mono_ns - self._epoch.mono_ns
-        if where.channel == topics.STATE:
-            state = decode(arrived.payload, State)
-            _belongs(state.site == where.member and state.boot == boot, arrived.key)
-            if self._accounts[arrived.key].take(state.tick):
-                self._writer.add(arrived.key, arrived.payload, state.sent_ns, log_time_ns, state.tick, state)
-        elif where.channel == topics.LINK:
-            stats = decode(arrived.payload, LinkStats)
-            _belongs(stats.site == where.member and stats.boot == boot, arrived.key)
-            every = ticks_between(self._scenario.sites[where.member].rate_hz)
-            if self._accounts[arrived.key].take(stats.tick // every):
-                self._writer.add(arrived.key, arrived.payload, stats.t_ns, log_time_ns, stats.tick, stats)
+        place = self._places.get(arrived.key)
+        since_ns = arrived.mono_ns - self._epoch.mono_ns
+        log_time_ns = self._epoch.unix_ns + since_ns
+        if place is None:
+            if self.accounts.get(arrived.key) is None:
+                raise WireError("stranger", arrived.key)
+            self._take_own(arrived, since_ns, log_time_ns)
+            return
+        sender, channel = place
+        message = sender.read(channel, arrived.payload)
+        if sender.take(channel, message, arrived.mono_ns):
+            t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
+            self._add(arrived.key, arrived.payload, message, t_ns, log_time_ns)
+
+    def _take_own(self, arrived: Arrived, since_ns: int, log_time_ns: int) -> None:
+        """Takes what this recorder says itself."""
+        account, own = self._own[arrived.key], self._voice.info.boot
+        if arrived.key.endswith(topics.STATS):
+            stats = decode(arrived.payload, RecorderStats)
+            boot, number, content = stats.boot, account.expected, None
         else:
             event = decode(arrived.payload, Event)
-            _belongs(event.member == where.member and event.boot == boot, arrived.key)
-            t_ns = event.t_ns if event.t_ns >= 0 else log_time_ns - self._epoch.unix_ns
-            if event.n < 0 or self._accounts[arrived.key].take(event.n):
-                self._writer.add(arrived.key, arrived.payload, t_ns, log_time_ns, event.n, event)
-            if event.kind == "end":
-                self._ends[where.member] = event.ticks
+            if event.member != topics.RECORDER:
+                raise WireError("stranger", arrived.key)
+            boot, number, content = event.boot, event.n, event
+        if boot != own:
+            raise WireError("another recorder", arrived.key)
+        if number >= 0 and account.take(number, arrived.mono_ns):
+            self._writer.add(arrived.key, arrived.payload, since_ns, log_time_ns, number, content)
 
-    def _say(self, kind: str, text: str, now_ns: int, **facts: object) -> None:
-        """Publishes an event of the recorder's own, and writes it."""
-        t_ns = now_ns - self._epoch.mono_ns
-        event = self._voice.say(kind, text, t_ns=t_ns, **facts)
-        key = topics.key(self._session, topics.RECORDER, topics.EVENT)
-        self._accounts[key].take(event.n)
-        self._writer.add(key, encode(event), t_ns, self._epoch.unix_ns + t_ns, event.n, event)
+    def _add(self, key: str, payload: bytes, message: Message, t_ns: int, log_time_ns: int) -> None:
+        self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
 
-    def _account(self, site: str) -> Account:
-        return self._accounts[topics.key(self._session, site, topics.STATE)]
+    def _say_stored(self, sender: Sender, now_ns: int) -> None:
+        shortage = sender.shortage()
+        text = f"every record of {sender.name} is stored"
+        if shortage:
+            text = f"all that can be had of {sender.name} is stored; missing for good: {shortage}"
+        self._voice.say(
+            "stored", text, t_ns=now_ns - self._epoch.mono_ns, about=sender.name, ticks=sender.made
+        )
 
     def presence(self, key: str, alive: bool) -> None:
         """Takes note of a member's token that appeared or disappeared."""
@@ -109,8 +190,8 @@ class Recording:
         (self._gone.discard if alive else self._gone.add)(where.member)
 
     def over(self, now_ns: int) -> bool:
-        """True once every site has ended with all its records here, or is gone for good."""
-        left = [self._left(site, now_ns) for site in self._scenario.names]
+        """True once all that can be had of every site is here, or the site is gone for good."""
+        left = [self._left(name, now_ns) for name in self._senders]
         return all(left)
 
     def _left(self, site: str, now_ns: int) -> bool:
@@ -122,9 +203,8 @@ class Recording:
             return False
         since_ns = self._gone_since_ns.setdefault(site, now_ns)
         patience_ns = SETTLE_NS
-        if site not in self._ends:
-            end_ns = self._epoch.mono_ns + round(self._scenario.duration_s * 1e9) + LAST_NS
-            patience_ns = max(SETTLE_NS, min(AWAY_NS, end_ns - since_ns))
+        if self._senders[site].made is None:
+            patience_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
         return now_ns - since_ns > patience_ns
 
     def flush(self) -> None:
@@ -133,34 +213,33 @@ class Recording:
 
     def finish(self, tap: Tap) -> None:
         """Writes the rest, the accounts and the end mark."""
-        for arrived in tap.drain():
-            try:
-                self._take(arrived)
-            except WireError as error:
-                self.dropped[error.reason] += 1
+        self._drain(tap, None)
         self._overflowed = sum(tap.overflowed.values())
+        self._writer.finish(self.account_texts(tap))
+
+    def account_texts(self, tap: Tap) -> dict[str, str]:
+        """Returns the accounts as the file holds them: per topic, and what was dropped, by reason."""
         counts = {f"dropped: {reason}": str(count) for reason, count in self.dropped.items() if count}
-        for site, ticks in self._ends.items():
-            self._account(site).expect(ticks)
         texts = {
             f"/{key}": f"{account.as_text()}, overflowed {tap.overflowed[key]}"
-            for key, account in self._accounts.items()
+            for key, account in self.accounts.items()
         }
-        self._writer.finish({**texts, **counts})
+        return {**texts, **counts}
 
     def summary(self) -> list[str]:
         """Returns what was recorded, a line per site, for people."""
         lines = []
-        for site in self._scenario.names:
-            account = self._account(site)
-            made = self._ends.get(site)
+        for name, sender in self._senders.items():
+            account = sender.accounts[topics.STATE]
+            made = sender.made
             of = f" of {made} records" if made is not None else " records of a number that it never said"
             lines.append(
-                f"recorder: {site}: {account.received}{of}, {account.missing} missing, "
+                f"recorder: {name}: {account.received}{of}, {account.missing} missing, "
                 f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
+                + (f", {account.refilled} from its memory" if account.refilled else "")
             )
         if self._overflowed:
-            lines.append(f"recorder: {self._overflowed} messages lost because the queue was full")
+            lines.append(f"recorder: {self._overflowed} messages turned away because the queue was full")
         for reason, count in self.dropped.items():
             if count:
                 lines.append(f"recorder: {count} messages dropped: {reason}")
@@ -168,16 +247,9 @@ class Recording:
 
     def problem(self) -> str | None:
         """Says what is missing, or None where everything is there."""
-        for site in self._scenario.names:
-            account = self._account(site)
-            if site not in self._ends:
-                return f"{site} disappeared after {account.received} records"
-            if account.missing:
-                return f"{account.missing} of {self._ends[site]} records of {site} are missing"
+        for name, sender in self._senders.items():
+            if sender.made is None:
+                return f"{name} disappeared after {sender.accounts[topics.STATE].received} records"
+            if sender.shortage():
+                return f"missing of {name}: {sender.shortage()}"
         return None
-
-
-def _belongs(right: bool, key: str) -> None:
-    """Refuses a message whose sender is not the member that its key names."""
-    if not right:
-        raise WireError("stranger", key)

@@ -38,6 +38,10 @@ class Tap:
         self._queue: deque[Arrived] = deque()
         self.overflowed: Counter[str] = Counter()
 
+    def __len__(self) -> int:
+        """Returns how many wait."""
+        return len(self._queue)
+
     def take(self, key: str, payload: bytes) -> None:
         """Takes one message; called by the bus."""
         if len(self._queue) >= CAPACITY:
@@ -45,7 +49,12 @@ class Tap:
             return
         self._queue.append(Arrived(key, payload, self._clock.monotonic_ns()))
 
-    def drain(self) -> Iterator[Arrived]:
-        """Yields what waits, oldest first."""
-        while self._queue:
-            yield self._queue.popleft()
+    def drain(self, until_ns: int | None = None) -> Iterator[Arrived]:
+        """Yields what waits, oldest first.
+
+        Args:
+            until_ns: what came after this instant waits on; None for all.
+        """
+        queue = self._queue
+        while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
+            yield queue.popleft()

@@ -137,7 +137,7 @@ def _start(
     connect = [word for endpoint in endpoints for word in ("--connect", endpoint)]
     log = str(folder / "run.mcap")
     Path(log).unlink(missing_ok=True)  # an earlier run's, in a folder that may be replaced
-    arguments = ["record", "--session", session, *connect, "-o", log, "--join-timeout", "60"]
+    arguments = ["record", "--session", session, *connect, "-o", log, "--join-timeout", "60", "--force"]
     return children, _Child(topics.RECORDER, arguments, printed)
 
 

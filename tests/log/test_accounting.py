@@ -1,5 +1,7 @@
 """The account of a channel, against the set of ticks that came."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,26 +38,76 @@ def test_an_account_is_what_the_set_of_ticks_says(stream: list[int], ticks: int)
     assert account.last == max(ticks - 1, newest)
 
 
-@given(stream=streams, most=st.integers(1, 4))
-def test_gaps_are_bounded_and_missing_is_never_too_small(stream: list[int], most: int) -> None:
+@given(stream=streams, ticks=st.integers(0, 70), most=st.integers(1, 4))
+def test_gaps_are_bounded_and_missing_is_exact_all_the_same(stream: list[int], ticks: int, most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accounting, "MAX_GAPS", most)
-        account, came = Account(), set[int]()
-        newest = -1
+        account, taken = Account(), set[int]()
         for tick in stream:
-            if tick > newest:  # in order: a tick that comes late may split a gap
-                account.take(tick)
-                came.add(tick)
-                newest = tick
+            if account.take(tick):
+                assert tick not in taken
+                taken.add(tick)
+        account.expect(ticks)
         assert len(account.gaps) <= most
-        assert account.missing >= newest + 1 - len(came)
+        assert account.received == len(taken)
+        assert account.missing == max([ticks - 1, *stream], default=-1) + 1 - len(taken)
+        assert account.received + account.duplicate == len(stream)
+
+
+@given(
+    stream=st.lists(st.tuples(st.sampled_from(["came", "from memory"]), st.integers(0, 40)), max_size=80),
+    hopeless=st.integers(0, 50),
+)
+def test_what_comes_from_memory_is_there_once_and_is_no_disorder(
+    stream: list[tuple[str, int]], hopeless: int
+) -> None:
+    account, there, newest, reordered, refilled, duplicate = Account(), set[int](), -1, 0, 0, 0
+    for how, number in stream:
+        new = number not in there
+        if how == "came":
+            reordered += new and number < newest
+            duplicate += not new
+            newest = max(newest, number)
+        else:
+            refilled += new
+        assert (account.take if how == "came" else account.refill)(number) == new
+        there.add(number)
+    account.give_up(hopeless)
+    assert (account.received, account.refilled) == (len(there), refilled)
+    assert (account.reordered, account.duplicate) == (reordered, duplicate)
+    missing = sorted(set(range(account.expected)) - there)
+    for start in range(0, 52, 3):
+        wanted = [number for number in missing if number >= max(start, hopeless)]
+        gap = account.wanted(start)
+        assert (gap[0] if gap else None) == (wanted[0] if wanted else None)
+    assert account.missing == len(missing)
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30).map(sorted), st.booleans())
+def test_the_longest_silence_is_the_longest_time_between_two_that_came(came: list[int], again: bool) -> None:
+    account = Account()
+    for number, at_ns in enumerate(came):
+        account.take(0 if again else number, at_ns)
+        account.refill(number + 5)
+    assert account.silence_ns == max((b - a for a, b in pairwise(came)), default=0)
 
 
 def test_an_account_reads_as_one_line() -> None:
     account = Account()
     for tick in (0, 1, 5, 3, 3):
-        account.take(tick)
+        account.take(tick, tick * 1_000_000)
+    account.refill(4)
     account.expect(10)
     assert account.as_text() == (
-        "received 4, missing 6, duplicate 1, reordered 1, largest gap 4 (2-2 4-4 6-9)"
+        "expected 10, received 5, missing 5, duplicate 1, reordered 1, refilled 1, "
+        "largest gap 4 (2-2 6-9), longest silence 4.0 ms"
+    )
+
+
+def test_of_very_many_gaps_the_first_are_named() -> None:
+    account = Account()
+    for tick in range(0, 1000, 2):
+        account.take(tick)
+    assert account.as_text().endswith(
+        "largest gap 1 (" + " ".join(f"{n}-{n}" for n in range(1, 40, 2)) + " ...)"
     )

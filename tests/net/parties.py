@@ -52,7 +52,13 @@ class Member:
         if self.epoch is None:
             self.epoch = self.joining.poll()
             if self.epoch is not None:
-                self.voice.info = msgspec.structs.replace(self.info, running=True)
+                self.voice.info = msgspec.structs.replace(
+                    self.info,
+                    running=True,
+                    epoch_mono_ns=self.epoch.mono_ns,
+                    epoch_unix_ns=self.epoch.unix_ns,
+                    boots=self.epoch.boots,
+                )
         else:
             self.voice.answer()
 

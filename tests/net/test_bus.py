@@ -88,6 +88,22 @@ def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> N
     assert heard == [("t/a", number) for number in NUMBERS]
 
 
+def test_a_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tuple[Bus, Bus]) -> None:
+    """Several times what a connection holds; who takes it is slower."""
+    sender, receiver = pair
+    heard: list[bytes] = []
+    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a", patient=True)
+    receiver.tap("t/a", lambda _, payload: heard.append(payload))
+    opened(publish, inbox)
+    until(lambda: heard and heard[-1] == b"last probe")
+    heard.clear()
+    said = [n.to_bytes(2, "big") * 500 for n in range(6000)]
+    for payload in said:
+        publish(payload)
+    until(lambda: len(heard) >= len(said), 30.0)
+    assert heard == said
+
+
 def test_a_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     small, large, publish = receiver.inbox("t/a", 16), receiver.inbox("t/a"), sender.publisher("t/a")

@@ -256,7 +256,7 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
     assert len({epoch.boots["m1"] for epoch in epochs}) == 1
 
 
-@pytest.mark.parametrize("name", [*SITES, RECORDER])
+@pytest.mark.parametrize("name", SITES)
 def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(name: str) -> None:
     session = party(*SITES)
     epoch = session.agreed()

@@ -10,101 +10,34 @@ from mcap.reader import make_reader
 
 from recorder import tap as tap_module
 from recorder.recorder import Recorder
-from recorder.recording import AWAY_NS, LAST_NS, SETTLE_NS, Recording
-from recorder.tap import Tap
+from recorder.recording import AWAY_NS, LAST_NS, SETTLE_NS
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site import Site
 from trilat_net.core.tick import Tick
 from trilat_net.errors import UsageError
 from trilat_net.experiment import verify
-from trilat_net.log.reader import Log, open_log
+from trilat_net.log.parts import Storage
+from trilat_net.log.reader import open_log
 from trilat_net.net import topics
-from trilat_net.net.bus import Inbox, LocalNetwork
-from trilat_net.net.clock import ManualClock
-from trilat_net.net.session import Epoch
-from trilat_net.net.stats import LoopStats
-from trilat_net.net.voice import Voice
-from trilat_net.net.wire import Event, Info, decode, encode, encode_state
-from trilat_net.scenario import Scenario, load
+from trilat_net.net.bus import LocalNetwork
+from trilat_net.net.wire import Event, encode, encode_state
+from trilat_net.scenario import load
 
-SESSION = "t"
-MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
-BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
-EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
-SCENARIO = load("two_sites", {"duration_s": 0.05})
-TICKS = SCENARIO.ticks("m")
-
-
-def states(name: str, boot: int | None = None) -> list[bytes]:
-    """The records of a site that hears nobody."""
-    site = Site(SCENARIO.setup(name))
-    boot = BOOTS[name] if boot is None else boot
-    return [encode_state(name, boot, site.peers, site.step(Tick(k)), [], 0, 0) for k in range(TICKS)]
-
-
-def statistics(name: str) -> bytes:
-    site = Site(SCENARIO.setup(name))
-    return encode(LoopStats(site, BOOTS[name], [1000]).take(site.step(Tick(0))))
-
-
-def end(name: str, ticks: int = TICKS, boot: int | None = None) -> bytes:
-    boot = BOOTS[name] if boot is None else boot
-    return encode(Event(member=name, boot=boot, kind="end", text="done", t_ns=50_000_000, ticks=ticks))
-
-
-class Desk:
-    """A recording into memory, with a clock that the test moves."""
-
-    def __init__(self, scenario: Scenario = SCENARIO) -> None:
-        self.clock = ManualClock(MONO_NS)
-        network = LocalNetwork()
-        bus, listener = network.join(), network.join()
-        self._heard: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.EVENT))
-        info = Info(
-            member=topics.RECORDER,
-            boot=BOOTS[topics.RECORDER],
-            scenario_sha256="",
-            scenario="",
-            host="h",
-            clock="c",
-            fingerprint="f",
-        )
-        self.stream = io.BytesIO()
-        self.tap = Tap(self.clock)
-        self.recording = Recording(self.stream, scenario, SESSION, EPOCH, Voice(bus, SESSION, info))
-
-    def take(self, name: str, channel: str, *payloads: bytes) -> None:
-        """Messages come in, a millisecond after each other, and are written."""
-        for payload in payloads:
-            self.clock.sleep_until(self.clock.monotonic_ns() + 1_000_000)
-            self.tap.take(topics.key(SESSION, name, channel), payload)
-        self.write()
-
-    def write(self) -> None:
-        self.recording.write(self.tap, self.clock.monotonic_ns())
-
-    def whole(self, *names: str) -> None:
-        """Sites that send every record and say so."""
-        for name in names:
-            self.take(name, topics.STATE, *states(name))
-            self.take(name, topics.EVENT, end(name))
-
-    def over(self) -> bool:
-        return self.recording.over(self.clock.monotonic_ns())
-
-    def stored(self) -> list[tuple[str, int]]:
-        """What the recorder said it has: (site, ticks)."""
-        heard = []
-        while (message := self._heard.poll()) is not None:
-            event = decode(message[1], Event)
-            assert event.kind == "stored"
-            heard.append((event.about, event.ticks))
-        return heard
-
-    def log(self) -> Log:
-        self.recording.finish(self.tap)
-        self.stream.seek(0)
-        return open_log(self.stream)
+from .desk import (
+    BOOTS,
+    EPOCH,
+    MONO_NS,
+    SCENARIO,
+    SESSION,
+    TICKS,
+    UNIX_NS,
+    Desk,
+    end,
+    happening,
+    states,
+    statistics,
+    told,
+)
 
 
 def test_payloads_stand_in_the_file_byte_for_byte() -> None:
@@ -201,10 +134,11 @@ def test_gaps_are_counted_named_and_a_problem() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], *records[31:-2])
+    desk.take("m", topics.LINK, statistics("m"))
     desk.take("m", topics.EVENT, end("m"))
     desk.whole("s")
     log = desk.log()
-    assert desk.recording.problem() == f"6 of {TICKS} records of m are missing"
+    assert desk.recording.problem() == f"missing of m: 6 of {TICKS} records (10-12 30-30 48-49)"
     assert "missing 6" in log.account("m")
     assert "largest gap 3" in log.account("m")
     assert f"(10-12 30-30 {TICKS - 2}-{TICKS - 1})" in log.account("m")
@@ -215,6 +149,7 @@ def test_reordered_records_are_no_gap() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:5], records[6], records[5], *records[7:])
+    desk.take("m", topics.LINK, statistics("m"))
     desk.take("m", topics.EVENT, end("m"))
     desk.whole("s")
     assert desk.stored() == [("m", TICKS), ("s", TICKS)]
@@ -237,9 +172,12 @@ def test_stored_is_said_only_when_every_record_is_in() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:-1])
-    desk.take("m", topics.EVENT, end("m"))
+    desk.take("m", topics.EVENT, happening("m", 0), end("m", n=2))
     assert desk.stored() == []
     desk.take("m", topics.STATE, records[-1])
+    desk.take("m", topics.EVENT, happening("m", 1))
+    assert desk.stored() == []
+    desk.take("m", topics.LINK, statistics("m"))
     assert desk.stored() == [("m", TICKS)]
     desk.write()
     assert desk.stored() == []
@@ -354,19 +292,11 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
             clock,
             SESSION,
             BOOTS[topics.RECORDER],
-            path,
+            Storage(path),
             lambda: clock.monotonic_ns() > stop_ns,
             str,
         )
-        site = Info(
-            member="m",
-            boot=BOOTS["m"],
-            scenario_sha256=SCENARIO.sha256,
-            scenario=SCENARIO.text,
-            host="h",
-            clock="c",
-            fingerprint="f",
-        )
+        site = told("m")
         recorder._joining.meeting.met["x"] = msgspec.structs.replace(
             site, member="x", boot=5, scenario="garbage"
         )
@@ -402,3 +332,45 @@ def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"run\.mcap: exists; choose another name"):
         recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
+
+
+def after_the_end() -> bytes:
+    site = Site(SCENARIO.setup("m"))
+    return encode_state("m", BOOTS["m"], site.peers, site.step(Tick(0))._replace(tick=TICKS), [], 0, 0)
+
+
+OUT_OF_RANGE = {
+    "a record after the end": ("state", after_the_end()),
+    "statistics after the end": ("link", statistics("m", 100)),
+    "an end after the end": ("event", end("m", TICKS + 1)),
+    "an end before the beginning": ("event", end("m", -1)),
+}
+
+
+@pytest.mark.parametrize(("channel", "payload"), OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
+def test_what_cannot_be_of_this_session_opens_no_gap(channel: str, payload: bytes) -> None:
+    desk = Desk()
+    desk.take("m", channel, payload)
+    assert desk.recording.dropped == {"out of range": 1}
+    desk.whole("m", "s")
+    assert desk.recording.problem() is None
+
+
+def test_what_another_recorder_says_is_none_of_ours_and_named() -> None:
+    desk = Desk()
+    other = encode(Event(member=topics.RECORDER, boot=99, n=0, kind="stored", text=""))
+    desk.take(topics.RECORDER, topics.EVENT, other)
+    assert desk.recording.dropped == {"another recorder": 1}
+    assert "recorder/event" not in desk.written()
+
+
+def test_what_it_says_itself_stands_in_its_log_from_its_first_word() -> None:
+    desk = Desk()
+    desk.whole("m", "s")
+    log = desk.log()
+    assert [(e.kind, e.about) for e in log.events if e.member == topics.RECORDER] == [
+        ("stored", "m"),
+        ("stored", "s"),
+    ]
+    account = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
+    assert (account.expected, account.received) == (2, 2)

@@ -9,6 +9,7 @@ import msgpack
 from recorder.recorder import Recorder
 from sites.process import Member, Options
 from trilat_net.interrupt import Interrupt
+from trilat_net.log.parts import Storage
 from trilat_net.log.reader import Log, open_log
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, SkewedClock
@@ -38,6 +39,8 @@ class Session:
     said: list[str] = field(default_factory=list)
     skews: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Of members on clocks of their own: how far ahead (ns), and how much faster (ns/s)."""
+    storage: Storage | None = None
+    """Where the log goes, if not simply to `path`."""
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
         """Adds a site."""
@@ -67,7 +70,11 @@ class Session:
             bus = self.network.join()
             try:
                 own = self._own("recorder", clock)
-                recorder = Recorder(bus, own, SESSION, RECORDER_BOOT, self.path, stopped, self.said.append)
+                recorder = Recorder(
+                    *(bus, own, SESSION, RECORDER_BOOT, self.storage or Storage(self.path)),
+                    stopped,
+                    self.said.append,
+                )
                 epoch = recorder.join(30.0)
                 assert epoch is not None
                 recording = recorder.record(epoch)

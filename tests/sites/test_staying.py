@@ -8,6 +8,7 @@ import pytest
 from recorder.recorder import Recorder
 from sites.process import Member, Options
 from trilat_net.interrupt import Interrupt
+from trilat_net.log.parts import Storage
 from trilat_net.net.connection import Connection
 from trilat_net.scenario import load
 
@@ -47,7 +48,9 @@ class Ending:
     def _recorder(self, clock: RelayClock) -> None:
         bus = self.session.network.join()
         path = self.session.path
-        recorder = Recorder(bus, clock, SESSION, RECORDER_BOOT, path, lambda: False, lambda _text: None)
+        recorder = Recorder(
+            bus, clock, SESSION, RECORDER_BOOT, Storage(path), lambda: False, lambda _text: None
+        )
         epoch = recorder.join(30.0)
         assert epoch is not None
         recorder.record(epoch)

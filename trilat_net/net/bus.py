@@ -65,8 +65,14 @@ class Questions(Protocol):
 class Bus(Protocol):
     """One member's connection."""
 
-    def publisher(self, key: str) -> Callable[[bytes], None]:
-        """Returns what publishes a payload under a key; it drops rather than waits."""
+    def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
+        """Returns what publishes a payload under a key; it drops rather than waits.
+
+        Args:
+            key: without wildcards.
+            patient: wait for room rather than drop, seconds at most: for who has no tick to meet and must
+                not lose what it publishes, as a replay.
+        """
 
     def inbox(self, key: str, capacity: int = RING) -> Inbox:
         """Returns a ring that fills with what others publish under a key expression."""
@@ -103,7 +109,7 @@ class Bus(Protocol):
 
 
 def matches(expression: str, key: str) -> bool:
-    """True where a key expression (`*` for one chunk, `**` for any number) includes a key."""
+    """True where a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of one."""
     return _match(expression.split("/"), key.split("/"))
 
 
@@ -112,7 +118,21 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
         return not chunks
     if pattern[0] == "**":
         return any(_match(pattern[1:], chunks[n:]) for n in range(len(chunks) + 1))
-    return bool(chunks) and pattern[0] in ("*", chunks[0]) and _match(pattern[1:], chunks[1:])
+    return bool(chunks) and _match_chunk(pattern[0], chunks[0]) and _match(pattern[1:], chunks[1:])
+
+
+def _match_chunk(pattern: str, chunk: str) -> bool:
+    if "$*" not in pattern:
+        return pattern in ("*", chunk)
+    first, *rest = pattern.split("$*")
+    if not chunk.startswith(first):
+        return False
+    at = len(first)
+    for part in rest[:-1]:
+        at = chunk.find(part, at) + len(part)
+        if at < len(part):
+            return False
+    return len(chunk) - at >= len(rest[-1]) and chunk.endswith(rest[-1])
 
 
 class _Ring(Generic[T]):
@@ -199,8 +219,8 @@ class LocalBus:
         self._watching: list[tuple[str, _Ring[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
-    def publisher(self, key: str) -> Callable[[bytes], None]:
-        """See `Bus`."""
+    def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
+        """See `Bus`; here is always room."""
 
         def publish(payload: bytes) -> None:
             for member in self._network.members:

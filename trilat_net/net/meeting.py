@@ -1,7 +1,8 @@
 """Who is there: every member asks every other one, and knows who is missing.
 
 Law: another scenario, a running session and a second start of oneself are refused at the first meeting; what
-strangers answer is remembered for the error, and passed over.
+strangers answer is remembered for the error, and passed over. A recorder may meet a running session, and
+there may be other recorders.
 """
 
 from collections.abc import Sequence
@@ -101,9 +102,9 @@ class Meeting:
             SessionError: this member cannot be part of the session, and why.
         """
         own = self.own
-        if info.boot == own.boot:
+        if info.boot == own.boot or (not self._sites and info.member == topics.RECORDER):
             return
-        if info.running and not invited:
+        if info.running and not invited and (self._sites or not info.boots):
             raise SessionError(f"session {self._session!r} is running; {info.member} is at tick {info.ticks}")
         if info.member == own.member:
             if info.boot < own.boot:
@@ -112,8 +113,15 @@ class Meeting:
         if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
             self._refuse(info)
             return
+        if info.member == topics.RECORDER and self._has_recorder(info):
+            return
         if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
             self.met[info.member] = info
+
+    def _has_recorder(self, info: Info) -> bool:
+        """True where another recorder was met before, which is still there: the first one is the member."""
+        met = self.met.get(topics.RECORDER)
+        return met is not None and met.boot != info.boot
 
     def _refuse(self, info: Info) -> None:
         """The leader's scenario is the session's: others leave, and the leader says why."""

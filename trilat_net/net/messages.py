@@ -81,7 +81,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rx: list[Stamp]
     rx_crc: U64
     cmd: list[str]
-    mem: list[float]
+    mem: Annotated[list[float], Meta(max_length=JOINTS + 1)]
     late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
     sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
@@ -169,8 +169,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         v: version of this schema.
         member: who says it: a site, or "recorder".
         boot: the sender's process start.
-        kind: "epoch", "ready", "start", "lost", "back", "diverged", "end", "stored", "refused", "setup",
-            "mode", "change", "clock", "clock fault".
+        kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
+            "setup", "mode", "change", "clock", "clock fault".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.

@@ -2,7 +2,8 @@
 
 Law: one epoch whatever the start order. The first site of the scenario leads: with every member's answer
 in and equal where it must be, it announces an epoch and the boots that it is for; when all have answered
-`ready` in time it says `start`, and otherwise announces another one. Nobody starts without `start`.
+`ready` in time it says `start`, and otherwise announces another one. Nobody starts without `start`; a
+recorder that comes later learns from those who run when that was.
 
 The epoch is an instant of the leader's monotonic clock. A member on another clock puts it onto its own by
 pings, to half a round trip, and is ready only when it knows all clocks that it will need; wall clocks
@@ -18,6 +19,7 @@ from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
+from .latecomer import Latecomer
 from .meeting import Meeting
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
@@ -66,6 +68,7 @@ class Joining:
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self.meeting = Meeting(bus, clock, session, voice, sites)
         self.pinger = Pinger(bus, clock, session)
+        self._latecomer = Latecomer(self.meeting, self.pinger)
         answer_pings(bus, clock, session, voice.info)
         self._offered: Event | None = None
         self._epoch_ns = 0
@@ -93,7 +96,17 @@ class Joining:
             self._answer()
         if epoch is None and meeting.leads:
             epoch = self._lead()
+        if epoch is None and not self._sites:
+            epoch = self._come_late()
         return epoch
+
+    def _come_late(self) -> Epoch | None:
+        """Returns the epoch of a session that runs; not while its `start` may still be under way."""
+        now_ns = self._clock.monotonic_ns()
+        if self._announced is not None and now_ns < self._epoch_ns:
+            return None
+        since = self._latecomer.poll(now_ns)
+        return None if since is None else Epoch(*since)
 
     def _apart(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
         """Returns the boots of the sites whose clock is another one than the own."""
@@ -142,7 +155,7 @@ class Joining:
                 return
             self._offered = event
             self._answer()
-        elif self._own.member in event.boots:
+        elif self._own.member in event.boots and self._sites:  # of two recorders, one comes late
             raise SessionError(f"session {self._session!r} goes on with another {self._own.member}")
 
     def _answer(self) -> None:

@@ -1,7 +1,7 @@
 """The bus over Eclipse Zenoh; the only importer of `zenoh`.
 
-Law: nothing here waits for the network. What is published is dropped rather than kept waiting, what is asked
-is answered into a ring, and a session that cannot open yet says so.
+Law: nothing here waits for the network. What is published is dropped rather than kept waiting (but by a
+patient publisher), what is asked is answered into a ring, and a session that cannot open yet says so.
 """
 
 import json
@@ -129,11 +129,11 @@ class ZenohBus:
         self._kept: list[Any] = []
         self._tokens: set[str] = set()
 
-    def publisher(self, key: str) -> Callable[[bytes], None]:
-        """See `Bus`."""
+    def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
+        """See `Bus`; one who takes nothing for 5 s, while a patient one waits, loses its connection."""
         publisher = self._session.declare_publisher(
             key,
-            congestion_control=CongestionControl.DROP,
+            congestion_control=CongestionControl.BLOCK if patient else CongestionControl.DROP,
             priority=Priority.REAL_TIME,
             express=False,
         )

@@ -1,0 +1,105 @@
+"""The recorder of a live session: stopped, killed, started again; the log is whole all the same."""
+
+import signal
+from pathlib import Path
+
+from tests.net.waiting import until
+from trilat_net.experiment import verify
+from trilat_net.log.names import active
+from trilat_net.log.reader import Log, open_log
+from trilat_net.net.clock import SystemClock
+
+from .processes import (
+    Process,
+    Session,
+    Stage,
+    connections,
+    equal_to_virtual_time,
+    executed_again,
+    whole,
+)
+
+S = 1_000_000_000
+
+
+def pause(for_ns: int) -> None:
+    clock = SystemClock()
+    clock.sleep_until(clock.monotonic_ns() + for_ns)
+
+
+def another_recorder(stage: Stage, session: Session, log: Path) -> Process:
+    """One more recorder of a session, with a file of its own, once it is in."""
+    recorder = stage.start(
+        log.stem, "record", "--session", "t", "-o", str(log), *connections(session.endpoints)
+    )
+    recorder.prints("joins the session")
+    return recorder
+
+
+def interrupted(session: Session) -> dict[str, int]:
+    """Ends the sites after a while, however long it took to come here; how every site ended."""
+    pause(S)
+    for name in session.sites:
+        session.processes[name].signal(signal.SIGINT)
+    return {name: session.processes[name].code() for name in session.sites}
+
+
+def from_the_start(path: Path) -> Log:
+    """A log that has every record that was made, and everything else."""
+    log = open_log(path)
+    assert log.complete
+    for name in log.sites:
+        (end,) = [event for event in log.events if event.kind == "end" and event.member == name]
+        assert [state.tick for state in log[name].states] == list(range(end.ticks))
+    accounts = [text for topic, text in log.accounts.items() if topic.startswith("/trilat")]
+    assert all("missing 0, duplicate 0" in text for text in accounts)
+    executed_again(log)
+    return log
+
+
+def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_end(stage: Stage) -> None:
+    """With small buffers on the way, so that the network drops what it cannot deliver."""
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "7")
+    session.endpoints = [f"{endpoint}#so_sndbuf=8192;so_rcvbuf=8192" for endpoint in session.endpoints]
+    session.all()
+    session.recording()
+    recorder = session.processes["recorder"]
+    recorder.signal(signal.SIGSTOP)
+    pause(4 * S)
+    recorder.signal(signal.SIGCONT)
+    assert session.codes() == {"recorder": 0, "m": 0, "s": 0}
+    log = whole(session.log)
+    executed_again(log)
+    equal_to_virtual_time(log)
+    assert recorder.text().count(" from its memory") == 2
+
+
+def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_start(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
+    session.all()
+    session.recording()
+    killed = session.processes["recorder"]
+    killed.signal(signal.SIGKILL)
+    until(killed.ended, 10.0)
+    later = another_recorder(stage, session, stage.folder / "later.mcap")
+    assert interrupted(session) == {"m": 130, "s": 130}
+    assert later.code() == 0
+    log = from_the_start(stage.folder / "later.mcap")
+    (late,) = [event for event in log.events if event.kind == "late"]
+    assert late.t_ns > 0
+    events = {event.kind for event in log.events if event.member == "m"}
+    assert {"epoch", "start", "setup", "lost", "back", "end"} <= events
+    torn = open_log(active(session.log))
+    assert not torn.complete
+    assert verify(torn).passed
+
+
+def test_two_recorders_at_once_have_the_same_records(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
+    session.all()
+    twin = another_recorder(stage, session, stage.folder / "twin.mcap")
+    assert interrupted(session) == {"m": 130, "s": 130}
+    assert (session.processes["recorder"].code(), twin.code()) == (0, 0)
+    logs = [from_the_start(path) for path in (session.log, stage.folder / "twin.mcap")]
+    for name in session.sites:
+        assert logs[0][name].states == logs[1][name].states

@@ -1,0 +1,158 @@
+"""A recorder comes into a session that runs; nobody else does."""
+
+from contextlib import suppress
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.errors import SessionError
+from trilat_net.net import topics
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.latecomer import GATHER_NS
+from trilat_net.net.session import Epoch
+
+from .parties import STEP_NS, Party
+
+SITES = ("m1", "m2", "s")
+RECORDER = topics.RECORDER
+
+
+def running(*, recorder: bool = False, on_clock: ManualClock | None = None) -> tuple[Party, Epoch]:
+    """A session that runs, whose sites say so, and its epoch; on a clock of their own, if one is given."""
+    session = Party(SITES)
+    for name in (*SITES, RECORDER) if recorder else SITES:
+        session.start(name, **({"on_clock": on_clock} if on_clock else {}))
+    for _ in range(100):
+        step(session, on_clock)
+    epochs = [member.epoch for member in session.members.values()]
+    assert epochs[0] is not None
+    assert all(epoch == epochs[0] for epoch in epochs)
+    return session, epochs[0]
+
+
+def step(session: Party, *clocks: ManualClock | None) -> None:
+    session.round()
+    for clock in clocks:
+        if clock is not None:
+            clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+
+
+def joined(session: Party, within_ns: int, *clocks: ManualClock) -> Epoch | None:
+    """The epoch of the recorder, once it has one."""
+    for _ in range(within_ns // STEP_NS):
+        if session.members[RECORDER].epoch is not None:
+            break
+        step(session, *clocks)
+    return session.members[RECORDER].epoch
+
+
+def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
+    session, epoch = running()
+    session.start(RECORDER)
+    late = joined(session, GATHER_NS)
+    assert late == epoch._replace(epochs={})
+    assert session.kinds().count("start") == 1
+
+
+@given(ahead_ns=st.integers(-(10**9) + 1, 10**15), unix_ns=st.integers(0, 2**60))
+@settings(max_examples=30, deadline=None)
+def test_on_a_clock_of_its_own_it_finds_the_same_instant(ahead_ns: int, unix_ns: int) -> None:
+    session, epoch = running()
+    here = session.clock
+
+    class Elsewhere(ManualClock):
+        def identity(self) -> str:
+            return "elsewhere"
+
+    own = Elsewhere(here.monotonic_ns() + ahead_ns, unix_ns)
+    session.start(RECORDER, on_clock=own)
+    late = joined(session, 4 * GATHER_NS, own)
+    assert late is not None
+    assert late.mono_ns == epoch.mono_ns + ahead_ns
+    assert late.unix_ns == epoch.unix_ns
+
+
+def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
+    session, epoch = running()
+    session.kill("s")
+    session.start(RECORDER)
+    assert joined(session, GATHER_NS - 5 * STEP_NS) is None
+    assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
+    assert set(session.members[RECORDER].joining.meeting.met) == {"m1", "m2"}
+
+
+def test_of_two_recorders_at_the_start_one_is_a_member_and_one_comes_late() -> None:
+    session = Party(SITES)
+    session.start(*SITES)
+    session.start(RECORDER)
+    first = session.members.pop(RECORDER)
+    session.members["first"] = first
+    session.start(RECORDER)
+    for _ in range(100):
+        session.round()
+    sites = [session.members[name] for name in SITES]
+    epoch = sites[0].epoch
+    assert epoch is not None
+    assert all(site.epoch == epoch for site in sites)
+    both = (first, session.members[RECORDER])
+    assert [member.epoch for member in both if member.info.boot == epoch.boots[RECORDER]] == [epoch]
+    for _ in range(100):
+        session.round()
+    assert [member.epoch.mono_ns for member in both if member.epoch] == [epoch.mono_ns] * 2
+
+
+def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
+    session = Party(SITES)
+    session.start(*SITES, RECORDER)
+    while session.kinds().count("ready") < len(SITES):
+        session.round()
+    deaf = session.members.pop(RECORDER)  # it has said ready, and misses what comes then
+    session.rounds(3)
+    deaf.joining._events = session.network.join().inbox("nothing")
+    epoch = session.members["m1"].epoch
+    assert epoch is not None
+    session.members[RECORDER] = deaf
+    while session.clock.monotonic_ns() + STEP_NS < epoch.mono_ns:
+        session.round()
+        assert deaf.epoch is None
+    late = joined(session, 2 * GATHER_NS)
+    assert late == epoch._replace(epochs={})
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"boots": {"m1": 5}},
+        {"boots": {}},
+        {"scenario": ""},
+        {"running": False},
+    ],
+)
+def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> None:
+    session, _ = running()
+    for name in SITES:
+        voice = session.members[name].voice
+        voice.info = msgspec.structs.replace(voice.info, **forged)
+    session.start(RECORDER)
+    with suppress(SessionError):  # a session that runs and does not say since when takes nobody in
+        joined(session, 3 * GATHER_NS)
+    assert session.members[RECORDER].epoch is None
+
+
+def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
+    session, epoch = running(recorder=True)
+    other = session.members.pop(RECORDER)
+    session.members["other"] = other
+    session.start(RECORDER)
+    assert joined(session, 2 * GATHER_NS) == epoch._replace(epochs={})
+    assert RECORDER not in session.members[RECORDER].joining.meeting.met
+
+
+def test_a_site_still_does_not_come_late() -> None:
+    session, _ = running()
+    session.kill("s")
+    session.start("s")
+    with pytest.raises(SessionError, match="is running"):
+        session.rounds(30)

@@ -1,0 +1,203 @@
+"""A recording into memory, on a clock that the test moves, and sites that remember what they sent."""
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+from mcap.reader import make_reader
+
+from recorder.recording import Recording
+from recorder.report import Report
+from recorder.tap import Tap
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Tick
+from trilat_net.log.reader import Log, open_log
+from trilat_net.log.writer import LogWriter
+from trilat_net.net import topics
+from trilat_net.net.answers import Past, Wanted
+from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.session import Epoch
+from trilat_net.net.stats import LoopStats
+from trilat_net.net.voice import Voice, said
+from trilat_net.net.wire import Event, Info, decode, encode, encode_state
+from trilat_net.scenario import Scenario, load
+
+SESSION = "t"
+MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
+MS, S = 1_000_000, 1_000_000_000
+BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
+EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
+SCENARIO = load("two_sites", {"duration_s": 0.05})
+TICKS = SCENARIO.ticks("m")
+
+
+def told(name: str, **facts: object) -> Info:
+    """What a member says of itself."""
+    info = Info(
+        member=name,
+        boot=BOOTS[name],
+        scenario_sha256=SCENARIO.sha256,
+        scenario=SCENARIO.text,
+        host="h",
+        clock="c",
+        fingerprint="f",
+    )
+    return msgspec.structs.replace(info, **facts)
+
+
+def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
+    """The records of a site that hears nobody."""
+    site = Site(scenario.setup(name))
+    boot = BOOTS[name] if boot is None else boot
+    return [
+        encode_state(name, boot, site.peers, site.step(Tick(k)), [], 0, 0)
+        for k in range(scenario.ticks(name))
+    ]
+
+
+def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
+    """What it says of its links after a tick."""
+    site = Site(scenario.setup(name))
+    stats = LoopStats(site, BOOTS[name], [1000]).take(site.step(Tick(0)))
+    t_ns = tick * S // scenario.sites[name].rate_hz
+    return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
+
+
+def happening(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
+    """The n-th event of a site."""
+    event = Event(member=name, boot=BOOTS[name], kind=kind, text=kind, t_ns=n * MS, n=n)
+    return encode(msgspec.structs.replace(event, **facts))
+
+
+def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
+    """Its last word."""
+    boot = BOOTS[name] if boot is None else boot
+    return happening(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
+
+
+class Memory:
+    """What a site answers when it is asked for its past; at most so many messages at once.
+
+    Attributes:
+        made: all that it has made, by channel.
+        oldest: number of the oldest message that it still has, by channel.
+        asked: every question that reached it.
+        replies: what becomes of an answer on its way: the payloads that arrive.
+    """
+
+    def __init__(self, network: LocalNetwork, name: str, chunk: int = 64) -> None:
+        self.name, self.chunk = name, chunk
+        self.made: dict[str, Sequence[bytes]] = {"state": [], "link": [], "event": []}
+        self.oldest = dict.fromkeys(self.made, 0)
+        self.asked: list[Wanted] = []
+        self.replies: Callable[[bytes], Sequence[bytes]] = lambda payload: [payload]
+        self._questions = network.join().questions(topics.key(SESSION, name, topics.PAST))
+
+    def answer(self) -> None:
+        """Answers what it has been asked."""
+        while (question := self._questions.poll()) is not None:
+            wanted = decode(question.payload, Wanted)
+            self.asked.append(wanted)
+            for payload in self.replies(encode(self.past(wanted))):
+                question.answer(payload)
+
+    def past(self, wanted: Wanted) -> Past:
+        """What it still has of what is wanted."""
+        made = self.made[wanted.channel]
+        first = max(wanted.first, min(self.oldest[wanted.channel], len(made)))
+        last = min(wanted.last, first + self.chunk - 1)
+        return Past(
+            member=self.name,
+            boot=BOOTS[self.name],
+            channel=wanted.channel,
+            first=first,
+            payloads=list(made[first : last + 1]),
+            made=len(made),
+        )
+
+
+class Desk:
+    """A recording into memory, with a clock that the test moves."""
+
+    def __init__(
+        self, scenario: Scenario = SCENARIO, clock: ManualClock | None = None, epoch: Epoch = EPOCH
+    ) -> None:
+        self.clock = clock or ManualClock(MONO_NS)
+        self.network = LocalNetwork()
+        self.bus = self.network.join()
+        listener = self.network.join()
+        self._heard: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.EVENT))
+        self.reports: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.STATS))
+        self.stream = io.BytesIO()
+        self.tap = Tap(self.clock)
+        own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
+        info = told(topics.RECORDER, scenario="", scenario_sha256="")
+        voice = Voice(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
+        writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
+        self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, voice)
+        self.report = Report(
+            self.bus, self.clock, SESSION, info.boot, epoch, self.recording, self.tap, self.stream.tell
+        )
+
+    def wait(self, for_ns: int) -> None:
+        self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)
+
+    def take(self, name: str, channel: str, *payloads: bytes) -> None:
+        """Messages come in, a millisecond after each other, and are written."""
+        for payload in payloads:
+            self.wait(MS)
+            self.tap.take(topics.key(SESSION, name, channel), payload)
+        self.write()
+
+    def write(self) -> None:
+        self.recording.write(self.tap, self.clock.monotonic_ns())
+
+    def rounds(self, count: int, *sites: Memory, step_ns: int = 10 * MS) -> None:
+        """Time goes on, while the recorder works and these sites answer."""
+        for _ in range(count):
+            self.wait(step_ns)
+            self.write()
+            for site in sites:
+                site.answer()
+
+    def whole(self, *names: str) -> None:
+        """Sites that send everything and say so."""
+        for name in names:
+            self.take(name, topics.STATE, *states(name))
+            self.take(name, topics.LINK, statistics(name))
+            self.take(name, topics.EVENT, end(name))
+
+    def over(self) -> bool:
+        return self.recording.over(self.clock.monotonic_ns())
+
+    def said(self) -> list[Event]:
+        """What the recorder said since the last call."""
+        return list(said(self._heard))
+
+    def stored(self) -> list[tuple[str, int]]:
+        """What the recorder said it has: (site, ticks)."""
+        heard = self.said()
+        assert all(event.kind == "stored" for event in heard)
+        return [(event.about, event.ticks) for event in heard]
+
+    def log(self) -> Log:
+        self.recording.finish(self.tap)
+        self.stream.seek(0)
+        return open_log(self.stream)
+
+    def written(self) -> dict[str, list[bytes]]:
+        """All payloads in the finished file, by topic."""
+        payloads: dict[str, list[bytes]] = {}
+        for topic, message in self.messages():
+            payloads.setdefault(topic, []).append(message.data)
+        return payloads
+
+    def messages(self) -> Iterator[tuple[str, Any]]:
+        """Finishes the log: all its messages in the order of the file, each with its channel, "m/state"."""
+        self.recording.finish(self.tap)
+        reader = make_reader(io.BytesIO(self.stream.getvalue()))
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic.startswith(f"/trilat/{SESSION}/"):
+                yield channel.topic.removeprefix(f"/trilat/{SESSION}/"), message

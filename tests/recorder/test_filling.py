@@ -1,0 +1,356 @@
+"""Whatever the network loses, doubles and delays: the log has all that came or could be had, each once."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recorder.filling import ANSWER_NS, CHUNK, GIVE_UP_NS, SILENT_NS, VAIN
+from trilat_net.net import topics
+from trilat_net.net.answers import Past
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.messages import Event, RecorderStats, State
+from trilat_net.net.wire import decode, encode
+from trilat_net.scenario import load
+
+from .desk import BOOTS, MONO_NS, MS, SESSION, UNIX_NS, Desk, Memory, S, happening, states, statistics
+
+SLOW = load("two_sites", {"duration_s": 2.0, "rate_hz": 100})
+TICKS = SLOW.ticks("m")
+EVERY = 10
+MADE = {
+    "state": states("m", scenario=SLOW),
+    "link": [statistics("m", k, SLOW) for k in range(0, TICKS, EVERY)],
+    "event": [
+        *(happening("m", n, "mode") for n in range(8)),
+        happening("m", 8, "end", ticks=TICKS, t_ns=2 * S),
+    ],
+}
+SENT = sorted(
+    [(k * 10 * MS, "state", k) for k in range(TICKS)]
+    + [(k * EVERY * 10 * MS + 1, "link", k) for k in range(TICKS // EVERY)]
+    + [(n * 240 * MS + 2, "event", n) for n in range(8)]
+    + [(2 * S, "event", 8)]
+)
+"""When a site sends which message of which channel, ns since the epoch."""
+
+
+@dataclass
+class Way:
+    """What becomes of the messages on their way, by their place in SENT; and of the answers, in turn."""
+
+    lost: set[int] = field(default_factory=set)
+    twice: set[int] = field(default_factory=set)
+    late_ms: dict[int, int] = field(default_factory=dict)
+    oldest: dict[str, int] = field(default_factory=dict)
+    answers: list[str] = field(default_factory=list)
+    chunk: int = 64
+
+    def deliveries(self) -> list[tuple[int, str, int]]:
+        """What comes: (when since the epoch, channel, number)."""
+        came = []
+        for place, (sent_ns, channel, number) in enumerate(SENT):
+            if place not in self.lost:
+                at_ns = sent_ns + 137_000 + self.late_ms.get(place, 0) * MS
+                came += [(at_ns, channel, number)] * (2 if place in self.twice else 1)
+        return sorted(came)
+
+
+def lie(how: str, payload: bytes) -> Sequence[bytes]:
+    """What arrives of an answer."""
+    past = decode(payload, Past)
+    wrong = {
+        "wrong boot": {"boot": 99},
+        "wrong member": {"member": "s"},
+        "wrong channel": {"channel": "link" if past.channel != "link" else "event"},
+        "wrong numbers": {"payloads": past.payloads[::-1]},
+        "too many": {"payloads": past.payloads * 2, "made": past.made},
+        "undecodable": {"payloads": [b"\xc1" for _ in past.payloads]},
+        "another's": {"payloads": [p.replace(b"\xa1m", b"\xa1s") for p in past.payloads]},
+        "a hole": {"payloads": [b"" if n == 1 else p for n, p in enumerate(past.payloads)]},
+        "more gone than made": {"first": past.made + 70, "payloads": []},
+        "far too many made": {"made": 2**39} if past.channel != "event" else {"boot": 0},
+    }
+    return {
+        "lost": [],
+        "twice": [payload, payload],
+        "garbage": [b"", b"\xc1", bytes(70_000)],
+        "garbage first": [b"junk", payload],
+    }.get(how) or ([encode(msgspec.structs.replace(past, **wrong[how]))] if how in wrong else [])
+
+
+HOW = [
+    *("lost", "twice", "garbage", "garbage first", "wrong boot", "wrong member", "wrong channel"),
+    *(
+        "wrong numbers",
+        "too many",
+        "undecodable",
+        "another's",
+        "a hole",
+        "more gone than made",
+        "far too many made",
+    ),
+]
+
+
+@st.composite
+def ways(draw: st.DrawFn) -> Way:
+    places = st.integers(0, len(SENT) - 1)
+    runs = draw(st.lists(st.tuples(places, st.integers(1, len(SENT))), max_size=4))
+    lost = draw(st.sets(places, max_size=30)) | {
+        place for first, count in runs for place in range(first, min(first + count, len(SENT)))
+    }
+    return Way(
+        lost,
+        draw(st.sets(places, max_size=10)),
+        draw(st.dictionaries(places, st.integers(1, 400), max_size=10)),
+        draw(st.fixed_dictionaries({c: st.integers(0, len(MADE[c]) - 1) for c in MADE})),
+        draw(st.lists(st.sampled_from(HOW), max_size=12)),
+        draw(st.sampled_from([1, 3, 64])),
+    )
+
+
+class Run:
+    """A session in which one site sends all it makes, and the other is gone."""
+
+    def __init__(self, way: Way, clock: ManualClock | None = None) -> None:
+        self.way = way
+        self.desk = Desk(SLOW, clock)
+        self.site = Memory(self.desk.network, "m", way.chunk)
+        self.site.oldest |= way.oldest
+        self.site.replies = self._reply
+        self._asked = 0
+
+    def _reply(self, payload: bytes) -> Sequence[bytes]:
+        """Every fourth answer at least comes as it is: nobody is patient for ever."""
+        self._asked += 1
+        turn = self._asked - self._asked // 4 - 1
+        if self._asked % 4 == 0 or turn >= len(self.way.answers):
+            return [payload]
+        return lie(self.way.answers[turn], payload)
+
+    def live(self, until_ns: int) -> None:
+        """Lets the site make and send until an instant; the recorder works every 10 ms."""
+        desk, came = self.desk, self.way.deliveries()
+        now_ns = desk.clock.monotonic_ns()
+        while now_ns < until_ns + MONO_NS:
+            begun_ns, now_ns = now_ns, now_ns + 10 * MS
+            for at_ns, channel, number in SENT:
+                if begun_ns <= at_ns + MONO_NS < now_ns:
+                    self.site.made[channel] = MADE[channel][: number + 1]
+            for at_ns, channel, number in came:
+                if begun_ns <= at_ns + MONO_NS < now_ns:
+                    desk.clock.sleep_until(at_ns + MONO_NS)
+                    desk.tap.take(topics.key(SESSION, "m", channel), MADE[channel][number])
+            desk.clock.sleep_until(now_ns)
+            desk.write()
+            self.site.answer()
+
+    def until_stored(self) -> Event:
+        """Goes on until the recorder says that it has all of it."""
+        for _ in range(400):
+            stored = [event for event in self.desk.said() if event.kind == "stored"]
+            if stored:
+                return stored[0]
+            self.desk.rounds(10, self.site)
+        raise AssertionError("never stored")
+
+
+@given(ways())
+@settings(max_examples=80, deadline=None)
+def test_the_log_has_all_that_came_or_could_be_had_and_the_accounts_are_the_truth(way: Way) -> None:
+    run = Run(way)
+    run.live(2600 * MS)
+    stored = run.until_stored()
+    file: dict[str, list[tuple[int, int]]] = {}
+    for topic, message in run.desk.messages():
+        site, channel = topic.split("/")
+        if site == "m":
+            number = MADE[channel].index(message.data)
+            file.setdefault(channel, []).append((number, message.log_time - UNIX_NS))
+    for channel, made in MADE.items():
+        account = run.desk.recording.accounts[topics.key(SESSION, "m", channel)]
+        came = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
+        numbers = [number for number, _ in file.get(channel, [])]
+        truth = {number for _, number in came} | set(range(way.oldest[channel], len(made)))
+        assert sorted(numbers) == sorted(truth)
+        live = [(at_ns, number) for number, at_ns in file.get(channel, []) if at_ns % MS]
+        assert set(live) <= set(came)
+        assert (account.expected, account.received) == (len(made), len(truth))
+        assert account.missing == len(made) - len(truth)
+        assert account.refilled == len(truth) - len(live)
+        assert account.duplicate == len(came) - len(live)
+        passed = [
+            number < max(n for _, n in came[: came.index((at_ns, number)) + 1]) for at_ns, number in live
+        ]
+        assert account.reordered == sum(passed)
+        assert {n for first, last in account.gaps for n in range(first, last + 1)} == (
+            set(range(len(made))) - truth
+        )
+        stamps = sorted(at_ns for at_ns, _ in came)
+        silence = max((b - a for a, b in pairwise(stamps)), default=0)
+        assert account.silence_ns == silence
+    missing = sum(account.missing for account in run.desk.recording.accounts.values())
+    assert ("missing for good" in stored.text) == (missing > 0)
+    assert stored.ticks == TICKS
+
+
+def test_who_hears_everything_asks_nothing() -> None:
+    run = Run(Way())
+    run.live(2 * S + 20 * MS)
+    run.until_stored()
+    assert run.site.asked == []
+    assert run.desk.recording.dropped == Counter()
+
+
+def test_no_more_than_one_question_is_under_way_and_none_asks_for_more_than_a_chunk() -> None:
+    run = Run(Way(lost=set(range(20, 180))))
+    most = 0
+    answer = run.site.answer
+
+    def counted() -> None:
+        nonlocal most
+        before = len(run.site.asked)
+        answer()
+        most = max(most, len(run.site.asked) - before)
+
+    run.site.answer = counted  # type: ignore[method-assign]
+    run.live(2600 * MS)
+    run.until_stored()
+    assert most == 1
+    assert all(wanted.last - wanted.first < CHUNK for wanted in run.site.asked)
+
+
+def test_what_is_only_late_is_not_asked_for() -> None:
+    run = Run(Way(late_ms=dict.fromkeys(range(0, len(SENT), 3), 25)))
+    run.live(2100 * MS)
+    run.until_stored()
+    assert run.site.asked == []
+
+
+def test_a_site_that_is_silent_is_asked_and_its_lost_end_is_noticed() -> None:
+    """The last second is lost on the way, statistics, end and all."""
+    run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
+    run.live(3100 * MS)
+    assert run.until_stored().text == "every record of m is stored"
+    assert run.desk.recording.problem() == "s disappeared after 0 records"
+
+
+def test_a_site_that_is_hushed_is_asked_no_more_than_three_times_a_second() -> None:
+    """It hangs, say: it has said nothing since its start, and there is nothing to be had."""
+    run = Run(Way(lost=set(range(len(SENT)))))
+    run.site.answer()
+    for _ in range(500):
+        run.desk.wait(10 * MS)
+        run.desk.write()
+        run.site.answer()
+    assert 0 < len(run.site.asked) <= 3 * 5 * S // SILENT_NS
+
+
+@pytest.mark.parametrize("how", ["lost", "garbage", "wrong boot"])
+def test_a_site_that_does_not_answer_is_asked_ever_more_rarely_and_then_no_more(how: str) -> None:
+    run = Run(Way(lost=set(range(30, 60))))
+    run.site.replies = lambda payload: lie(how, payload)
+    run.live(2100 * MS)
+    run.desk.rounds(150, run.site, step_ns=100 * MS)
+    assert len(run.site.asked) <= 5 + 15 * S // ANSWER_NS[1]
+    (stored,) = [event for event in run.desk.said() if event.kind == "stored"]
+    assert "missing for good" in stored.text
+    assert stored.t_ns - 2 * S > GIVE_UP_NS
+    log = run.desk.log()
+    assert f"missing {TICKS - len(log['m'])}" in log.account("m")
+
+
+def test_a_site_that_answers_in_vain_is_left_alone() -> None:
+    run = Run(Way(lost=set(range(30, 60))))
+    run.site.replies = lambda payload: lie("undecodable", payload)
+    run.live(20 * S)
+    assert len(run.site.asked) <= 3 * VAIN + 3
+    assert "missing for good" in run.until_stored().text
+
+
+def test_what_a_site_no_longer_has_is_asked_for_once() -> None:
+    run = Run(Way(lost=set(range(200)), oldest={"state": TICKS, "link": 20, "event": 9}))
+    run.live(2600 * MS)
+    stored = run.until_stored()
+    assert "missing for good" in stored.text
+    first = [(wanted.channel, wanted.first) for wanted in run.site.asked]
+    assert len(first) == len(set(first))
+
+
+def test_a_late_message_that_was_given_up_is_welcome() -> None:
+    run = Run(Way(lost={0}, oldest={"state": 5}))
+    run.live(2100 * MS)
+    run.until_stored()
+    run.desk.take("m", "state", MADE["state"][0])
+    log = run.desk.log()
+    assert len(log["m"]) == TICKS
+    assert "missing 0" in log.account("m")
+
+
+def test_a_site_that_is_gone_is_not_asked_and_what_it_owes_ends_nothing() -> None:
+    run = Run(Way(lost=set(range(30, 60))))
+    run.desk.recording.presence(topics.key(SESSION, "m", topics.ALIVE) + f"/{BOOTS['m']}", False)
+    run.desk.recording.presence(topics.key(SESSION, "s", topics.ALIVE) + f"/{BOOTS['s']}", False)
+    run.live(2100 * MS)
+    assert not run.desk.over()
+    run.desk.rounds(90, run.site, step_ns=100 * MS)
+    assert run.site.asked == []
+    assert run.desk.over()
+
+
+def test_what_is_not_what_its_answer_says_is_counted_and_not_written() -> None:
+    run = Run(Way(lost=set(range(20, 40))))
+    run.site.replies = lambda payload: lie("wrong numbers", payload)
+    run.live(S)
+    assert run.desk.recording.dropped["out of range"] > 0
+    account = run.desk.recording.accounts[topics.key(SESSION, "m", "state")]
+    assert account.missing > 10
+
+
+def test_answers_that_are_too_large_for_the_way_are_made_smaller() -> None:
+    run = Run(Way(lost=set(range(20, 180))))
+    run.site.replies = lambda payload: [payload] if len(payload) < 5_000 else []
+    run.live(2100 * MS)
+    assert run.until_stored().text == "every record of m is stored"
+
+
+def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
+    run = Run(Way(lost={n for n in range(20, 180) if n % 3}))
+    run.site.replies = lambda payload: [] if decode(payload, Past).channel == "state" else [payload]
+    run.live(2600 * MS)
+    run.desk.rounds(700, run.site)
+    accounts = run.desk.recording.accounts
+    assert accounts[topics.key(SESSION, "m", "state")].missing > 0
+    assert accounts[topics.key(SESSION, "m", "link")].missing == 0
+    assert accounts[topics.key(SESSION, "m", "event")].missing == 0
+    assert run.desk.said() == []
+
+
+def test_times_come_from_the_monotonic_clock_however_the_wall_clock_steps() -> None:
+    class Stepping(ManualClock):
+        def unix_ns(self) -> int:
+            return super().unix_ns() + (-3600 * S if self.monotonic_ns() > MONO_NS + S else 0)
+
+    run = Run(Way(lost=set(range(50, 80))), Stepping(MONO_NS, UNIX_NS - MONO_NS))
+    run.live(S // 2)
+    run.desk.report.say()
+    run.live(2100 * MS)
+    run.desk.report.say()
+    run.until_stored()
+    messages = list(run.desk.messages())
+    times = [message.log_time for _, message in messages]
+    assert times == sorted(times)
+    assert times[0] > UNIX_NS
+    assert times[-1] < UNIX_NS + 4 * S
+    records = [message for topic, message in messages if topic == "m/state"]
+    assert len(records) == TICKS
+    assert all(m.publish_time - UNIX_NS == decode(m.data, State).t_ns for m in records)
+    seen = [decode(message[1], RecorderStats) for message in iter(run.desk.reports.poll, None)]
+    early, late = (stats.unix_ns - stats.mono_ns for stats in seen)
+    assert late - early == -3600 * S

@@ -1,0 +1,107 @@
+"""A recorder that comes into a running session has what the sites remember, and says that it came late."""
+
+from pathlib import Path
+
+import pytest
+
+from recorder.recorder import Recorder
+from sites import realtime
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import SESSION as REAL
+from tests.sites.sessions import Session, in_log, in_virtual_time
+from trilat_net.experiment import verify
+from trilat_net.log.parts import Storage
+from trilat_net.log.reader import open_log
+from trilat_net.net import topics
+from trilat_net.scenario import load
+
+from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S, end, happening, states, statistics
+
+
+def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
+    """A recorder that comes 40 s late into a session of which these sites are left."""
+    desk = Desk()
+    sites = {name: Memory(desk.network, name) for name in there}
+    for name, site in sites.items():
+        events = [happening(name, 0, "ready", t_ns=-1), happening(name, 1), end(name, n=2)]
+        site.made = {"state": states(name), "link": [statistics(name)], "event": events}
+    desk.wait(40 * S)
+    desk.recording.away()
+    for name in there:
+        desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True)
+    desk.recording.late(desk.clock.monotonic_ns())
+    return desk, sites
+
+
+def test_it_asks_every_site_for_all_that_it_has() -> None:
+    desk, sites = late_desk("m", "s")
+    desk.rounds(30, *sites.values())
+    said = desk.said()
+    assert [(event.kind, event.about) for event in said] == [("late", ""), ("stored", "m"), ("stored", "s")]
+    assert said[0].t_ns == 40 * S
+    assert "at t = 40.000 s" in said[0].text
+    assert desk.over()
+    assert desk.recording.problem() is None
+    log = desk.log()
+    assert [state.tick for state in log["m"].states] == list(range(TICKS))
+    assert [event.kind for event in log.events if event.member == "s"] == ["ready", "mode", "end"]
+
+
+def test_sites_that_are_gone_are_named_and_not_waited_for() -> None:
+    desk, sites = late_desk("m")
+    desk.rounds(30, *sites.values())
+    assert [(event.kind, event.about) for event in desk.said()] == [
+        ("late", ""),
+        ("lost", "s"),
+        ("stored", "m"),
+    ]
+    assert not desk.over()
+    desk.wait(20 * S)
+    assert desk.over()
+    assert desk.recording.problem() == "s disappeared after 0 records"
+
+
+def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
+    desk, sites = late_desk("m", "s")
+    for site in sites.values():
+        site.oldest["state"] = 20
+    desk.rounds(30, *sites.values())
+    stored = [event.text for event in desk.said() if event.kind == "stored"]
+    assert stored[0] == f"all that can be had of m is stored; missing for good: 20 of {TICKS} records (0-19)"
+    assert desk.recording.problem() == f"missing of m: 20 of {TICKS} records (0-19)"
+
+
+@pytest.mark.parametrize("ahead_ns", [0, 5 * S])
+def test_a_recorder_takes_over_from_one_that_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead_ns: int
+) -> None:
+    """Real sites, real recorders, in one process; the second one with another clock, too."""
+    monkeypatch.setattr(realtime, "prepare", lambda _cpu: {"scheduling": "as it was", "memory": "as it was"})
+    scenario = load("two_sites", {"duration_s": 3.0, "rate_hz": 100})
+    session = Session(scenario, tmp_path / "first.mcap")
+    for name in scenario.names:
+        session.site(name)
+    begun_ns = session.relay.now_ns
+    session.recorder(lambda: session.relay.now_ns > begun_ns + S)
+    if ahead_ns:
+        session.skews["later"] = (ahead_ns, 0)
+    later = tmp_path / "later.mcap"
+
+    def second(clock: RelayClock) -> str | None:
+        own = session._own("later", clock)
+        said = session.said.append
+        recorder = Recorder(session.network.join(), own, REAL, 99, Storage(later), lambda: False, said)
+        epoch = recorder.join(30.0)
+        assert epoch is not None
+        return recorder.record(epoch).problem()
+
+    session.relay.add("second", second, begun_ns + 3 * S // 2)
+    session.relay.run()
+    assert session.relay.results["second"] is None
+    log = open_log(later)
+    assert in_log(log) == in_virtual_time(scenario)
+    assert verify(log).whole_run
+    (came,) = [event for event in log.events if event.kind == "late"]
+    assert 0 < came.t_ns < 3 * S
+    assert any("joins the session" in sentence for sentence in session.said)
+    assert 0 < len(open_log(tmp_path / "first.mcap")["m"]) < scenario.ticks("m")

@@ -1,0 +1,98 @@
+"""What a recorder says of its own work: true, once a second, bounded, and in its log."""
+
+from recorder.report import EVERY_NS
+from trilat_net.net import topics
+from trilat_net.net.messages import RecorderStats
+from trilat_net.net.wire import MAX_BYTES, decode, encode
+from trilat_net.scenario import load
+
+from .desk import MS, SESSION, TICKS, Desk, Memory, S, end, states, statistics
+
+
+def heard(desk: Desk) -> list[RecorderStats]:
+    """What it has said since the last call."""
+    return [decode(message[1], RecorderStats) for message in iter(desk.reports.poll, None)]
+
+
+def test_it_says_what_is_there_and_what_is_missing() -> None:
+    desk = Desk()
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:10], *records[13:30], records[29], records[12])
+    desk.take("nobody", topics.STATE, records[0])
+    desk.report.flushed(3 * MS)
+    desk.report.flushed(2 * MS)
+    desk.report.say()
+    (stats,) = heard(desk)
+    assert (stats.expected["m/state"], stats.received["m/state"]) == (30, 28)
+    assert (stats.missing["m/state"], stats.gaps) == (2, {"m/state": ["10-11"]})
+    assert (stats.duplicate["m/state"], stats.reordered["m/state"]) == (1, 1)
+    assert stats.silence_us["m/state"] == 1000
+    assert stats.dropped == {"stranger": 1}
+    assert stats.flush_max_us == 3000
+    assert stats.written_bytes == desk.stream.tell()
+    assert (stats.mono_ns, stats.unix_ns) == (desk.clock.monotonic_ns(), desk.clock.unix_ns())
+    assert set(stats.expected) == {
+        *(f"{site}/{channel}" for site in ("m", "s") for channel in ("state", "link", "event")),
+        *("recorder/event", "recorder/stats"),
+    }
+    desk.report.say()
+    assert heard(desk)[0].flush_max_us == 0
+
+
+def test_it_counts_what_came_from_a_sites_memory_and_what_waits() -> None:
+    desk = Desk()
+    site = Memory(desk.network, "m")
+    site.made = {"state": states("m"), "link": [statistics("m")], "event": []}
+    desk.take("m", topics.STATE, states("m")[0], states("m")[-1])
+    desk.rounds(30, site)
+    desk.tap.take("somewhere", b"")
+    desk.report.say()
+    (stats,) = heard(desk)
+    assert stats.refilled["m/state"] == TICKS - 2
+    assert stats.missing["m/state"] == 0
+    assert stats.queued == 1
+
+
+def test_it_says_so_once_a_second_and_writes_it() -> None:
+    desk = Desk()
+    for _ in range(350):
+        desk.wait(10 * MS)
+        desk.write()
+        desk.report.poll()
+    said = heard(desk)
+    assert [stats.t_ns for stats in said] == [EVERY_NS, 2 * EVERY_NS, 3 * EVERY_NS]
+    assert desk.written()["recorder/stats"] == [encode(stats) for stats in said]
+
+
+def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
+    desk = Desk()
+    desk.wait(10 * S + 300 * MS)
+    for _ in range(160):
+        desk.report.poll()
+        desk.wait(10 * MS)
+    assert [stats.t_ns // MS for stats in heard(desk)] == [10_300, 11_300]
+
+
+def test_it_fits_a_message_however_much_is_missing() -> None:
+    names = [f"site-with-a-long-name-{n}" for n in range(12)]
+    scenario = load("two_sites")
+    desk = Desk(scenario)
+    for key in desk.recording.accounts:
+        for number in range(0, 10_000, 2):
+            desk.recording.accounts[key].take(number + 2**39)
+    for name in names:
+        desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[key]
+    desk.report.say()
+    (stats,) = heard(desk)
+    assert sum(map(len, stats.gaps.values())) <= 600
+    assert len(encode(stats)) < MAX_BYTES
+
+
+def test_a_whole_run_is_whole_in_its_last_words() -> None:
+    desk = Desk()
+    desk.whole("m", "s")
+    desk.take("m", topics.EVENT, end("m"))
+    desk.report.say()
+    (stats,) = heard(desk)
+    assert set(stats.missing.values()) == {0}
+    assert stats.gaps == {}

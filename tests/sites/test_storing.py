@@ -1,0 +1,121 @@
+"""What is in the file at any time of a session, and after a full disk; parts of a session are the session."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.log.disks import SmallDisk, file_on
+from trilat_net.errors import LogRefused
+from trilat_net.experiment import verify
+from trilat_net.log import parts
+from trilat_net.log.choice import Choice
+from trilat_net.log.chunks import Walk
+from trilat_net.log.names import active, existing
+from trilat_net.log.parts import Storage
+from trilat_net.log.reader import open_log
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.scenario import load
+
+from .relay import RelayClock
+from .sessions import SESSION, Session, computed
+
+pytestmark = pytest.mark.usefixtures("unprepared")
+MS = 1_000_000
+SITES = ("m", "s")
+
+
+def session_of(path: Path, duration_s: float, storage: Storage | None = None) -> Session:
+    session = Session(load("two_sites", {"duration_s": duration_s}), path, storage=storage)
+    session.recorder()
+    for name in SITES:
+        session.site(name)
+    return session
+
+
+def records(path: Path) -> dict[str, int]:
+    """How many messages of each topic a file has, whole or not."""
+    with path.open("rb") as stream:
+        return Counter(item.topic for item in Walk(stream, str(path)).messages())
+
+
+def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    session = session_of(path, 0.5)
+    looks: list[tuple[int, int]] = []
+
+    def look(_: Bus, clock: RelayClock) -> None:
+        epoch_ns = 0
+        while not path.exists():
+            clock.sleep_until(clock.monotonic_ns() + 19 * MS)
+            if not active(path).exists():
+                continue
+            with active(path).open("rb") as stream:
+                walk = Walk(stream, "look")
+                count = Counter(item.topic for item in walk.messages())
+            epoch_ns = int(walk.metadata["trilat.session"]["epoch_unix_ns"])
+            due = min(500, (clock.unix_ns() - 100 * MS - epoch_ns) // MS)
+            looks.extend((count[f"/trilat/{SESSION}/{site}/state"], due) for site in SITES)
+
+    session.stranger(look)
+    session.run()
+    assert len(looks) > 40
+    assert max(due for _, due in looks) > 300
+    assert all(have >= due for have, due in looks)
+
+
+@pytest.mark.parametrize("room", range(160_000, 300_000, 27_000))
+def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
+    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    monkeypatch.setattr(parts, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
+    session = session_of(path, 2.0)
+    with pytest.raises(LogRefused, match="the disk is full; the log ends there, finished") as refusal:
+        session.run()
+    assert refusal.value.exit_code == 5
+    log = open_log(path)
+    assert log.complete
+    assert verify(log).passed
+    found = records(path)
+    for name in SITES:
+        assert [state.tick for state in log[name].states] == list(range(len(log[name])))
+        for channel in (topics.STATE, topics.LINK, topics.EVENT):
+            topic = "/" + topics.key(SESSION, name, channel)
+            assert f"received {found[topic]}, missing 0" in log.accounts[topic]
+    assert session.relay.results == dict.fromkeys(SITES, 0)  # the sites went on
+
+
+def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
+    whole = session_of(tmp_path / "whole.mcap", 1.0).run()
+    path = tmp_path / "run.mcap"
+    session = session_of(path, 1.0, Storage(path, split_ns=300 * MS))
+    with pytest.raises(Exception, match="No such file"):
+        session.run()  # there is no file of that name
+    names = [part.name for part in sorted(existing(path).values())]
+    assert names == [f"run-00{n}.mcap" for n in range(1, len(names) + 1)]
+    assert len(names) >= 4
+    log = open_log(*(tmp_path / name for name in names))
+    for site in SITES:
+        assert [computed(state) for state in log[site].states] == [
+            computed(state) for state in whole[site].states
+        ]
+    made = 0
+    for name in names:
+        part = open_log(tmp_path / name)
+        made += len(part["m"])
+        said = part.accounts[f"/trilat/{SESSION}/m/state"]
+        # the message that begins the next part has come when this one ends
+        assert any(f"received {known}, missing 0" in said for known in (made, made + 1))
+
+
+def test_what_is_left_out_is_neither_in_the_file_nor_missing(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    choice = Choice(("**/m/**", "**/s/event"), ("**/link",))
+    log = session_of(path, 0.3, Storage(path, choice=choice)).run()
+    assert len(log["m"]) == 300
+    assert len(log["s"]) == 0
+    kept = {f"/trilat/{SESSION}/{what}" for what in ("m/state", "m/event", "s/event")}
+    assert set(records(path)) == kept == {name for name in log.accounts if name.startswith("/")}
+    assert (log.session["include"], log.session["exclude"]) == ("**/m/** **/s/event", "**/link")
