@@ -2,12 +2,28 @@
 
 import sys
 
-from . import clocks, endurance, links, machine, presets, stalls, tick, virtual
+from . import (
+    clocks,
+    crashes,
+    endurance,
+    links,
+    machine,
+    presets,
+    reading,
+    replay,
+    stalls,
+    tick,
+    virtual,
+    writer,
+)
 
-BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run}
+BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run, "writer": writer.run}
 LONG = {
     "clocks": clocks.run,
+    "crashes": crashes.run,
     "presets": presets.run,
+    "reading": reading.run,
+    "replay": replay.run,
     "stalls": stalls.run,
     "endurance": endurance.run,
 }

@@ -56,7 +56,13 @@ class LogError(TrilatError):
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """The machine's: a log that could not be written on, as on a full disk."""
+    """The machine's: a log that could not be written on, as on a full disk; what was before is kept."""
+
+    exit_code = 5
+
+
+class NothingSaved(LogError):  # noqa: N818 - it names an outcome
+    """The file's: there is nothing in it that could be recovered."""
 
     exit_code = 1
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from tests.cli.running import COMMAND, PLAIN
 from tests.net.waiting import until
 from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.log.names import active
 from trilat_net.log.reader import Log, open_log
 from trilat_net.net.endpoints import free_endpoints
 
@@ -168,7 +169,15 @@ class Session:
 
 def recorded(log: Path) -> None:
     """Returns once records are in a log."""
-    until(lambda: log.exists() and log.stat().st_size > 20_000, PATIENCE_S)
+    until(lambda: size(log) > 60_000, PATIENCE_S)  # its head is a third of that
+
+
+def size(log: Path) -> int:
+    """Bytes of a log, finished or not; 0 where there is none."""
+    for path in (active(log), log):
+        with contextlib.suppress(FileNotFoundError):
+            return path.stat().st_size
+    return 0
 
 
 def connections(endpoints: Sequence[str]) -> list[str]:

@@ -1,0 +1,80 @@
+"""A recorder that is killed in the middle of a session, and what became of its file."""
+
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+from trilat_net.log.chunks import Walk
+from trilat_net.log.names import active
+from trilat_net.log.reader import Log, open_log
+from trilat_net.log.recover import Recovery, recover
+from trilat_net.net.clock import SystemClock
+
+from .processes import Session, Stage
+
+SITES = ("m1", "m2", "s")
+
+
+@dataclass
+class Killed:
+    """What became of it.
+
+    Attributes:
+        recovery: what `recover` says.
+        log: the file that it made.
+        flushed: messages that were in the file when the recorder died.
+        kept: messages that are in the new one.
+        lost_ms: time between the newest record in the file and the kill, at the worst site.
+    """
+
+    recovery: Recovery
+    log: Log
+    flushed: list[tuple[str, bytes]]
+    kept: list[tuple[str, bytes]]
+    lost_ms: float
+
+
+def killed(stage: Stage, after_s: float, *more: str) -> Killed:
+    """Runs the paper's experiment, kills its recorder some time after its first records, ends the sites.
+
+    Args:
+        stage: where it runs.
+        after_s: how long after.
+        more: options of the recorder.
+    """
+    session = Session(stage, "paper", SITES, "--duration", "60")
+    session.recorder(*more)
+    for name in SITES:
+        session.site(name, "--needs-recorder")
+    session.recording()
+    clock = SystemClock()
+    clock.sleep_until(clock.monotonic_ns() + round(after_s * 1e9))
+    killed_ns = clock.monotonic_ns()
+    recorder = session.processes["recorder"]
+    recorder.signal(signal.SIGKILL)
+    assert recorder.code() == -signal.SIGKILL
+    for name in SITES:
+        session.processes[name].signal(signal.SIGINT)
+    for name in SITES:
+        assert session.processes[name].code() == 130
+    torn = active(session.log)
+    recovery = recover(torn)
+    log = open_log(recovery.output)
+    return Killed(
+        recovery,
+        log,
+        _messages(torn),
+        _messages(recovery.output),
+        max((killed_ns - newest_ns) / 1e6 for newest_ns in _newest(log)),
+    )
+
+
+def _messages(path: Path) -> list[tuple[str, bytes]]:
+    with path.open("rb") as stream:
+        return [(item.topic, item.payload) for item in Walk(stream, str(path)).messages()]
+
+
+def _newest(log: Log) -> list[int]:
+    """Per site when its newest record was sent, on the machine's monotonic clock."""
+    (epoch_ns,) = {at for event in log.events if event.kind == "start" for at in event.epochs.values()}
+    return [epoch_ns + log[name].states[-1].sent_ns for name in log.sites]

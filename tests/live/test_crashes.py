@@ -1,0 +1,94 @@
+"""A recorder that dies, and a disk that is full: what was flushed is kept, and the sites never notice."""
+
+import random
+import signal
+
+import pytest
+from mcap.reader import make_reader
+
+from trilat_net.experiment import verify
+from trilat_net.log.names import active
+from trilat_net.log.reader import open_log
+from trilat_net.log.recover import recover
+
+from .killing import SITES, killed
+from .processes import Session, Stage, connections, executed_again
+from .small_disks import NoSmallDisk, SmallDisk, small_disk
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_a_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool, stage: Stage) -> None:
+    done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
+    assert done.recovery.lossless, done.recovery.lost
+    assert done.kept == done.flushed
+    assert done.log.complete
+    assert all(len(done.log[name]) for name in SITES)
+    verdict = verify(done.log)
+    assert verdict.passed
+    assert verdict.identical == verdict.records == sum(len(done.log[name]) for name in SITES)
+    # no bar, which stands in the benchmarks: a second would mean that flushing was forgotten
+    assert done.lost_ms < 1000
+
+
+def test_a_full_disk_ends_the_recording_in_order_and_no_site_loses_a_sample(stage: Stage) -> None:
+    folder = stage.folder / "disk"
+    folder.mkdir()
+    try:
+        with small_disk(folder, 3) as disk:
+            _full_disk(stage, disk)
+    except NoSmallDisk as reason:
+        pytest.skip(f"no disk of three MiB here: {reason}")
+
+
+def _full_disk(stage: Stage, disk: SmallDisk) -> None:
+    disk.seen(disk.folder / "other").write_bytes(bytes(1_400_000))
+    session = Session(stage, "paper", SITES, "--duration", "8")
+    path = disk.folder / "run.mcap"
+    small = stage.start(
+        "on a small disk",
+        *("record", "--session", "t", "-o", str(path), "--listen", session.recorder_endpoint),
+        *(word for endpoint in session.endpoints for word in ("--connect", endpoint)),
+        before=disk.before,
+    )
+    for name in SITES:
+        session.site(name, "--needs-recorder")
+    assert small.code() == 5
+    assert f"error: {path}: the disk is full; the log ends there, finished, with" in small.text()
+    assert not disk.seen(path.with_name("run.mcap.active")).exists()
+    assert session.codes() == dict.fromkeys(SITES, 0)
+    with disk.seen(path).open("rb") as stream:
+        assert list(make_reader(stream, validate_crcs=True).iter_messages())
+    log = open_log(disk.seen(path))
+    assert log.complete
+    assert verify(log).passed
+    for name in SITES:
+        states = log[name].states
+        assert [state.tick for state in states] == list(range(len(states)))
+        assert f"{name}: 8000 ticks" in session.processes[name].text()
+        assert log.link_stats(name)[-1].dropped.get("missing", 0) == 0
+
+
+def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(stage: Stage) -> None:
+    session = Session(stage, "paper", SITES, "--duration", "6")
+    session.all()
+    session.recording()
+    first = session.processes["recorder"]
+    first.signal(signal.SIGKILL)
+    assert first.code() == -signal.SIGKILL
+    again = stage.start(
+        "recorder again",
+        *("record", "--session", "t", "-o", str(session.log), "--continue"),
+        *("--listen", session.recorder_endpoint, *connections(session.endpoints)),
+    )
+    assert again.code() == 0, again
+    assert [session.processes[name].code() for name in SITES] == [0, 0, 0]
+    torn = recover(active(session.log))
+    assert torn.lossless
+    second = session.log.with_name("run-002.mcap")
+    log = open_log(session.log, second)
+    for name in SITES:
+        assert [state.tick for state in log[name].states] == list(range(6000))
+    with second.open("rb") as stream:
+        metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}
+    assert metadata["trilat.part"] == {"index": "2", "previous": "run.mcap"}
+    executed_again(log)

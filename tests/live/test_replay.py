@@ -1,0 +1,97 @@
+"""A log on the network once more: recorded again it is the same log, and others find a session that runs."""
+
+import signal
+from pathlib import Path
+
+from tests.playback.logs import session_payloads
+from trilat_net.log.reader import open_log
+from trilat_net.net.endpoints import free_endpoints
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
+
+from .processes import Process, Session, Stage, executed_again
+
+SITES = ("m", "s")
+
+
+class Again:
+    """A replay on an endpoint of its own, and those who listen to it."""
+
+    def __init__(self, stage: Stage, log: Path) -> None:
+        self._stage, self._log = stage, log
+        (self.endpoint,) = free_endpoints(1)
+
+    def replay(self, *options: str, called: str = "replay", listen: str = "") -> Process:
+        return self._stage.start(
+            called,
+            *("replay", str(self._log), "--session", "again", "--listen", listen or self.endpoint, *options),
+        )
+
+    def recorder(self, log: Path) -> Process:
+        return self._stage.start(
+            "second recorder",
+            *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint),
+        )
+
+
+def numbered(log: Path) -> dict[str, list[bytes]]:
+    """What sites published, per channel in an order that does not depend on the file's."""
+    return {key: sorted(found) for key, found in session_payloads(log).items()}
+
+
+def test_a_session_recorded_played_and_recorded_again_is_the_same_bytes_in_the_same_order(
+    stage: Stage,
+) -> None:
+    session = Session(stage, "two_sites", SITES, "--duration", "1.5")
+    session.all()
+    assert set(session.codes().values()) == {0}
+    again = Again(stage, session.log)
+    second = stage.folder / "second.mcap"
+    recorder, replay = again.recorder(second), again.replay("--needs-recorder")
+    assert (replay.code(), recorder.code()) == (0, 0)
+    assert "none dropped" in replay.text()
+    assert "the recorder has everything" in replay.text()
+    assert session_payloads(second) == session_payloads(session.log)
+    log = open_log(second)
+    executed_again(log)
+    assert "missing 0" in log.account("s")
+
+
+def virtual_log(folder: Path) -> Path:
+    """A second of two sites."""
+    path = folder / "run.mcap"
+    with path.open("wb") as stream:
+        virtual.record(load("two_sites", {"duration_s": 1.0}), stream)
+    return path
+
+
+def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(stage: Stage) -> None:
+    """Round after round, so that nobody is too late; until Ctrl-C."""
+    path = virtual_log(stage.folder)
+    again = Again(stage, path)
+    replay = again.replay("--loop")
+    replay.prints("playing")
+    ping = stage.start("ping", "ping", "--session", "again", "--connect", again.endpoint, "--count", "5")
+    (elsewhere,) = free_endpoints(1)
+    other = again.replay("--connect", again.endpoint, called="other replay", listen=elsewhere)
+    second = stage.folder / "second.mcap"
+    recorder = again.recorder(second)
+    assert ping.code() == 0
+    assert "session again runs" in ping.text()
+    assert other.code() == 2
+    assert "session 'again' is there already and runs" in other.text()
+    assert recorder.code() == 0
+    assert numbered(second) == numbered(path)
+    replay.signal(signal.SIGINT)
+    assert replay.code() == 130
+    assert "interrupted" in replay.text()
+
+
+def test_read_by_another_process_and_as_fast_as_can_be_nothing_is_lost(stage: Stage) -> None:
+    path = virtual_log(stage.folder)
+    again = Again(stage, path)
+    second = stage.folder / "second.mcap"
+    recorder = again.recorder(second)
+    replay = again.replay("--rate", "max", "--preload", "0", "--needs-recorder")
+    assert (replay.code(), recorder.code()) == (0, 0)
+    assert numbered(second) == numbered(path)

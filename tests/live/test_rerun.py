@@ -1,0 +1,47 @@
+"""What if, asked of a session over a network: with nothing changed, any of its sites is the log."""
+
+from itertools import combinations
+
+from tests.cli.running import trilat
+from trilat_net.replay.comparison import late_samples
+from trilat_net.whatif.rerun import rerun
+
+from .processes import Session, Stage, connections, whole
+
+PAPER = ("m1", "m2", "s")
+LINKS = (
+    "link.delay_ms=1",  # some samples come late
+    "links.m2->s.model=measured",
+    "links.s->m1.preset=4g",
+    "links.s->m1.loss=0.2",
+    "links.s->m1.loss_burst=5",
+    "links.m1->m2.duplicate=0.3",
+    "links.s->m2.outages_s=[[1.0, 1.3]]",
+    "sites.m2.on_stale.action=hold",
+    "sites.m2.on_stale.age_ms=100.0",
+)
+
+
+def test_any_sites_of_a_session_are_what_they_were(stage: Stage) -> None:
+    """Late samples, losses, duplicates, an outage, a stale peer, a measured link, and a change by command."""
+    options = [word for text in LINKS for word in ("--set", text)]
+    session = Session(stage, "paper", PAPER, "--duration", "4", *options)
+    session.all()
+    session.begun()
+    session.recording()
+    to = ("set", "--session", "t", *connections(session.endpoints))
+    trilat(*to, "link", "m1->s", "--delay", "30ms", cwd=stage.folder).succeeds()
+    assert set(session.codes().values()) == {0}
+    log = whole(session.log)
+    assert late_samples(log)
+    assert "hold" in {state.mode for state in log["m2"].states}
+    assert log.changes("s")
+    for count in (1, 2, 3):
+        for replace in combinations(PAPER, count):
+            again = rerun(log, replace)
+            assert again.identical
+            assert all(effect.executed == 4000 for effect in again.sites.values())
+    # what the network did stays: a delay above its worst makes every sample of the link as old as that
+    slower = rerun(log, ["s"], {"links.m2->s.model": "constant", "links.m2->s.delay_ms": 900.0})
+    assert slower.links["m2->s"].age_max_ms.after == 900.0
+    assert slower.links["m1->s"].age_mean_ms.before == slower.links["m1->s"].age_mean_ms.after

@@ -1,0 +1,79 @@
+"""The messages of a log dealt out to several files, each of which opens on its own."""
+
+import io
+from collections.abc import Collection, Sequence
+
+import msgpack
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+Message = tuple[str, bytes, int, int, int]
+"""Topic, payload, log time, publish time, sequence."""
+
+
+def messages(data: bytes) -> list[Message]:
+    reader = make_reader(io.BytesIO(data))
+    return [
+        (channel.topic, m.data, m.log_time, m.publish_time, m.sequence)
+        for _, channel, m in reader.iter_messages(log_time_order=False)
+    ]
+
+
+def changed(message: Message, **fields: object) -> Message:
+    topic, payload, *rest = message
+    return (topic, msgpack.packb({**msgpack.unpackb(payload), **fields}), *rest)
+
+
+def a_file(
+    data: bytes,
+    chosen: Sequence[Message],
+    *,
+    finished: bool = True,
+    session: dict[str, str] | None = None,
+    scenario: str | None = None,
+    part: int = 0,
+    accounts: dict[str, str] | None = None,
+) -> bytes:
+    """A log with the head of another one and these messages.
+
+    Args:
+        data: the other one.
+        chosen: the messages.
+        finished: whether it has its end.
+        session: entries of the session's metadata that are changed.
+        scenario: its scenario, where that is another one.
+        part: its number among the parts of a log; 0: it says nothing of parts.
+        accounts: its accounts.
+    """
+    reader = make_reader(io.BytesIO(data))
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    (head,) = (entry.metadata for entry in reader.iter_metadata() if entry.name == "trilat.session")
+    writer.add_metadata("trilat.session", {**head, **(session or {})})
+    if part:
+        writer.add_metadata("trilat.part", {"index": str(part), "previous": ""})
+    (attachment,) = reader.iter_attachments()
+    text = attachment.data if scenario is None else scenario.encode()
+    writer.add_attachment(0, 0, attachment.name, attachment.media_type, text)
+    schema = writer.register_schema("any", "jsonschema", b"{}")
+    channels: dict[str, int] = {}
+    for topic, payload, log_ns, publish_ns, sequence in chosen:
+        if topic not in channels:
+            channels[topic] = writer.register_channel(topic, "msgpack", schema)
+        writer.add_message(channels[topic], log_ns, payload, publish_ns, sequence)
+    if not finished:
+        writer.flush()
+        return stream.getvalue()
+    writer.add_metadata("trilat.accounts", accounts or {})
+    writer.finish()
+    return stream.getvalue()
+
+
+def dealt(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
+    """The parts of a log: file n has the messages whose places are in hand n, in their order."""
+    every = messages(data)
+    return [
+        a_file(data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs)  # type: ignore[arg-type]
+        for n, hand in enumerate(hands)
+    ]

@@ -1,0 +1,91 @@
+"""Disks that have little room, or take little at a time: stand-ins for `FileIO` and `Ballast`."""
+
+import errno
+import io
+import os
+from pathlib import Path
+
+from trilat_net.log.container import Container
+from trilat_net.log.logfile import LogFile
+
+
+class SmallDisk:
+    """A disk with so many bytes, for one file and the room that is kept for it.
+
+    Args:
+        capacity: bytes.
+        error: what it says when they are used up.
+        most: how many bytes it takes at once.
+    """
+
+    def __init__(self, capacity: int, error: int = errno.ENOSPC, most: int = 1 << 30) -> None:
+        self.capacity, self.error, self.most = capacity, error, most
+        self.written = 0
+        self.kept = 0
+
+    def refuse(self) -> OSError:
+        return OSError(self.error, os.strerror(self.error))
+
+    def opened(self, path: Path, mode: str) -> "SmallFile":
+        return SmallFile(self, path, mode)
+
+
+class SmallFile(io.FileIO):
+    """A file on a small disk."""
+
+    def __init__(self, disk: SmallDisk, path: Path, mode: str) -> None:
+        super().__init__(path, mode)
+        self._disk = disk
+
+    def write(self, data: memoryview) -> int:  # type: ignore[override]
+        disk = self._disk
+        taken = min(len(data), disk.most, disk.capacity - disk.written - disk.kept)
+        if taken <= 0 < len(data):
+            raise disk.refuse()
+        disk.written += taken
+        return super().write(data[:taken])
+
+    def truncate(self, size: int | None = None) -> int:
+        self._disk.written = size or 0
+        return super().truncate(size)
+
+
+class SmallRoom:
+    """Room kept on a small disk; none where `possible` is False."""
+
+    def __init__(self, disk: SmallDisk, possible: bool = True) -> None:
+        self._disk, self._possible = disk, possible
+
+    def grow(self, size: int) -> None:
+        if not self._possible or size <= self._disk.kept:
+            return
+        if self._disk.written + size > self._disk.capacity:
+            raise self._disk.refuse()
+        self._disk.kept = size
+
+    def release(self) -> None:
+        self._possible = False
+        self._disk.kept = 0
+
+
+def file_on(disk: SmallDisk, path: Path, room: bool = True) -> LogFile:
+    return LogFile(path, room=SmallRoom(disk, room), opened=disk.opened)
+
+
+Sent = tuple[int, int, bytes, int, int]
+"""Channel, log time, payload, publish time, sequence."""
+
+
+def sent(count: int) -> list[Sent]:
+    """Messages that cannot be packed."""
+    return [(1 + n % 2, 10 * n, os.urandom(40), 10 * n + 1, n) for n in range(count)]
+
+
+def begun(file: LogFile) -> Container:
+    """A file with two channels, flushed."""
+    container = Container(file, "lib")
+    schema = container.register_schema("S", "jsonschema", b"{}")
+    for name in "ab":
+        container.register_channel(f"/{name}", "msgpack", schema)
+    container.flush()
+    return container

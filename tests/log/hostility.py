@@ -1,0 +1,353 @@
+"""Hostile logs, and everybody who reads one. Shared by the tests and by `tests/fuzz_log.py`."""
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import lz4.frame
+import msgpack
+import zstandard
+
+from tests.log_editing import edited
+from trilat_net.analysis.overview import overview
+from trilat_net.errors import TrilatError
+from trilat_net.log.framing import Framing
+from trilat_net.log.packed import unpacked
+from trilat_net.log.reader import open_log
+from trilat_net.log.recover import recover
+from trilat_net.log.soundness import soundness
+from trilat_net.playback.loading import load
+from trilat_net.playback.selection import Selection
+from trilat_net.replay.verify import verify
+
+LENGTHS = (0, 1, 7, 22, 255, 1 << 16, 1 << 20, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
+NUMBERS = (
+    0,
+    -1,
+    1,
+    255,
+    1 << 31,
+    1 << 40,
+    (1 << 40) - 1,
+    (1 << 63) - 1,
+    -(1 << 63),
+    (1 << 64) - 1,
+    3,
+    119,
+    120,
+)
+VALUES: tuple[Any, ...] = (
+    *NUMBERS,
+    float("nan"),
+    float("inf"),
+    1e308,
+    -1e308,
+    5e-324,
+    "",
+    "x",
+    "m1",
+    "diverged",
+    "end",
+    None,
+    True,
+    [],
+    {},
+    [0, 0],
+    [0.0] * 3,
+    [float("nan")] * 3,
+    [1e300] * 3,
+    [[0, 0, 0]] * 300,
+    [[1 << 40, (1 << 40) - 1, -(1 << 58)]],
+    [[0, 5, 0], [0, 5, 0], [1, (1 << 58), 3]],
+    {"m2": 1 << 62, "s": (1 << 64) - 1},
+    {"m2": -(1 << 63)},
+    {str(n): n for n in range(300)},
+    ["{}", '{"link": "m2->m1"}', "[" * 2000, '{"at_s": 1e999}'],
+    ["x" * 5000],
+)
+"""What a field of a message may be turned into."""
+TEXTS = ("", "0", "-1", "9" * 400, "x" * 3000, "\x1b[31m", "live", "virtual", "m1 m2 s", "1e999", "²")
+SCENARIO_VALUES = (
+    "0x" + "f" * 300,
+    "-1",
+    "1e308",
+    "5e-324",
+    "nan",
+    "''",
+    "[]",
+    "{}",
+    "[[]]",
+    "true",
+    "86400",
+    "20000",
+    "1",
+    "[1e308, 1e308]",
+    "'/dev/zero'",
+    "'0 0, 1 lost'",
+)
+
+
+class Draws(Protocol):
+    """Where choices come from: `random.Random`, or the bytes of a fuzzer."""
+
+    def randrange(self, start: int, stop: int) -> int:
+        """Returns a number from start to before stop."""
+
+    def random(self) -> float:
+        """Returns a number from 0 to before 1."""
+
+
+def one_of(draws: Draws, values: Sequence[Any]) -> Any:
+    return values[draws.randrange(0, len(values))]
+
+
+def another(value: Any, draws: Draws) -> Any:
+    """Returns another value, mostly of the same kind."""
+    alike = [each for each in VALUES if type(each) is type(value)]
+    return one_of(draws, alike if alike and draws.random() < 0.8 else VALUES)
+
+
+def flipped(data: bytes, draws: Draws) -> bytes:
+    """Some bits are others."""
+    changed = bytearray(data)
+    for _ in range(draws.randrange(1, 4)):
+        changed[draws.randrange(0, len(changed))] ^= 1 << draws.randrange(0, 8)
+    return bytes(changed)
+
+
+def torn(data: bytes, draws: Draws) -> bytes:
+    """The end, or a piece in the middle, is not there."""
+    start = draws.randrange(0, len(data))
+    length = len(data) if draws.random() < 0.5 else draws.randrange(1, 2000)
+    return data[:start] + data[start + length :]
+
+
+def lengthened(data: bytes, draws: Draws) -> bytes:
+    """A number at some place is a hostile one: a length, an offset, a count."""
+    changed = bytearray(data)
+    size = one_of(draws, (2, 4, 8))
+    at = draws.randrange(0, len(data) - size)
+    changed[at : at + size] = (one_of(draws, LENGTHS) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
+    return bytes(changed)
+
+
+def record_lengthened(data: bytes, draws: Draws) -> bytes:
+    """The length of a record of the file is another."""
+    frames = list(Framing(io.BytesIO(data)).frames())
+    frame = one_of(draws, frames)
+    changed = bytearray(data)
+    length = one_of(draws, (*LENGTHS, frame.length + 1, max(0, frame.length - 1), len(data)))
+    struct.pack_into("<Q", changed, frame.offset + 1, length)
+    return bytes(changed)
+
+
+def chunk(
+    records: bytes, size: int | None = None, compression: str = "zstd", crc: int | None = None
+) -> bytes:
+    """A chunk with these records, which says what it likes."""
+    packed = {
+        "zstd": lambda: zstandard.compress(records),
+        "lz4": lambda: lz4.frame.compress(records),
+        "": lambda: records,
+    }[compression]()
+    name = compression.encode()
+    head = struct.pack(
+        "<QQQI", 0, 0, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc
+    )
+    content = head + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(content)) + content
+
+
+def repacked(data: bytes, draws: Draws, change: Callable[[bytes, Draws], bytes]) -> bytes:
+    """What is inside a chunk is changed, and its checksum is right."""
+    framing = Framing(io.BytesIO(data))
+    chunks = [frame for frame in framing.frames() if frame.opcode == 6]
+    if not chunks:
+        return data
+    frame = one_of(draws, chunks)
+    try:
+        inside = change(unpacked(framing.content(frame)), draws)
+    except Exception:  # it is damaged already
+        return data
+    new = chunk(inside, compression=one_of(draws, ("zstd", "lz4", "")))
+    return data[: frame.offset] + new + data[frame.end :]
+
+
+def inside_changed(data: bytes, draws: Draws) -> bytes:
+    return repacked(data, draws, one_of(draws, (flipped, torn, lengthened)))
+
+
+def message_changed(data: bytes, draws: Draws) -> bytes:
+    """A message of the log says something else, in one field or two."""
+
+    def change(inside: bytes, draws: Draws) -> bytes:
+        places = []
+        at = 0
+        while at + 9 <= len(inside):
+            opcode, length = struct.unpack_from("<BQ", inside, at)
+            if opcode == 5:
+                places.append((at, length))
+            at += 9 + length
+        if not places:
+            return inside
+        for _ in range(draws.randrange(1, 4)):
+            at, length = places[-1 - draws.randrange(0, len(places))]
+            payload = inside[at + 31 : at + 9 + length]
+            try:
+                fields = msgpack.unpackb(payload)
+                name = one_of(draws, list(fields))
+                fields[name] = another(fields[name], draws)
+                payload = msgpack.packb(fields)
+            except Exception:  # not one of ours, or what cannot be packed
+                payload = flipped(payload, draws) if payload else payload
+            new = struct.pack("<BQ", 5, 22 + len(payload)) + inside[at + 9 : at + 31] + payload
+            inside = inside[:at] + new + inside[at + 9 + length :]
+            break
+        return inside
+
+    return repacked(data, draws, change)
+
+
+def field_changed(data: bytes, draws: Draws) -> bytes:
+    """A field is another from some record of a site on."""
+    name = one_of(
+        draws,
+        (
+            "tick",
+            "t_ns",
+            "used",
+            "rx",
+            "cmd",
+            "mem",
+            "mode",
+            "late_us",
+            "boot",
+            "site",
+            "echo",
+            "v",
+            "sent_ns",
+            "rx_crc",
+            "busy_us",
+            "q",
+        ),
+    )
+    kinds = {"used": {}, "rx": [], "cmd": [], "mem": [], "echo": [], "q": [], "mode": "", "site": ""}
+    value = another(kinds.get(name, 0), draws)
+    since, site = draws.randrange(0, 30), one_of(draws, ("m1", "m2", "s"))
+
+    def change(record: dict[str, Any]) -> dict[str, Any]:
+        hit = record["site"] == site and record["tick"] >= since
+        return {**record, name: value} if hit else record
+
+    try:
+        return edited(data, record=change)
+    except Exception:  # it was no log any more
+        return data
+
+
+def told_otherwise(data: bytes, draws: Draws) -> bytes:
+    """The session's metadata say something else."""
+    keys = (
+        "session",
+        "driver",
+        "scenario_sha256",
+        "epoch_unix_ns",
+        "schema_version",
+        "sites",
+        "fingerprint",
+        "seed",
+        "rerun_executed",
+    )
+    try:
+        return edited(data, session={one_of(draws, keys): one_of(draws, TEXTS)})
+    except Exception:
+        return data
+
+
+def scenario_changed(data: bytes, draws: Draws) -> bytes:
+    """A value of the scenario is another, or a table is there twice."""
+
+    def change(text: str) -> str:
+        lines = text.split("\n")
+        places = [n for n, line in enumerate(lines) if " = " in line]
+        if not places:
+            return text
+        for _ in range(draws.randrange(1, 3)):
+            place = one_of(draws, places)
+            key = lines[place].partition(" = ")[0]
+            lines[place] = f"{key} = {one_of(draws, SCENARIO_VALUES)}"
+        return "\n".join(lines)
+
+    try:
+        return edited(data, scenario=change)
+    except Exception:
+        return data
+
+
+CHANGES: tuple[Callable[[bytes, Draws], bytes], ...] = (
+    flipped,
+    torn,
+    lengthened,
+    record_lengthened,
+    inside_changed,
+    message_changed,
+    message_changed,
+    field_changed,
+    told_otherwise,
+    scenario_changed,
+)
+
+
+def mangled(data: bytes, draws: Draws) -> bytes:
+    """A log, changed in one way or two."""
+    for _ in range(draws.randrange(1, 3)):
+        if len(data) > 16:
+            data = one_of(draws, CHANGES)(data, draws)
+    return data
+
+
+def _arrays(path: Path) -> None:
+    log = open_log(path)
+    for site in log.sites:
+        part = log[site]
+        _ = part.q, part.used, part.arrivals, part.t_s, part.mode, part.late_us, part.sent_ns
+        log.link_stats(site)
+        log.changes(site)
+    repr(log)
+    log.recorder_stats()
+    _ = log.accounts, log.complete
+
+
+def _executed(path: Path) -> None:
+    verify(open_log(path))
+
+
+def _recovered(path: Path) -> None:
+    output = path.with_name("made.mcap")
+    output.unlink(missing_ok=True)
+    recover(path, output)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "arrays": _arrays,
+    "verify": _executed,
+    "info": lambda path: overview([path]),
+    "check": lambda path: soundness([path]),
+    "recover": _recovered,
+    "replay": lambda path: load([path], Selection(), 64 << 20),
+}
+"""Everybody who reads a log, by name."""
+
+
+def read_by_all(path: Path) -> dict[str, str]:
+    """Has everybody read a file; returns what each said against it. Anything but a `TrilatError` is raised."""
+    complaints = {}
+    for name, reader in READERS.items():
+        try:
+            reader(path)
+        except TrilatError as error:
+            complaints[name] = str(error)
+    return complaints

@@ -1,0 +1,81 @@
+"""Files as other people's readers get them: of a simulation, of a recorder, a part, recovered, exported."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from trilat_net.core.tick import Output
+from trilat_net.log.container import Sink
+from trilat_net.log.parts import LogParts, Storage
+from trilat_net.log.reader import open_log
+from trilat_net.log.recover import recover
+from trilat_net.log.ros2 import export_ros2
+from trilat_net.log.writer import LogWriter
+from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.net.wire import decode, encode, encode_state
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
+
+EPOCH_NS = 1_700_000_000_000_000_000
+SCENARIO = load("two_sites", {"duration_s": 0.5})
+KINDS = ("virtual", "live", "first part", "last part", "recovered")
+VIEWS_HZ = 100.0
+
+
+def outputs() -> dict[str, list[Output]]:
+    """What each site does."""
+    made: dict[str, list[Output]] = {name: [] for name in SCENARIO.names}
+    for step in virtual.run(SCENARIO):
+        made[step.site.name].append(step.output)
+    return made
+
+
+def live(storage: Storage) -> None:
+    """Records a session as the recorder does: records that were sent late and came later."""
+
+    def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+        return LogWriter(
+            stream, SCENARIO, "lab", "live", EPOCH_NS, part=part, choice=storage.choice, views_hz=VIEWS_HZ
+        )
+
+    with LogParts(storage, begin) as log:
+        for step in virtual.run(SCENARIO):
+            name, k, t_ns = step.site.name, step.output.tick, step.output.t_ns
+            sent_ns, log_ns = t_ns + 80_000, EPOCH_NS + t_ns + 300_000
+            payload = encode_state(name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns)
+            state = decode(payload, State)
+            log.add(f"trilat/lab/{name}/state", payload, sent_ns, log_ns, k, state)
+            if k % 100 == 0:
+                stats = statistics(name, step.site.peers[0], k, t_ns)
+                log.add(f"trilat/lab/{name}/link", encode(stats), t_ns, log_ns, k, stats)
+                log.flush()
+        for n, name in enumerate(SCENARIO.names):
+            end = Event(member=name, boot=7, kind="end", text=f"{name} made 500 ticks", t_ns=5 * 10**8, n=0)
+            log.add(f"trilat/lab/{name}/event", encode(end), end.t_ns, EPOCH_NS + 6 * 10**8 + n, 0, end)
+        log.finish({})
+
+
+def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
+    """Statistics of a site with one peer, as a live loop publishes them."""
+    counts = {name: {peer: 0} for name in ("accepted", "late", "duplicate", "refused")}
+    measured = {"offset_us": {peer: -120}, "bound_us": {peer: 40}, "rtt_us": {peer: 400}}
+    facts = {"v": 3, "site": site, "boot": 7, "tick": tick, "t_ns": t_ns, "mode": "run", "dropped": {}}
+    loop = {"age_us": {peer: 1000 + tick}, "late_max_us": 90, "busy_max_us": 30, "overruns": 0}
+    delays = {"delay_us": {peer: 210 + tick}, "delay_max_us": {peer: 900}}
+    return LinkStats(**facts, **loop, **delays, **measured, **counts)
+
+
+def made(folder: Path) -> dict[str, Path]:
+    """Makes every kind of file, and the bag of the live one."""
+    whole = folder / "virtual.mcap"
+    with whole.open("wb") as stream:
+        virtual.record(SCENARIO, stream, views_hz=VIEWS_HZ)
+    live(Storage(folder / "live.mcap"))
+    live(Storage(folder / "parts.mcap", split_ns=200_000_000))
+    parts = sorted(folder.glob("parts-*.mcap"))
+    torn = folder / "torn.mcap"
+    torn.write_bytes((folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10])
+    recover(torn, folder / "recovered.mcap")
+    bag = folder / "live-ros2.mcap"
+    export_ros2(open_log(folder / "live.mcap"), bag)
+    found = (whole, folder / "live.mcap", parts[0], parts[-1], folder / "recovered.mcap")
+    return {**dict(zip(KINDS, found, strict=True)), "bag": bag}

@@ -1,0 +1,144 @@
+"""Our bytes against two decoders and a serializer that other people wrote."""
+
+import math
+import struct
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from trilat_net.log import cdr
+from trilat_net.log.cdr import Dimension, JointStates, Level, float_arrays, log_message, string_message
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
+floats = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.nan, math.inf, 5e-324])
+stamps_ns = st.integers(0, (1 << 31) * 10**9 - 1)
+
+
+def decoded(name: str, data: bytes) -> Any:
+    """By mcap-ros2-support, from the schema text that stands in our files."""
+    schema = Schema(id=1, name=name, encoding="ros2msg", data=cdr.SCHEMAS[name])
+    decoder = DecoderFactory().decoder_for("cdr", schema)
+    assert decoder is not None
+    return decoder(data)
+
+
+def by_rosbags(name: str, data: bytes) -> Any:
+    """By rosbags, from its own definition of the type."""
+    return STORE.deserialize_cdr(data, name)
+
+
+def serialized(name: str, message: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(message, name))
+
+
+def type_of(name: str) -> Any:
+    return STORE.types[name]
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
+    return type_of("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
+
+
+def bits(numbers: Any) -> list[bytes]:
+    """So that NaN equals itself and -0.0 is not 0.0."""
+    return [struct.pack("<d", number) for number in numbers]
+
+
+@pytest.mark.parametrize("name", list(cdr.SCHEMAS))
+def test_a_schema_text_is_complete_and_the_type_itself(name: str) -> None:
+    """Its hash, by which ROS 2 tells types apart, is that of the type."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(cdr.SCHEMAS[name].decode(), name))
+    assert store.hash_rihs01(name) == STORE.hash_rihs01(name)
+
+
+@st.composite
+def joint_states(draw: st.DrawFn) -> SimpleNamespace:
+    names = draw(st.lists(words, max_size=5))
+    velocity, effort = draw(st.booleans()), draw(st.booleans())
+    row = st.lists(floats, min_size=len(names), max_size=len(names))
+    return SimpleNamespace(
+        stamp_ns=draw(stamps_ns),
+        frame_id=draw(words),
+        names=names,
+        position=draw(row),
+        velocity=draw(row) if velocity else [],
+        effort=draw(row) if effort else [],
+        packer=lambda frame_id: JointStates(names, frame_id, velocity=velocity, effort=effort),
+    )
+
+
+@given(joint_states())
+def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> None:
+    data = case.packer(case.frame_id).pack(case.stamp_ns, case.position, case.velocity, case.effort)
+    for message in (decoded(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
+        stamp = message.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == case.stamp_ns
+        assert (message.header.frame_id, list(message.name)) == (case.frame_id, case.names)
+        assert bits(message.position) == bits(case.position)
+        assert bits(message.velocity) == bits(case.velocity)
+        assert bits(message.effort) == bits(case.effort)
+    own = type_of(cdr.JOINT_STATE)(
+        header=header(case.stamp_ns, case.frame_id),
+        name=case.names,
+        position=np.array(case.position),
+        velocity=np.array(case.velocity),
+        effort=np.array(case.effort),
+    )
+    assert data == serialized(cdr.JOINT_STATE, own)
+
+
+@st.composite
+def arrays(draw: st.DrawFn) -> tuple[list[Dimension], list[float]]:
+    dimensions = draw(st.lists(st.builds(Dimension, words, st.integers(0, 3)), max_size=3))
+    count = math.prod(dimension.size for dimension in dimensions)
+    return dimensions, draw(st.lists(floats, min_size=count, max_size=count))
+
+
+@given(arrays())
+def test_arrays_are_read_as_they_were_written(case: tuple[list[Dimension], list[float]]) -> None:
+    dimensions, numbers = case
+    data = float_arrays(*dimensions)(*numbers)
+    strides = [math.prod(d.size for d in dimensions[n:]) for n in range(len(dimensions))]
+    for message in (decoded(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
+        assert bits(message.data) == bits(numbers)
+        shape = [(d.label, d.size, d.stride) for d in message.layout.dim]
+        assert shape == [(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
+    one = type_of("std_msgs/msg/MultiArrayDimension")
+    dims = [one(d.label, d.size, stride) for d, stride in zip(dimensions, strides, strict=True)]
+    layout = type_of("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
+    own = type_of(cdr.FLOAT64_ARRAY)(layout=layout, data=np.array(numbers))
+    assert data == serialized(cdr.FLOAT64_ARRAY, own)
+
+
+@given(words)
+def test_a_string_is_read_as_it_was_written(text: str) -> None:
+    data = string_message(text)
+    assert decoded(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
+    assert data == serialized(cdr.STRING, type_of(cdr.STRING)(data=text))
+
+
+@given(stamps_ns, st.sampled_from(Level), words, words)
+def test_a_line_of_a_log_is_read_as_it_was_written(stamp_ns: int, level: Level, name: str, text: str) -> None:
+    data = log_message(stamp_ns, level, name, text)
+    for message in (decoded(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
+        assert message.stamp.sec * 10**9 + message.stamp.nanosec == stamp_ns
+        assert (message.level, message.name, message.msg, message.line) == (level, name, text, 0)
+        assert (message.file, message.function) == ("", "")
+    time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
+    own = type_of(cdr.LOG)(stamp=time, level=level.value, name=name, msg=text, file="", function="", line=0)
+    assert data == serialized(cdr.LOG, own)
+
+
+def test_a_stamp_beyond_what_ros_2_can_say_is_its_last_second() -> None:
+    message = by_rosbags(cdr.JOINT_STATE, JointStates(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
+    assert message.header.stamp.sec == 2**31 - 1

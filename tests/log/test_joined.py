@@ -1,0 +1,213 @@
+"""Parts of a session read as one log, whatever they are; what is no part of it is refused."""
+
+import io
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.log.dealt import Message, a_file, changed, dealt, messages
+from tests.log_editing import opened, recorded
+from trilat_net.errors import LogError
+from trilat_net.log.reader import Log, open_log
+from trilat_net.log.writer import LogWriter
+from trilat_net.net import topics
+from trilat_net.net.messages import Event, RecorderStats
+from trilat_net.net.wire import encode
+from trilat_net.replay.verify import verify
+from trilat_net.scenario import load
+
+
+@cache
+def whole() -> bytes:
+    return recorded("paper")
+
+
+@cache
+def count() -> int:
+    return len(messages(whole()))
+
+
+def joined(*parts: bytes) -> Log:
+    return open_log(*map(io.BytesIO, parts))
+
+
+def holds(log: Log) -> dict[str, object]:
+    """All that a log holds, as its file has it."""
+    return {
+        "records": {name: list(log[name].payloads) for name in log.sites},
+        "came": {name: log[name].log_time_ns.tolist() for name in log.sites},
+        "statistics": {name: log.link_stats(name) for name in log.sites},
+        "events": log.events,
+        "missing": [log.missing(name) for name in log.sites],
+    }
+
+
+@st.composite
+def hands(draw: st.DrawFn) -> list[set[int]]:
+    """Every message in one of the hands at least, some in several."""
+    n = draw(st.integers(1, 4))
+    bounds = sorted(draw(st.lists(st.integers(0, count()), min_size=n - 1, max_size=n - 1)))
+    edges = [0, *bounds, count()]
+    overlap = st.sets(st.integers(0, count() - 1), max_size=20)
+    return [set(range(edges[k], edges[k + 1])) | draw(overlap) for k in range(n)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(hands(), st.randoms(use_true_random=False))
+def test_a_log_dealt_out_reads_as_the_whole_in_whatever_order_its_parts_are_named(dealing, chance) -> None:
+    parts = dealt(whole(), dealing)
+    chance.shuffle(parts)
+    log = joined(*parts)
+    assert holds(log) == holds(opened(whole()))
+    assert log.complete
+
+
+def test_a_log_of_parts_verifies_as_the_whole() -> None:
+    parts = dealt(whole(), [range(200), range(150, count())])
+    verdict = verify(joined(*parts))
+    assert (verdict.identical, verdict.first) == (360, None)
+    assert verdict.gaps == []
+
+
+def place_of(topic_end: str, number: int = 0) -> int:
+    return [n for n, m in enumerate(messages(whole())) if m[0].endswith(topic_end)][number]
+
+
+@pytest.mark.parametrize(
+    ("where", "fields", "named"),
+    [
+        ("m1/state", {"q": [9.0, 9.0]}, "record of tick 0 of m1"),
+        ("m2/link", {"overruns": 9}, "statistics of tick 0 of m2"),
+        ("s/event", {"text": "no"}, "event 0 of s"),
+    ],
+)
+def test_parts_that_tell_the_same_differently_are_refused_by_their_names(
+    where: str, fields: dict[str, object], named: str, tmp_path: Path
+) -> None:
+    every = messages(whole())
+    other: list[Message] = [changed(every[place_of(where)], **fields)]
+    paths = [tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"]
+    paths[0].write_bytes(whole())
+    paths[1].write_bytes(a_file(whole(), other))
+    with pytest.raises(LogError, match=named) as raised:
+        open_log(*paths)
+    assert all(str(path) in str(raised.value) for path in paths)
+
+
+@pytest.mark.parametrize(
+    ("session", "scenario", "named"),
+    [
+        ({"session": "lab"}, None, "session lab, not paper"),
+        ({"epoch_unix_ns": "7"}, None, "epoch_unix_ns 7, not 0"),
+        ({"driver": "live"}, None, "driver live, not virtual"),
+        ({}, load("free").text, "scenario [0-9a-f]{16}, not "),
+    ],
+)
+def test_files_of_different_sessions_are_refused_with_what_differs(
+    session: dict[str, str], scenario: str | None, named: str, tmp_path: Path
+) -> None:
+    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
+    one.write_bytes(whole())
+    two.write_bytes(a_file(whole(), [], session=session, scenario=scenario))
+    with pytest.raises(LogError, match=rf"two\.mcap: is no part of the session in .*one\.mcap: {named}"):
+        open_log(one, two)
+
+
+def test_a_torn_part_whose_hole_another_one_fills_leaves_the_whole_complete() -> None:
+    every = messages(whole())
+    torn = a_file(whole(), every[:150], finished=False)
+    carried_on = a_file(whole(), every[100:], part=2)
+    assert not opened(torn).complete
+    assert not opened(carried_on).complete
+    assert joined(torn, carried_on).complete
+
+
+def test_a_record_that_no_part_has_is_missing_and_a_torn_part_shows_it() -> None:
+    every = messages(whole())
+    torn = a_file(whole(), every[:150], finished=False)
+    log = joined(torn, a_file(whole(), every[151:], part=2))
+    assert not log.complete
+    assert sum(map(log.missing, log.sites)) == 1
+    assert sum("missing 1" in log.account(name) for name in log.sites) == 1
+
+
+def test_a_part_that_is_not_named_leaves_the_whole_incomplete() -> None:
+    parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
+    assert joined(*parts).complete
+    assert not joined(parts[0], parts[2]).complete
+    assert not opened(parts[2]).complete
+
+
+def test_an_unfinished_end_leaves_the_whole_incomplete() -> None:
+    every = messages(whole())
+    assert not joined(a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)).complete
+
+
+def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
+    """A part that a recorder wrote, with what it counted so far."""
+    stream = io.BytesIO()
+    scenario = load("free")
+    writer = LogWriter(stream, scenario, "lab", "live", 10**18, part={"index": str(part), "previous": ""})
+    stats = RecorderStats(boot=recorder, t_ns=at_ns, expected={}, received={}, missing={})
+    event = Event(member="recorder", boot=recorder, kind="late", text="late", n=0)
+    for channel, message in ((topics.STATS, stats), (topics.EVENT, event)):
+        payload = encode(message)
+        writer.add(topics.key("lab", topics.RECORDER, channel), payload, at_ns, 10**18 + at_ns, 0)
+    writer.finish({"dropped: stranger": str(dropped), "/trilat/lab/m1/state": "received 7"})
+    return stream.getvalue()
+
+
+def test_what_recorders_dropped_is_counted_once_each_though_one_counts_on_from_part_to_part() -> None:
+    log = joined(
+        by(1, at_ns=0, dropped=2, part=1),
+        by(1, at_ns=10, dropped=5, part=2),
+        by(2, at_ns=20, dropped=1, part=3),
+    )
+    assert log.accounts["dropped: stranger"] == "6"
+    assert log.account("m1").startswith("expected 0, received 0")
+    assert [stats.boot for stats in log.recorder_stats()] == [1, 1, 2]
+    assert [event.boot for event in log.events] == [1, 2]
+
+
+def test_events_of_before_they_were_numbered_are_told_apart_by_what_they_say() -> None:
+    every = messages(whole())
+    place = place_of("m1/event")
+    old = [changed(every[place], n=-1, text=text) for text in ("a", "b")]
+    log = joined(a_file(whole(), old), a_file(whole(), [*old, every[place_of("m1/state")]], part=2))
+    assert [event.text for event in log.events] == ["a", "b"]
+
+
+def test_progress_is_told_of_all_parts_as_one(tmp_path: Path) -> None:
+    parts = dealt(whole(), [range(200), range(200, count())])
+    paths = [tmp_path / f"run-{n}.mcap" for n in range(2)]
+    for path, data in zip(paths, parts, strict=True):
+        path.write_bytes(data)
+    told: list[tuple[int, int]] = []
+    open_log(*paths, progress=lambda done, total: told.append((done, total)))
+    total = sum(map(len, parts))
+    assert {of for _, of in told} == {total}
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert total - 100 < told[-1][0] <= total
+
+
+def test_a_part_with_a_message_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:
+    every = messages(whole())
+    first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
+    first.write_bytes(a_file(whole(), every[:100]))
+    second.write_bytes(a_file(whole(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2))
+    with pytest.raises(LogError, match=r"run-002\.mcap: a message on /trilat/paper/m1/state cannot be read"):
+        open_log(first, second)
+
+
+def test_a_session_that_opens_says_what_it_is() -> None:
+    parts = dealt(whole(), [range(200), range(200, count())])
+    log = joined(*parts)
+    assert repr(log) == (
+        "<Log log and 1 more part: virtual session paper of m1, m2, s; 0.119 s, 360 records, none missing>"
+    )
+    assert repr(log["m1"]) == "<m1: 120 records of 1000 Hz, 0.000 s to 0.119 s, none missing>"
+    assert msgspec.structs.asdict(log.events[0])["kind"] == "end"

@@ -1,0 +1,394 @@
+"""A log's file while it is written: what a crash, a full disk and a name that is taken do to it."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from trilat_net.errors import LogRefused, NothingSaved, UsageError
+from trilat_net.log import logfile, syncing
+from trilat_net.log.ballast import STEP_BYTES, Ballast
+from trilat_net.log.logfile import MARGIN_BYTES, LogFile, active, closing_log, new_log
+from trilat_net.log.recover import recover
+from trilat_net.log.syncing import SYNC_NS
+
+from .disks import Sent, SmallDisk, begun, file_on, sent
+
+in_this_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+
+
+def messages(path: Path) -> list[Sent]:
+    with path.open("rb") as stream:
+        return [
+            (m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
+            for _, _, m in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
+
+
+# Names.
+
+
+def test_a_log_has_its_name_when_it_is_whole_and_not_before(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with new_log(path) as file:
+        container = begun(file)
+        container.add_message(1, 0, b"x", 0)
+        container.flush()
+        assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
+        container.finish()
+        assert not path.exists()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
+    assert messages(path) == [(1, 0, b"x", 0, 0)]
+
+
+def test_what_is_flushed_is_in_the_file_and_what_is_not_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    file = LogFile(path)
+    container = begun(file)
+    for n, message in enumerate(sent(5)):
+        container.add_message(*message)
+        before = active(path).stat().st_size
+        assert before == file.size
+        container.flush()
+        assert active(path).stat().st_size > before
+        with active(path).open("rb") as stream:
+            found = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
+        assert sum(isinstance(record, Message) for record in found) == container.messages == n + 1
+    file.close()
+
+
+def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def fail() -> None:
+        with new_log(path) as file:
+            begun(file).add_message(1, 0, b"x", 0)
+            _ = 1 / 0
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
+    with (
+        pytest.raises(UsageError, match=r"never finished.*trilat log recover .*run\.mcap\.active"),
+        new_log(path),
+    ):
+        pass
+    with new_log(path, force=True) as file:
+        begun(file).finish()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_file_into_which_nothing_was_written_is_not_there(tmp_path: Path) -> None:
+    with new_log(tmp_path / "run.mcap") as file:
+        file.write(b"not flushed")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_exists_is_replaced_only_when_asked_and_only_when_the_new_one_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"precious")
+    with (
+        pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"),
+        new_log(path),
+    ):
+        pass
+    with new_log(path, force=True) as file:
+        container = begun(file)
+        assert path.read_bytes() == b"precious"
+        container.finish()
+    assert messages(path) == []
+
+
+def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def write() -> None:
+        with new_log(path) as file:
+            begun(file).finish()
+            path.write_bytes(b"precious")
+
+    with pytest.raises(UsageError, match=r"exists by now; the finished log is .*run\.mcap\.active"):
+        write()
+    assert path.read_bytes() == b"precious"
+    assert messages(active(path)) == []
+
+
+def test_where_there_are_no_links_a_log_gets_its_name_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def link(*_: object) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", link)
+    with new_log(tmp_path / "run.mcap") as file:
+        begun(file).finish()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("name", ["no/run.mcap", "", "x" * 300])
+def test_a_file_that_cannot_be_made_is_bad_input(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot be written|is no file"):
+        LogFile(tmp_path / name)
+
+
+# Full disks.
+
+
+@pytest.fixture
+def unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of files, of which none need survive the loss of power; and little room for accounts."""
+    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    monkeypatch.setattr(logfile, "MARGIN_BYTES", 1000)
+
+
+@in_this_folder
+@given(count=st.integers(1, 40), most=st.integers(1, 100))
+def test_a_disk_that_takes_little_at_a_time_takes_all(count: int, most: int, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.unlink(missing_ok=True)
+    wanted = sent(count)
+    with closing_log(file_on(SmallDisk(1 << 20, most=most), path)) as file:
+        container = begun(file)
+        for message in wanted:
+            container.add_message(*message)
+        container.finish()
+    assert messages(path) == wanted
+
+
+CHUNK = 5
+
+
+def recorded(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
+    """Writes messages until the disk refuses, then the end, as a recorder does; notes what was flushed."""
+    container = None
+    try:
+        container = begun(file)
+        for n, message in enumerate(wanted, 1):
+            container.add_message(*message)
+            if n % CHUNK == 0:
+                container.flush()
+                flushed[:] = wanted[:n]
+        container.finish()
+    except OSError as error:
+        with suppress(OSError):
+            if container is not None and not file.whole:
+                container.add_metadata("accounts", {"why": str(error)})
+                container.finish()
+        raise LogRefused("refused") from None
+
+
+@pytest.mark.usefixtures("unsynced")
+def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_given(tmp_path: Path) -> None:
+    """At every byte of a chunk: the file is whole, with the chunk that did not fit any more."""
+    path = tmp_path / "run.mcap"
+    wanted = sent(60 * CHUNK)
+    seen = set()
+    for capacity in range(4000, 7000, 5):
+        disk = SmallDisk(capacity)
+        flushed: list[Sent] = []
+        with pytest.raises(LogRefused) as refusal, closing_log(file_on(disk, path)) as file:
+            recorded(file, wanted, flushed)
+        text = str(refusal.value)
+        assert refusal.value.exit_code == 5
+        assert f"{path}: the disk is full; the log ends there, finished" in text
+        assert "make room" in text
+        found = messages(path)
+        assert found == wanted[: len(flushed) + CHUNK]
+        assert f"{len(found)} other messages" in text
+        assert not active(path).exists()
+        seen.add(len(found))
+        path.unlink()
+    assert len(seen) > 4  # the chunk that did not fit was not always the same
+
+
+@pytest.mark.usefixtures("unsynced")
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO])
+def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
+    error: int, tmp_path: Path
+) -> None:
+    """At every byte of a chunk and of the end: cut where the last flush ended."""
+    path = tmp_path / "run.mcap"
+    wanted = sent(3 * CHUNK)
+    with closing_log(file_on(SmallDisk(1 << 20), path)) as file:
+        recorded(file, wanted, [])
+    whole = path.stat().st_size
+    path.unlink()
+    head = 200
+    for capacity in range(head, whole, 3 if error == errno.ENOSPC else 97):
+        active(path).unlink(missing_ok=True)
+        disk = SmallDisk(capacity, error)
+        flushed: list[Sent] = []
+        with pytest.raises(LogRefused) as refusal, closing_log(file_on(disk, path, room=False)) as file:
+            recorded(file, wanted, flushed)
+        assert refusal.value.exit_code == 5
+        assert not path.exists()
+        assert active(path).stat().st_size == file.size
+        assert f"trilat log recover {active(path)}" in str(refusal.value)
+        if not flushed:
+            with pytest.raises(NothingSaved):
+                recover(active(path))
+            continue
+        assert recover(active(path)).lossless
+        assert messages(path) == flushed
+        path.unlink()
+
+
+def test_room_is_kept_for_what_is_pending_and_for_the_end(tmp_path: Path) -> None:
+    disk = SmallDisk(10 << 20)
+    file = file_on(disk, tmp_path / "run.mcap")
+    container = begun(file)
+    for message in sent(500):
+        container.add_message(*message)
+    before = file.size
+    container.flush()
+    assert disk.kept >= file.size - before + container.owed + MARGIN_BYTES
+    container.finish()
+    file.close()
+    assert disk.kept == 0
+
+
+def test_a_real_ballast_takes_room_that_nobody_sees_and_gives_it_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for allocate in (os.posix_fallocate, None):
+        if allocate is None:
+
+            def refuse(*_: int) -> None:
+                raise OSError(errno.EOPNOTSUPP, "not here")
+
+            monkeypatch.setattr(os, "posix_fallocate", refuse)
+        ballast = Ballast(tmp_path)
+        ballast.grow(1)
+        ballast.grow(STEP_BYTES + 1)
+        assert ballast.size == 2 * STEP_BYTES
+        assert ballast._file is not None
+        assert os.fstat(ballast._file.fileno()).st_blocks * 512 >= ballast.size
+        assert list(tmp_path.iterdir()) == []
+        ballast.release()
+        ballast.grow(10)
+        assert ballast.size == 0
+
+
+def test_a_folder_that_takes_no_ballast_does_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: int) -> None:
+        raise OSError(errno.EACCES, "not here")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    ballast = Ballast(tmp_path)
+    ballast.grow(1)
+    assert ballast.size == 0
+
+
+LIMITED = """
+import os, resource, sys
+from pathlib import Path
+from trilat_net.errors import LogRefused
+from trilat_net.log.container import Container
+from trilat_net.log.logfile import new_log
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+try:
+    with new_log(Path(sys.argv[1])) as file:
+        container = Container(file, "lib")
+        channel = container.register_channel("/a", "msgpack", 0)
+        try:
+            for n in range(10_000):
+                container.add_message(channel, n, os.urandom(1000), n, n)
+                container.flush()
+        except OSError as error:
+            raise LogRefused(str(error)) from None
+except LogRefused as refused:
+    print(refused)
+    sys.exit(refused.exit_code)
+"""
+
+
+def test_a_file_that_is_as_long_as_it_may_be_is_cut_at_a_chunk_and_recovered(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    done = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 5, done
+    assert f"{active(path)}: the file system takes no longer file" in done.stdout
+    assert "--split-size" in done.stdout
+    assert recover(active(path)).lossless
+    assert [message[1] for message in messages(path)] == list(range(len(messages(path))))
+    assert len(messages(path)) > 900
+
+
+# Loss of power.
+
+
+def test_what_is_flushed_is_synced_every_second_and_with_durable_every_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(syncing, "_datasync", synced.append)
+    for durable, expected in ((False, 3), (True, 31)):
+        synced.clear()
+        times_ns = iter(range(0, 1000 * SYNC_NS, SYNC_NS // 10))
+        file = LogFile(tmp_path / f"{durable}.mcap", durable=durable, now_ns=times_ns.__next__)
+        for _ in range(31):
+            file.write(b"x")
+            file.flush()
+            file._syncing.wait()
+        assert len(synced) == expected
+        file.close()
+
+
+def test_a_disk_that_refuses_what_it_had_taken_ends_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(syncing, "_datasync", refuse)
+    path = tmp_path / "run.mcap"
+    times_ns = iter(range(0, 1000 * SYNC_NS, SYNC_NS))
+
+    def write() -> None:
+        with closing_log(LogFile(path, now_ns=times_ns.__next__)) as file:
+            recorded(file, sent(100), [])
+
+    with pytest.raises(LogRefused, match="the disk fails; the log ends there, finished, with") as refusal:
+        write()
+    assert refusal.value.exit_code == 5
+    assert 0 < len(messages(path)) < 100
+
+
+# The death of a process.
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from trilat_net.log.logfile import LogFile
+from trilat_net.log.container import Container
+file = LogFile(Path(sys.argv[1]))
+container = Container(file, "lib")
+channel = container.register_channel("/a", "msgpack", 0)
+container.flush()
+for n in range(int(sys.argv[2])):
+    container.add_message(channel, n, b"%d" % n, n, n)
+    if n % 7 == 6:
+        container.flush()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("count", [7, 13, 100])
+def test_what_was_flushed_survives_a_kill(count: int, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    done = subprocess.run([sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    result = recover(active(path))
+    assert result.lossless
+    assert [message[2] for message in messages(path)] == [b"%d" % n for n in range(count // 7 * 7)]

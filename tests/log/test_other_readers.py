@@ -1,0 +1,237 @@
+"""Our files in the hands of other people's readers, whose numbers must be ours."""
+
+import json
+import math
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from trilat_net.core.tick import Mode
+from trilat_net.log.reader import Log, open_log
+
+from .standard_files import EPOCH_NS, KINDS, SCENARIO, made, outputs
+
+BUCKET = 20
+RERUN = (sys.executable, "-m", "rerun")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return made(tmp_path_factory.mktemp("files"))
+
+
+@pytest.fixture(params=KINDS)
+def log_file(files: dict[str, Path], request: pytest.FixtureRequest) -> Path:
+    return files[request.param]
+
+
+def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
+    """Topic, message and the plain record of every standard message, by mcap-ros2-support."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.message_encoding == "cdr":
+                assert schema is not None
+                assert channel.topic.startswith(prefix)
+                decode = DecoderFactory().decoder_for("cdr", schema)
+                assert decode is not None
+                yield channel.topic, decode(message.data), message
+
+
+def program(*command: str) -> str:
+    """Runs a program of other people; returns what it printed."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_the_mcap_package_reads_the_same_with_the_index_and_without(log_file: Path) -> None:
+    with log_file.open("rb") as indexed, log_file.open("rb") as plain:
+        by_index = Counter(
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(indexed, validate_crcs=True).iter_messages()
+        )
+        in_order = [
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in NonSeekingReader(plain, validate_crcs=True).iter_messages(
+                log_time_order=False
+            )
+        ]
+    assert by_index == Counter(in_order)
+    times = [log_time for _, log_time, _, _ in in_order]
+    assert times == sorted(times)
+
+
+def test_every_channel_has_a_schema_and_every_message_a_name_for_each_field(log_file: Path) -> None:
+    """Viewers pass over channels without a schema, and take a list on top for many messages."""
+    with log_file.open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == ""
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            assert schema.id == channel.schema_id != 0
+            pair = (channel.message_encoding, schema.encoding)
+            assert pair in (("msgpack", "jsonschema"), ("cdr", "ros2msg"))
+            if channel.message_encoding == "msgpack":
+                assert isinstance(msgpack.unpackb(message.data), dict)
+                assert json.loads(schema.data)["type"] == "object"
+
+
+def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
+    """Of every bucket the extremes, and at the header's stamp as at the publish time a tick of it."""
+    shown: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
+    for topic, ros, message in decoded(files["live"]):
+        if topic.endswith("/joint_states"):
+            stamp_ns = ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec
+            assert stamp_ns == message.publish_time <= message.log_time
+            site = topic.split("/")[2]
+            assert ros.name == [f"{site}_q1", f"{site}_q2", f"{site}_q1_ref", f"{site}_q2_ref"]
+            assert all(map(math.isnan, [*ros.velocity[2:], *ros.effort[2:]]))
+            number = (message.publish_time - EPOCH_NS) // (BUCKET * 10**6)
+            shown[site, number].append([*ros.position, *ros.velocity[:2], *ros.effort[:2]])
+    for site, made_by in outputs().items():
+        for first in range(0, len(made_by), BUCKET):
+            rows = np.array([[*o.q, *o.q_des, *o.qd, *o.tau] for o in made_by[first : first + BUCKET]])
+            got = np.array(shown.pop((site, first // BUCKET)))
+            assert len(got) == 2
+            assert np.array_equal(got.min(axis=0), rows.min(axis=0))
+            assert np.array_equal(got.max(axis=0), rows.max(axis=0))
+    assert not shown
+
+
+def test_statistics_and_events_are_the_sites_own(files: dict[str, Path]) -> None:
+    log = open_log(files["live"])
+    stats = {(site, s.t_ns + EPOCH_NS): s for site in log.sites for s in log.link_stats(site)}
+    seen = Counter[str]()
+    for topic, ros, message in decoded(files["live"]):
+        name = topic.rpartition("/")[2]
+        seen[name] += 1
+        if name in ("link_delay", "link_age", "link_offset"):
+            (site,) = topic.split("/")[2:-1]
+            one = stats[site, message.publish_time]
+            (peer,) = log.scenario.peers(site)
+            assert (
+                ros.data
+                == {
+                    "link_delay": [one.delay_us[peer] / 1e3, one.delay_max_us[peer] / 1e3],
+                    "link_age": [one.age_us[peer] / 1e3],
+                    "link_offset": [one.offset_us[peer] / 1e3, one.bound_us[peer] / 1e3],
+                }[name]
+            )
+            assert peer in ros.layout.dim[0].label
+            assert "(ms)" in ros.layout.dim[-1].label
+        if name == "events":
+            assert ros.data in {f"{event.member}: {event.text}" for event in log.events}
+        if name == "log":
+            assert ros.msg in {event.text for event in log.events}
+    assert seen["link_delay"] == seen["link_age"] == len(stats)
+    assert seen["events"] == seen["log"] == len(log.events)
+
+
+@pytest.fixture(scope="module")
+def log(files: dict[str, Path]) -> Log:
+    return open_log(files["live"])
+
+
+def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log) -> None:
+    joints: dict[str, list[Any]] = defaultdict(list)
+    others: dict[str, list[list[float]]] = defaultdict(list)
+    with AnyReader([files["bag"]]) as reader:
+        for connection, log_ns, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            if connection.msgtype == "sensor_msgs/msg/JointState":
+                joints[connection.topic].append((log_ns, message))
+            elif connection.msgtype == "std_msgs/msg/Float64MultiArray":
+                others[connection.topic].append(message.data.tolist())
+    for site in log.sites:
+        part = log[site]
+        states, references = joints[f"/{site}/joint_states"], joints[f"/{site}/reference"]
+        assert [log_ns for log_ns, _ in states] == part.log_time_ns.tolist()
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in states]
+        assert stamps == [EPOCH_NS + k * 10**6 for k in part.tick.tolist()]
+        for field, list_of in (("q", "position"), ("qd", "velocity"), ("tau", "effort")):
+            assert np.array_equal([getattr(m, list_of) for _, m in states], getattr(part, field))
+        assert np.array_equal([m.position for _, m in references], part.q_des)
+        assert np.array_equal([m.velocity for _, m in references], part.qd_des)
+        assert all(len(m.effort) == 0 for _, m in references)
+        assert np.array_equal(others[f"/{site}/error"], part.e)
+        assert np.array_equal(others[f"/{site}/tau_x"], part.tau_x)
+        assert np.array_equal(others[f"/{site}/theta_hat"], part.theta_hat)
+        assert others[f"/{site}/mode"] == [[float(Mode.RUN)]] * len(part)
+        assert len(others[f"/{site}/link_delay"]) == len(log.link_stats(site))
+
+
+def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: Log) -> None:
+    times: dict[str, list[int]] = defaultdict(list)
+    for topic, _, message in decoded(files["bag"], "/"):
+        times[topic].append(message.publish_time)
+    for site in log.sites:
+        for name in ("joint_states", "reference", "error", "tau_x", "theta_hat", "mode"):
+            assert times[f"/{site}/{name}"] == log[site].publish_time_ns.tolist()
+
+
+def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
+    """Its profile, its types and the qualities of service are those that its tools ask for."""
+    with files["bag"].open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        for channel in summary.channels.values():
+            assert channel.message_encoding == "cdr"
+            assert "offered_qos_profiles" in channel.metadata
+            assert {"unit", "content"} & channel.metadata.keys()
+        metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
+        (scenario,) = reader.iter_attachments()
+    assert metadata["trilat.source"]["session"] == "lab"
+    assert scenario.data.decode() == SCENARIO.text
+    with Reader(files["bag"]) as bag:
+        (profile,) = {tuple(c.ext.offered_qos_profiles) for c in bag.connections}
+        assert (profile[0].depth, profile[0].reliability.name, profile[0].durability.name) == (
+            10,
+            "RELIABLE",
+            "VOLATILE",
+        )
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "bag"])
+def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
+    text = program(*RERUN, "mcap", "check", "--full", str(files[kind]))
+    rows = [
+        line.split() for line in text.splitlines() if "/" in line and line.strip()[:2] in ("ok", "wa", "er")
+    ]
+    assert rows
+    assert {row[0] for row in rows} == {"ok"}, text
+
+
+def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_path: Path) -> None:
+    """Of a recording as it converts it, the names of the series and their numbers."""
+    recording = tmp_path / "run.rrd"
+    program(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
+    text = program(*RERUN, "rrd", "print", "-vvv", str(recording))
+    for site in SCENARIO.names:
+        for entity in (f"/viz/{site}/joint_states/position", f"/viz/{site}/error", f"/viz/{site}/link_delay"):
+            assert entity in text
+        assert f"{site}_q1_ref" in text
+    assert "Scalars:scalars" in text
+    assert "SeriesLines:names" in text
+
+
+@pytest.mark.parametrize("kind", ["live", "recovered", "bag"])
+def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
+    """A program of others under another license: run, never imported."""
+    executable = str(Path(sys.executable).with_name("pymcap-cli"))
+    assert "passed" in program(executable, "doctor", "--strict-message-order", str(files[kind]))
+    if kind == "live":
+        assert "/viz/m/joint_states" in program(executable, "info", str(files[kind]))

@@ -1,0 +1,250 @@
+"""A log in parts: no message is lost or doubled at a seam, and every part explains itself."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from trilat_net.errors import LogRefused, UsageError
+from trilat_net.log import logfile
+from trilat_net.log.choice import ALL
+from trilat_net.log.container import Sink
+from trilat_net.log.logfile import LogFile
+from trilat_net.log.names import existing, part_path
+from trilat_net.log.parts import LogParts, Storage, storage
+from trilat_net.log.reader import open_log
+from trilat_net.log.writer import LogWriter
+from trilat_net.net import topics
+from trilat_net.scenario import load
+
+from .disks import SmallDisk, file_on
+
+SCENARIO = load("two_sites")
+KEYS = [topics.key("t", site, channel) for site in ("m", "s") for channel in ("state", "event")]
+Message = tuple[str, bytes, int, int]
+"""Key, payload, log time, sequence."""
+
+
+@pytest.fixture(autouse=True)
+def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+
+
+def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+    return LogWriter(stream, SCENARIO, "t", "live", 10**18, part=part)
+
+
+def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert [attachment.name for attachment in reader.iter_attachments()] == ["scenario.toml"]
+        metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
+        found: list[Message] = []
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            assert schema is not None
+            assert schema.encoding == "jsonschema"
+            found.append((channel.topic[1:], message.data, message.log_time, message.sequence))
+    return found, metadata
+
+
+def written(place: Storage, messages: list[Message], flush_every: int = 7) -> None:
+    with LogParts(place, begin) as log:
+        log.so_far = lambda: {"so far": "yes"}
+        for n, (key, payload, log_ns, number) in enumerate(messages):
+            log.add(key, payload, 0, log_ns, number)
+            if n % flush_every == 0:
+                log.flush()
+        log.finish({"in all": str(len(messages))})
+
+
+def cleared(folder: Path) -> Path:
+    for path in folder.iterdir():
+        path.unlink()
+    return folder / "run.mcap"
+
+
+STEPS = st.lists(
+    st.tuples(st.sampled_from(KEYS), st.integers(0, 3000), st.integers(-(10**7), 4 * 10**8)),
+    min_size=1,
+    max_size=60,
+)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    steps=STEPS,
+    size=st.none() | st.integers(10_000, 120_000),
+    duration_ns=st.none() | st.integers(1, 3 * 10**9),
+)
+def test_the_parts_one_behind_the_other_are_the_unsplit_file(
+    steps: list[tuple[str, int, int]], size: int | None, duration_ns: int | None, tmp_path: Path
+) -> None:
+    path = cleared(tmp_path)
+    messages: list[Message] = []
+    log_ns = 10**18
+    for n, (key, length, step_ns) in enumerate(steps):
+        log_ns += step_ns
+        messages.append((key, os.urandom(length), log_ns, n))
+    place = Storage(path, split_bytes=size, split_ns=duration_ns)
+    written(place, messages)
+    parts = existing(path)
+    if not place.splits:
+        assert list(tmp_path.iterdir()) == [path]
+        assert read(path)[0] == messages
+        assert "trilat.part" not in read(path)[1]
+        return
+    assert sorted(tmp_path.iterdir()) == [part_path(path, n) for n in range(1, len(parts) + 1)]
+    found: list[Message] = []
+    previous = ""
+    for number, part in sorted(parts.items()):
+        own, metadata = read(part)
+        found += own
+        assert metadata["trilat.session"]["session"] == "t"
+        assert metadata["trilat.part"] == {"index": str(number), "previous": previous}
+        previous = part.name
+        last = number == len(parts)
+        assert metadata["trilat.accounts"] == ({"in all": str(len(messages))} if last else {"so far": "yes"})
+        if size is not None:
+            assert part.stat().st_size <= size or len(own) <= 1
+        if duration_ns is not None and own:
+            assert all(message[2] - own[0][2] < duration_ns for message in own)
+    assert found == messages
+
+
+def test_a_part_opens_as_a_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
+    messages = [(KEYS[0], b"\x80" * 900, 10**18 + k * 10**8, k) for k in range(40)]
+    path = tmp_path / "run.mcap"
+    written(Storage(path, split_ns=10**9), messages)
+    names = ["run-001.mcap", "run-002.mcap", "run-003.mcap", "run-004.mcap"]
+    assert [part.name for part in sorted(tmp_path.iterdir())] == names
+    for name in names:
+        assert open_log(tmp_path / name).scenario == SCENARIO
+
+
+@pytest.mark.parametrize(
+    ("there", "splits", "expected", "previous"),
+    [
+        ([], False, "run.mcap", None),
+        ([], True, "run-001.mcap", ""),
+        (["run.mcap"], False, "run-002.mcap", "run.mcap"),
+        (["run.mcap.active"], False, "run-002.mcap", "run.mcap"),
+        (["run.mcap", "run-002.mcap.active"], True, "run-003.mcap", "run-002.mcap"),
+        (["run-001.mcap", "run-009.mcap"], False, "run-010.mcap", "run-009.mcap"),
+        (
+            ["other.mcap", "run-x.mcap", "run-001.txt", "run-1.mcap", "rerun-007.mcap"],
+            False,
+            "run.mcap",
+            None,
+        ),
+    ],
+)
+def test_to_continue_is_to_write_the_next_part(
+    there: list[str], splits: bool, expected: str, previous: str | None, tmp_path: Path
+) -> None:
+    for name in there:
+        (tmp_path / name).write_bytes(b"precious")
+    place = Storage(tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None)
+    written(place, [(KEYS[0], b"\x80", 10**18, 0)])
+    _, metadata = read(tmp_path / expected)
+    assert metadata.get("trilat.part", {}).get("previous") == previous
+    for name in there:
+        assert (tmp_path / name).read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"])
+def test_a_name_that_is_taken_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
+    (tmp_path / there).write_bytes(b"precious")
+    place = Storage(tmp_path / "run.mcap", split_ns=1)
+    with pytest.raises(UsageError, match=f"{there}.* exists.*--force"):
+        LogParts(place, begin)
+    assert (tmp_path / there).read_bytes() == b"precious"
+    messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
+    written(Storage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [f"run-00{n}.mcap" for n in (1, 2, 3)]
+
+
+def test_a_log_without_parts_leaves_the_parts_of_others_alone(tmp_path: Path) -> None:
+    (tmp_path / "run-002.mcap").write_bytes(b"precious")
+    for force in (False, True):
+        written(Storage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)])
+    assert (tmp_path / "run-002.mcap").read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("name", ["run[1].mcap", "a*b.mcap", "run", "r?n.bag.mcap"])
+def test_any_name_will_do(name: str, tmp_path: Path) -> None:
+    messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
+    place = Storage(tmp_path / name, split_ns=1)
+    (tmp_path / "run1-001.mcap").write_bytes(b"")
+    written(place, messages)
+    assert sorted(existing(place.path)) == [1, 2, 3]
+    assert [message for path in existing(place.path).values() for message in read(path)[0]] == messages
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"split_mib": 0.5}, "--split-size"),
+        ({"split_mib": float("nan")}, "--split-size"),
+        ({"split_s": 0.0}, "--split-duration"),
+        ({"force": True, "carry_on": True}, "give one of them"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(options: dict[str, Any], problem: str, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"split_mib": None, "split_s": None, "force": False, "carry_on": False, **options}
+    with pytest.raises(UsageError, match=problem):
+        storage(tmp_path / "run.mcap", choice=ALL, durable=False, views_hz=0.0, **asked).first()
+
+
+def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:
+    """Writes messages in parts onto a disk with so much room; returns those that were given to it."""
+    taken: list[Message] = []
+    disks = [SmallDisk(room)]
+
+    def opened(part: Path) -> LogFile:
+        disks.append(SmallDisk(disks[-1].capacity - disks[-1].written))
+        return file_on(disks[-1], part)
+
+    def record() -> None:
+        with LogParts(Storage(path, split_ns=5 * 10**8), begin, opened) as log:
+            try:
+                for message in messages:
+                    key, payload, log_ns, number = message
+                    log.add(key, payload, 0, log_ns, number)
+                    taken.append(message)
+                    log.flush()
+            finally:
+                log.finish({})
+
+    try:
+        record()
+    except LogRefused as error:
+        assert (error.exit_code, "the disk is full" in str(error)) == (5, True)  # noqa: PT017
+        assert taken != messages
+    return taken
+
+
+def test_a_disk_that_is_full_at_a_seam_keeps_the_parts_before(tmp_path: Path) -> None:
+    """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
+    messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
+    for room in range(80_000, 200_000, 1700):
+        path = cleared(tmp_path)
+        taken = recorded_on(room, path, messages)
+        found = [message for _, part in sorted(existing(path).items()) for message in read(part)[0]]
+        assert found == taken
+        assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
+
+
+def test_who_adds_after_the_end_is_told(tmp_path: Path) -> None:
+    with LogParts(Storage(tmp_path / "run.mcap"), begin) as log:
+        log.finish({})
+        assert log.ended
+        with pytest.raises(LogRefused, match="is finished"):
+            log.add(KEYS[0], b"", 0, 0, 0)
+        log.finish({})
+    assert read(tmp_path / "run.mcap")[0] == []

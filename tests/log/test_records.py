@@ -1,0 +1,80 @@
+"""Many records read like a list of them, in bounded memory."""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.log import records
+from trilat_net.log.records import ByTick, Records
+from trilat_net.net.messages import STATE_VECTORS, State
+
+EMPTY = State(
+    v=3, site="m1", boot=1, tick=0, t_ns=0, mode="run", used={}, rx=[], rx_crc=0, cmd=[], mem=[], late_us=0,
+    busy_us=0, **{field: [0.0] * count for field, count in STATE_VECTORS.items()},
+)  # fmt: skip
+
+
+def state(tick: int) -> State:
+    return msgspec.structs.replace(EMPTY, tick=tick)
+
+
+def decoded(payloads: Sequence[bytes]) -> list[State]:
+    return [state(int(payload)) for payload in payloads]
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "BLOCK", 4)
+    monkeypatch.setattr(records, "HELD", 8)
+
+
+counts = st.integers(0, 30)
+
+
+@given(counts, st.lists(st.one_of(st.integers(-35, 35), st.slices(30)), max_size=10))
+def test_records_are_the_list_of_them(count: int, looks: list[int | slice]) -> None:
+    payloads = [str(n).encode() for n in range(count)]
+    every = decoded(payloads)
+    some = Records(payloads, decoded)
+    assert (len(some), list(some), list(reversed(some))) == (count, every, every[::-1])
+    for look in looks:
+        try:
+            expected = every[look]
+        except IndexError:
+            with pytest.raises(IndexError):
+                some[look]
+        else:
+            assert some[look] == expected
+
+
+def test_only_the_blocks_looked_at_last_are_held() -> None:
+    asked: list[int] = []
+
+    def counted(payloads: Sequence[bytes]) -> list[State]:
+        asked.append(int(payloads[0]))
+        return decoded(payloads)
+
+    some = Records([str(n).encode() for n in range(16)], counted)
+    for n in (0, 1, 4, 0, 8, 0, 4):  # 4 was looked at longest ago when 8 came
+        assert some[n].tick == n
+    assert asked == [0, 4, 8, 4]
+
+
+def test_few_records_are_a_list() -> None:
+    assert isinstance(records.records([b"1"] * 8, decoded), list)
+    assert isinstance(records.records([b"1"] * 9, decoded), Records)
+
+
+@given(st.lists(st.integers(0, 20), max_size=20).map(sorted))
+def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
+    states = [msgspec.structs.replace(state(tick), late_us=n) for n, tick in enumerate(ticks)]
+    by_tick = ByTick(states, np.array(ticks, dtype=np.int64))
+    assert dict(by_tick) == {s.tick: s for s in states}
+    assert len(by_tick) == len(set(ticks))
+    assert [by_tick.get(tick) for tick in range(-1, 22)] == [
+        {s.tick: s for s in states}.get(tick) for tick in range(-1, 22)
+    ]

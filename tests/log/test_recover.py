@@ -1,0 +1,457 @@
+"""`recover`: what can be read is kept byte for byte, what cannot is told, nothing is made up."""
+
+import io
+import json
+import os
+import struct
+import tracemalloc
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from tests.cli.running import trilat
+from tests.log_editing import edited, recorded, without
+from trilat_net.errors import LogError, NothingSaved, UsageError
+from trilat_net.log import logfile
+from trilat_net.log.container import Container
+from trilat_net.log.names import active
+from trilat_net.log.reader import open_log
+from trilat_net.log.recover import Recovery, recover, recovered_path
+from trilat_net.replay.verify import verify
+
+anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
+positions = st.floats(0, 1, exclude_max=True)
+
+
+@pytest.fixture(autouse=True)
+def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+
+
+class Message(NamedTuple):
+    topic: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+class Chunk(NamedTuple):
+    """A chunk of a whole file: where it lies, and its messages."""
+
+    begin: int
+    end: int
+    messages: list[Message]
+
+
+def messages(data: bytes) -> list[Message]:
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    return [
+        Message(c.topic, m.log_time, m.publish_time, m.sequence, m.data)
+        for _, c, m in reader.iter_messages(log_time_order=False)
+    ]
+
+
+def chunks(data: bytes) -> list[Chunk]:
+    """The chunks of a whole file, by its index."""
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary is not None
+    every = iter(messages(data))
+    found = []
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        begin, length = index.chunk_start_offset, index.chunk_length
+        entries = 0
+        at = begin + length
+        while at < begin + length + index.message_index_length:
+            (size,) = struct.unpack_from("<Q", data, at + 1)
+            entries += (size - 6) // 16
+            at += 9 + size
+        found.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
+    return found
+
+
+@cache
+def log() -> bytes:
+    """A log of twenty chunks, as it is written today."""
+    data = recorded("paper")
+    reader = make_reader(io.BytesIO(data))
+    stream = io.BytesIO()
+    file = Container(stream, "lib", chunk_bytes=8000)
+    channels: dict[str, int] = {}
+    schemas: dict[str, int] = {}
+    for entry in reader.iter_metadata():
+        if entry.name == "trilat.session":
+            file.add_metadata(entry.name, entry.metadata)
+    for attachment in reader.iter_attachments():
+        file.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+    summary = reader.get_summary()
+    assert summary is not None
+    for schema in summary.schemas.values():
+        schemas[schema.name] = file.register_schema(schema.name, schema.encoding, schema.data)
+    for channel in summary.channels.values():
+        name = summary.schemas[channel.schema_id].name
+        channels[channel.topic] = file.register_channel(
+            channel.topic, channel.message_encoding, schemas[name], channel.metadata
+        )
+    for message in messages(data):
+        file.add_message(
+            channels[message.topic], message.log_time, message.data, message.publish_time, message.sequence
+        )
+    for entry in reader.iter_metadata():
+        if entry.name == "trilat.accounts":
+            file.add_metadata(entry.name, entry.metadata)
+    file.finish()
+    return stream.getvalue()
+
+
+@cache
+def earlier_log() -> bytes:
+    """The same by `mcap.Writer`: schemas and channels stand in the first chunk and at the end."""
+    return edited(recorded("paper"), chunk_bytes=8000)
+
+
+LOGS = st.sampled_from([log, earlier_log])
+
+
+def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Recovery, bytes]:
+    """What becomes of a file with these bytes."""
+    for path in folder.iterdir():
+        path.unlink()
+    path = folder / name
+    path.write_bytes(data)
+    result = recover(path)
+    assert path.read_bytes() == data
+    assert sorted(folder.iterdir()) == sorted({path, result.output})
+    return result, result.output.read_bytes()
+
+
+@anywhere
+@given(made_by=LOGS, share=positions)
+def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
+    made_by: Callable[[], bytes], share: float, tmp_path: Path
+) -> None:
+    data = made_by()
+    end = int(share * len(data))
+    whole = [chunk for chunk in chunks(data) if chunk.end <= end]
+    kept = [message for chunk in whole for message in chunk.messages]
+    try:
+        result, saved = made(data[:end], tmp_path)
+    except NothingSaved:
+        assert not kept
+        return
+    found = messages(saved)
+    assert found[: len(kept)] == kept
+    assert found == messages(data)[: len(found)]
+    assert result.salvaged == len(found) - len(kept)
+    if any(chunk.begin < end < chunk.end for chunk in chunks(data)):
+        assert not result.lossless
+    elif chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:  # before the accounts
+        assert result.lossless, result.lost
+    assert result.finished == (end == len(data))
+    if len(found):
+        again = open_log(tmp_path / "run.mcap")
+        assert again.complete
+        verdict = verify(again)
+        assert verdict.passed
+        assert verdict.records == sum(len(again[name]) for name in again.sites)
+
+
+@anywhere
+@given(made_by=LOGS, flips=st.lists(st.tuples(positions, st.integers(1, 255)), min_size=1, max_size=3))
+def test_of_a_damaged_file_every_chunk_that_is_intact_is_kept(
+    made_by: Callable[[], bytes], flips: list[tuple[float, int]], tmp_path: Path
+) -> None:
+    whole = made_by()
+    data = bytearray(whole)
+    places = {int(share * len(data)) for share, _ in flips}
+    for place, (_, flip) in zip(places, flips, strict=False):
+        data[place] ^= flip
+    intact = [
+        message
+        for chunk in chunks(whole)
+        if not any(chunk.begin <= place < chunk.end for place in places)
+        for message in chunk.messages
+    ]
+    result, saved = made(bytes(data), tmp_path, "run.mcap")
+    found = messages(saved)
+    summary_begins = chunks(whole)[-1].end
+    if any(place >= summary_begins for place in places):  # what names the channels may be damaged twice
+        intact = [message._replace(topic="") for message in intact]
+        found = [message._replace(topic="") for message in found]
+    rest = iter(found)
+    assert all(message in rest for message in intact)  # in order
+    assert {message[1:] for message in found} <= {message[1:] for message in messages(whole)}
+    if len(found) < len(messages(whole)):
+        assert not result.lossless
+
+
+def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
+    data = log()
+    result, saved = made(data, tmp_path, "run.mcap")
+    assert (result.lossless, result.finished, result.missing) == (True, True, [])
+    assert result.output == tmp_path / "run.recovered.mcap"
+    assert messages(saved) == messages(data)
+    assert result.sites == {"m1": 120, "m2": 120, "s": 120}
+    before, after = (make_reader(io.BytesIO(each)) for each in (data, saved))
+    assert list(before.iter_attachments()) == list(after.iter_attachments())
+    old, new = ({e.name: e.metadata for e in each.iter_metadata()} for each in (before, after))
+    assert new["trilat.session"] == old["trilat.session"]
+    assert new["trilat.recovered"]["lost"] == "nothing"
+    assert new["trilat.recovered"]["from"] == "run.mcap"
+    for topic, account in new["trilat.accounts"].items():
+        assert "missing 0" in account, topic
+    assert set(new["trilat.accounts"]) == set(old["trilat.accounts"])
+    summaries = [each.get_summary() for each in (before, after)]
+    for summary in summaries:
+        assert summary is not None
+    kinds = [
+        sorted((c.topic, c.message_encoding, sorted(c.metadata.items())) for c in s.channels.values())
+        for s in summaries
+        if s
+    ]
+    assert kinds[0] == kinds[1]
+    schemas = [sorted((c.name, c.encoding, c.data) for c in s.schemas.values()) for s in summaries if s]
+    assert schemas[0] == schemas[1]
+
+
+def test_what_is_missing_is_counted_afresh_and_named_by_site(tmp_path: Path) -> None:
+    gone = set(range(30, 50)) | {70}
+    data = edited(recorded("paper"), record=without("m2", gone), chunk_bytes=8000)
+    result, saved = made(data, tmp_path, "run.mcap")
+    assert result.lossless  # what was never in the file was not lost with it
+    assert result.missing == ["m2: 21 of 120 records: 30-49 70-70"]
+    metadata = {e.name: e.metadata for e in make_reader(io.BytesIO(saved)).iter_metadata()}
+    account = metadata["trilat.accounts"]["/trilat/paper/m2/state"]
+    assert "received 99, missing 21" in account
+    assert "30-49 70-70" in account
+    assert metadata["trilat.recovered"]["missing"] == result.missing[0]
+
+
+def test_a_chunk_that_is_lost_is_told_with_the_ticks_that_were_in_it(tmp_path: Path) -> None:
+    data = bytearray(log())
+    chunk = chunks(log())[5]
+    data[(chunk.begin + chunk.end) // 2] ^= 1
+    result, saved = made(bytes(data), tmp_path, "run.mcap")
+    assert len(result.lost) == 1
+    assert f"at byte {chunk.begin}" in result.lost[0]
+    assert result.lost_bytes == chunk.end - chunk.begin
+    ticks = [m.sequence for m in chunk.messages if m.topic == "/trilat/paper/m1/state"]
+    assert f"m1: {len(ticks)} of 120 records: {ticks[0]}-{ticks[-1]}" in result.missing
+    assert len(messages(saved)) == len(messages(log())) - len(chunk.messages)
+
+
+def foreign(compression: CompressionType, chunked: bool) -> bytes:
+    """A file of another program."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=500, compression=compression, use_chunking=chunked)
+    writer.start(profile="ros1", library="theirs")
+    schema = writer.register_schema("S", "jsonschema", b"{}")
+    channels = [writer.register_channel("/a", "json", schema), writer.register_channel("/b", "raw", 0)]
+    for k in range(60):
+        writer.add_message(channels[k % 2], k * 10, os.urandom(30) if k % 3 else b"x" * 40, k * 10 + 1, k)
+        if k == 30:
+            writer.add_metadata("theirs", {"k": "v"})
+            writer.add_attachment(1, 2, "note", "text/plain", b"hello")
+    writer.finish()
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
+    compression: CompressionType, chunked: bool, tmp_path: Path
+) -> None:
+    data = foreign(compression, chunked)
+    everything = messages(data)
+    before = 0
+    for end in [*range(20, len(data), 41), len(data)]:
+        try:
+            _, saved = made(data[:end], tmp_path)
+        except NothingSaved:
+            assert not before
+            continue
+        found = messages(saved)
+        assert found == everything[: len(found)]
+        assert len(found) >= before
+        before = len(found)
+    assert before == 60
+    reader = make_reader(io.BytesIO(saved))
+    header = reader.get_header()
+    assert header.profile == "ros1"
+    assert header.library.startswith("theirs, recovered by")
+    assert [(a.name, a.data) for a in reader.iter_attachments()] == [("note", b"hello")]
+    names = {entry.name: entry.metadata for entry in reader.iter_metadata()}
+    assert names["theirs"] == {"k": "v"}
+    assert "trilat.accounts" not in names
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_the_complete_records_of_a_cut_chunk_are_kept(compression: CompressionType, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=compression)
+    writer.start()
+    channel = writer.register_channel("/a", "raw", writer.register_schema("S", "jsonschema", b"{}"))
+    for k in range(2000):
+        writer.add_message(channel, k, os.urandom(300), k, k)
+    writer.finish()
+    data = stream.getvalue()
+    (chunk,) = chunks(data)
+    result, saved = made(data[: (chunk.begin + chunk.end) // 2], tmp_path)
+    found = messages(saved)
+    assert found == messages(data)[: len(found)]
+    assert len(found) == result.salvaged > 600
+    assert not result.lossless
+    assert f"{len(found)} messages could be saved" in result.lost[0]
+
+
+# What is hostile.
+
+
+def record(opcode: int, content: bytes, length: int | None = None) -> bytes:
+    return struct.pack("<BQ", opcode, len(content) if length is None else length) + content
+
+
+def bomb() -> bytes:
+    packed = zstandard.compress(bytes(1 << 28))
+    head = struct.pack("<QQQII", 0, 1, 1 << 28, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
+    return record(6, head + packed)
+
+
+HEAD = b"\x89MCAP0\r\n" + record(1, bytes(8))
+META = record(12, struct.pack("<I", 1) + b"m" + bytes(4))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        HEAD + META + record(6, bytes(100), 1 << 62),
+        HEAD + META + record(9, bytes(100), 1 << 40),
+        HEAD + META + bomb(),
+        HEAD + META + bomb()[:-100],
+        HEAD + META + record(6, bytes(16) + struct.pack("<QII", 1 << 60, 0, 1 << 31) + b"zstd"),
+        HEAD + META + record(4, struct.pack("<HHI", 1, 1, 1 << 31)) * 100,
+    ],
+    ids=["chunk", "attachment", "bomb", "cut bomb", "sizes", "texts"],
+)
+def test_no_number_in_a_file_is_believed(data: bytes, tmp_path: Path) -> None:
+    tracemalloc.start()
+    try:
+        result, _ = made(data, tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 150 << 20
+    finally:
+        tracemalloc.stop()
+    assert result.messages == 0
+
+
+@anywhere
+@given(data=st.binary(max_size=300), at=positions)
+def test_whatever_is_in_a_file_it_is_recovered_or_refused(data: bytes, at: float, tmp_path: Path) -> None:
+    whole = log()
+    place = int(at * len(whole))
+    for content in (data, HEAD + data, whole[:place] + data + whole[place:]):
+        try:
+            _, saved = made(content, tmp_path)
+        except NothingSaved:
+            continue
+        assert list(StreamReader(io.BytesIO(saved), validate_crcs=True).records)
+
+
+# Names.
+
+
+def test_a_name_follows_from_that_of_the_file() -> None:
+    names = {
+        "run.mcap.active": "run.mcap",
+        "run-002.mcap.active": "run-002.mcap",
+        "run.mcap": "run.recovered.mcap",
+        "run": "run.recovered.mcap",
+        "a.b.mcap": "a.b.recovered.mcap",
+    }
+    assert {name: recovered_path(Path("d") / name).name for name in names} == names
+
+
+def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -> None:
+    torn = tmp_path / "run.mcap.active"
+    torn.write_bytes(log()[:-100])
+    (tmp_path / "run.mcap").write_bytes(b"precious")
+    with pytest.raises(UsageError, match=r"run\.mcap: exists"):
+        recover(torn)
+    with pytest.raises(UsageError, match="is the file itself"):
+        recover(torn, torn, force=True)
+    assert (tmp_path / "run.mcap").read_bytes() == b"precious"
+    recover(torn, force=True)
+    assert messages((tmp_path / "run.mcap").read_bytes()) == messages(log())
+    assert torn.read_bytes() == log()[:-100]
+
+
+@pytest.mark.parametrize("content", [b"", b"no log at all", HEAD])
+def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(NothingSaved, match="there is nothing in it that could be saved"):
+        recover(path)
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(LogError, match="cannot be read"):
+        recover(tmp_path)
+
+
+# The command.
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "told"),
+    [
+        (
+            lambda data: data[:-60],
+            0,
+            ["run.mcap: made of run.mcap.active, which was not finished", "nothing"],
+        ),
+        (lambda data: data[: len(data) // 2], 3, ["cut off", "lost"]),
+        (lambda _: b"junk", 1, []),
+    ],
+    ids=["lossless", "lossy", "nothing to save"],
+)
+def test_the_exit_code_says_what_came_of_it(
+    change: Callable[[bytes], bytes], code: int, told: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "run.mcap.active").write_bytes(change(log()))
+    done = trilat("log", "recover", "run.mcap.active", cwd=tmp_path)
+    assert done.code == code, done
+    for fact in told:
+        assert fact in done.out
+    if code == 1:
+        done.refuses("there is nothing in it that could be saved", code=1)
+        return
+    assert done.err == ""
+    trilat("verify", "run.mcap", cwd=tmp_path).succeeds()
+    done = trilat("log", "recover", "run.mcap.active", "-o", "other.mcap", "--json", cwd=tmp_path)
+    facts: dict[str, Any] = json.loads(done.out)
+    assert done.code == code
+    assert facts["lossless"] == (code == 0)
+    assert facts["output"] == "other.mcap"
+    assert facts["messages"] == len(messages((tmp_path / "other.mcap").read_bytes()))
+    assert not active(tmp_path / "other.mcap").exists()
+    trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses("run.mcap: exists", "--force")
+
+
+def test_a_file_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
+    trilat("log", "recover", "none.mcap", cwd=tmp_path).refuses("none.mcap: cannot be read")
+
+
+@pytest.mark.parametrize("command", [["log", "recover"], ["verify"]])
+def test_who_asks_for_a_log_that_was_not_finished_is_told_where_it_is(
+    command: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "run.mcap.active").write_bytes(log()[:-60])
+    done = trilat(*command, "run.mcap", cwd=tmp_path)
+    done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")

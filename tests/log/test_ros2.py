@@ -1,0 +1,62 @@
+"""The export as a bag: in order of arrival, as long as the log, refused where the log is broken."""
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from tests.log_editing import edited, opened, recorded
+from trilat_net.errors import LogError
+from trilat_net.log.ros2 import export_ros2
+
+RECORDS = 3 * 120
+
+
+def test_it_tells_how_many_records_are_written(tmp_path: Path) -> None:
+    told: list[int] = []
+    export_ros2(opened(recorded("paper")), tmp_path / "bag.mcap", told.append)
+    assert sum(told) == RECORDS
+
+
+def test_messages_stand_in_the_order_in_which_they_came(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    export_ros2(opened(recorded("paper")), path)
+    with path.open("rb") as stream:
+        messages = list(make_reader(stream).iter_messages(log_time_order=False))
+    times = [message.log_time for _, _, message in messages]
+    assert times == sorted(times)
+    states = [c.topic for _, c, _ in messages if c.topic.endswith("/joint_states")]
+    assert len(states) == RECORDS
+
+
+def test_the_same_log_is_the_same_bag(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        export_ros2(opened(recorded("paper")), tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_virtual_time_has_no_channels_of_clocks(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    export_ros2(opened(recorded("paper")), path)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert {"/m1/link_age", "/events", "/log"} <= topics
+    assert not {"/m1/link_delay", "/m1/link_offset", "/m1/timing"} & topics
+
+
+def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
+    """A gap in the log is a gap in the bag."""
+    log = opened(edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r))
+    path = tmp_path / "bag.mcap"
+    export_ros2(log, path)
+    with path.open("rb") as stream:
+        states = [m for _, c, m in make_reader(stream).iter_messages("/m1/joint_states")]
+    assert len(states) == 100
+
+
+def test_a_record_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+    log = opened(edited(recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r))
+    with pytest.raises(LogError, match="a record of m1 cannot be read"):
+        export_ros2(log, tmp_path / "bag.mcap")

@@ -1,0 +1,187 @@
+"""A table has every number of its records, under a name that ends in its unit."""
+
+import re
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from tests.analysis import logs
+from tests.log.dealt import a_file, changed, messages
+from tests.log_editing import edited, opened, recorded
+from trilat_net.core.grid import NS_PER_S
+from trilat_net.errors import LogError
+from trilat_net.log.reader import Log
+from trilat_net.log.table import SUFFIXES, Column, named
+from trilat_net.log.tables import all_tables
+from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats
+
+
+@cache
+def paper() -> Log:
+    return opened(recorded("paper"))
+
+
+LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.simulated("four")}
+
+
+@pytest.mark.parametrize("which", LOGS)
+def test_names_are_unique_end_in_their_unit_and_every_column_says_what_it_is(which: str) -> None:
+    log = LOGS[which]()
+    for table in all_tables(log):
+        names = [column.name for column in table.columns]
+        assert len(set(names)) == len(names)
+        for column in table.columns:
+            assert re.fullmatch(r"[a-z][a-z0-9_]{0,62}", column.name)
+            assert len(column.values) == len(table)
+            assert len(column.meaning) > 5
+            assert column.source
+            if column.unit and column.unit != "tick":
+                assert (
+                    column.name.split("_", 1)[-1].endswith(SUFFIXES[column.unit]) or column.name in SUFFIXES
+                )
+
+
+@pytest.mark.parametrize("which", LOGS)
+def test_a_row_of_states_is_its_record(which: str) -> None:
+    log = LOGS[which]()
+    units = dict.fromkeys(("q", "q_des"), "rad") | dict.fromkeys(("qd", "qd_des"), "rad_s")
+    units |= dict.fromkeys(("tau", "tau_x"), "nm")
+    for site in log.sites:
+        table = log.table(site)
+        assert table.label == f"{site}_state"
+        rows = {column.name: column.rows(0, len(table)) for column in table.columns}
+        for n, state in enumerate(log[site].states):
+            assert (rows["tick"][n], rows["mode"][n]) == (state.tick, state.mode)
+            assert (rows["late_us"][n], rows["busy_us"][n]) == (state.late_us, state.busy_us)
+            assert rows["t_s"][n] == state.t_ns / NS_PER_S
+            for field, unit in units.items():
+                assert [rows[f"{field}{k + 1}_{unit}"][n] for k in range(2)] == getattr(state, field)
+            theta = [rows[f"theta_hat{k + 1}_{'kg_m2' if k < 3 else 'kg_m'}"][n] for k in range(5)]
+            assert theta == state.theta_hat
+            for peer in log[site].peers:
+                used = state.used[peer]
+                stamp = used * NS_PER_S // log.scenario.sites[peer].rate_hz
+                assert rows[f"used_{peer}_tick"][n] == (used if used >= 0 else None)
+                assert rows[f"age_{peer}_ms"][n] == ((state.t_ns - stamp) / 1e6 if used >= 0 else None)
+    assert set(STATE_VECTORS) == {*units, "theta_hat"}
+
+
+@pytest.mark.parametrize("which", LOGS)
+def test_a_row_of_arrivals_is_what_a_record_lists(which: str) -> None:
+    log = LOGS[which]()
+    for site in log.sites:
+        table = log.table(site, "arrivals")
+        names = ("tick", "peer", "sample_tick", "delay_us")
+        rows = zip(*(table[name].rows(0, len(table)) for name in names), strict=True)
+        peers = log[site].peers
+        assert list(rows) == [
+            (state.tick, peers[peer], tick, delay_us)
+            for state in log[site].states
+            for peer, tick, delay_us in state.rx
+        ]
+
+
+def test_a_row_of_statistics_is_its_message() -> None:
+    log = logs.busy().log
+    stats = LinkStats(
+        v=3, site="a", boot=1, tick=20, t_ns=100_000_000, mode="hold", accepted={"b": 4, "c": 5}, late={},
+        age_us={"b": -1, "c": 7}, duplicate={}, refused={}, dropped={"not finite": 2, "malformed": 1},
+        late_max_us=8, busy_max_us=9, overruns=10, offset_us={"b": -1}, delay_us={"b": -1, "c": 12},
+    )  # fmt: skip
+    later = msgspec.structs.replace(stats, tick=40, dropped={})
+    table = logs.rewritten(log, keep=lambda s: s.tick < 3, others=[later, stats]).table("a", "link")
+    first = {column.name: column.rows(0, 1)[0] for column in table.columns}
+    assert first["tick"] == 20
+    assert (first["t_s"], first["mode"], first["late_max_us"], first["overruns"]) == (0.1, "hold", 8, 10)
+    assert (first["age_b_us"], first["age_c_us"]) == (None, 7)  # -1: none yet
+    assert (first["offset_b_us"], first["offset_c_us"]) == (-1, None)  # an offset of -1 us; none known
+    assert (first["delay_b_us"], first["delay_c_us"]) == (None, 12)
+    assert (first["accepted_b_count"], first["late_b_count"]) == (4, None)
+    assert table["dropped_not_finite_count"].rows(0, 2) == [2, 0]
+    assert table["dropped_malformed_count"].rows(0, 2) == [1, 0]
+
+
+def test_statistics_without_any_have_the_same_columns() -> None:
+    some = opened(recorded("paper"))
+    none = opened(a_file(recorded("paper"), []))
+    for kind in ("state", "link", "arrivals"):
+        assert [c.name for c in none.table("m1", kind).columns] == [
+            c.name for c in some.table("m1", kind).columns
+        ]
+        assert len(none.table("m1", kind)) == 0
+    assert len(none.table("events")) == 0
+
+
+def test_events_are_in_the_order_in_which_they_came() -> None:
+    log = paper()
+    told = [
+        Event(member="s", boot=2**64 - 1, kind="epoch", text="an epoch", boots={"m1": 5}, n=0),
+        Event(member="m1", boot=1, kind="mode", text="holds, and says so", t_ns=7_000_000, n=0),
+    ]
+    table = logs.rewritten(log, keep=lambda s: s.tick < 2, others=told).table("events")
+    rows = {column.name: column.rows(0, 2) for column in table.columns}
+    assert table.label == "events"
+    assert sorted(zip(rows["member"], rows["t_s"], rows["boot"], strict=True)) == [
+        ("m1", 0.007, 1),
+        ("s", None, 2**64 - 1),
+    ]
+    assert sorted(rows["boots"]) == ["", '{"m1": 5}']
+    every = messages(recorded("paper"))
+    ends = [m for m in every if m[0].endswith("/event")]
+    late = [
+        (topic, payload, 10**9 - n, sent, number) for n, (topic, payload, _, sent, number) in enumerate(ends)
+    ]
+    assert opened(a_file(recorded("paper"), late)).table("events")["member"].rows(0, 3) == ["s", "m2", "m1"]
+
+
+def test_what_there_is_not_is_answered_with_what_there_is() -> None:
+    log = paper()
+    with pytest.raises(KeyError, match="m1, m2, s"):
+        log.table("m3")
+    with pytest.raises(KeyError, match="state, link, arrivals"):
+        log.table("m1", "links")
+    with pytest.raises(KeyError, match="q1_rad, q2_rad"):
+        log.table("m1")["q1"]
+
+
+def test_an_arrival_of_a_peer_that_there_is_not_is_refused() -> None:
+    log = opened(edited(recorded("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]}))
+    with pytest.raises(LogError, match="record of m1 lists an arrival of a peer"):
+        log.table("m1", "arrivals")
+
+
+def test_a_number_that_64_bits_do_not_hold_is_refused() -> None:
+    every = messages(recorded("paper"))
+    event = next(m for m in every if m[0].endswith("/event"))
+    log = opened(a_file(recorded("paper"), [changed(event, ticks=2**64 - 1)]))
+    with pytest.raises(LogError, match="ticks has a number that is out of range"):
+        log.table("events")
+
+
+def test_times_are_the_files() -> None:
+    every = messages(recorded("paper"))
+    moved = [(topic, payload, log_ns + 5, sent + 3, number) for topic, payload, log_ns, sent, number in every]
+    table = opened(a_file(recorded("paper"), moved)).table("m1")
+    t_ns = np.round(table["t_s"].values * 1e9).astype(np.int64)
+    assert (table["log_time_ns"].values == t_ns + 5).all()
+    assert (table["publish_time_ns"].values == t_ns + 3).all()
+
+
+def test_a_name_has_its_unit_once() -> None:
+    assert named("q1", "rad") == "q1_rad"
+    assert named("late_us", "us") == "late_us"
+    assert named("tick", "tick") == "tick"
+    assert named("slew_ppb", "ns/s") == "slew_ppb"
+    assert named("kind", "") == "kind"
+
+
+def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
+    known = np.array([True, False])
+    column = Column("x_us", np.array([3, 4]), known=known)
+    assert column.rows(0, 2) == [3, None]
+    numbers = column.numbers()
+    assert numbers[0] == 3
+    assert np.isnan(numbers[1])
+    assert Column("x_us", np.array([3, 4]), known=~known | known).numbers().dtype == np.int64

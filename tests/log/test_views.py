@@ -1,0 +1,379 @@
+"""The standard channels: every extreme is there, nothing else is, whatever order the records come in."""
+
+import hashlib
+import io
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from trilat_net.core.tick import Mode, Output
+from trilat_net.log.envelope import columns_of, envelope
+from trilat_net.log.views import FULL, Views
+from trilat_net.log.writer import LogWriter
+from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.net.wire import decode, encode_state
+from trilat_net.scenario import Scenario, load
+from trilat_net.sim import virtual
+
+SCENARIO = load("two_sites", {"duration_s": 0.5})
+KEY = "trilat/lab/m/state"
+EPOCH_NS = 1_700_000_000_000_000_000
+BUCKET = 20  # ticks of a site at 1 kHz, at 100 Hz
+SLOW = 200
+CURVES = ("q", "q_des", "qd", "tau")
+finite = st.floats(-1e6, 1e6) | st.integers(-2, 2).map(float)
+
+
+@dataclass
+class Seen:
+    """A message as a reader of other people has it."""
+
+    topic: str
+    message: Any
+    publish_ns: int
+    log_ns: int
+
+
+class Desk:
+    """The views of a session, and what they put."""
+
+    def __init__(self, views_hz: float, scenario: Scenario = SCENARIO, epoch_ns: int = 0) -> None:
+        self.seen: list[Seen] = []
+        self.views = Views(scenario, "lab", epoch_ns, views_hz, self._put)
+
+    def _put(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
+        channel = self.views.channels[topic]
+        self.seen.append(Seen(topic, (channel.kind, data), publish_ns, log_ns))
+
+    def take(self, messages: Iterable[Any], key: str = KEY) -> None:
+        for n, message in enumerate(messages):
+            self.views.takers[key](message, n)
+
+    def finish(self) -> None:
+        self.views.finish(max((seen.log_ns for seen in self.seen), default=0))
+
+    def arrays(self, topic: str) -> list[tuple[int, list[float]]]:
+        """Publish time and numbers of a channel's messages, in the order in which they were put."""
+        return [(s.publish_ns, numbers_of(*s.message)) for s in self.seen if s.topic == topic]
+
+
+def decoder_of(kind: str) -> Any:
+    from mcap.records import Schema
+
+    from trilat_net.log import cdr
+
+    schema = Schema(id=1, name=kind, encoding="ros2msg", data=cdr.SCHEMAS[kind])
+    return DecoderFactory().decoder_for("cdr", schema)
+
+
+@cache
+def _decoder(kind: str) -> Any:
+    return decoder_of(kind)
+
+
+def numbers_of(kind: str, data: bytes) -> list[float]:
+    message = _decoder(kind)(data)
+    if kind == "sensor_msgs/msg/JointState":
+        return [*message.position, *message.velocity, *message.effort]
+    return list(message.data)
+
+
+def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> Output:
+    """A record whose numbers are these, from q to theta_hat."""
+    n = iter(numbers)
+    vectors = [[next(n) for _ in range(size)] for size in (2, 2, 2, 2, 2, 2, 5)]
+    q, qd, q_des, qd_des, tau, tau_x, theta_hat = vectors
+    return Output(tick, tick * 10**6, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, [-1], 0, [], [])
+
+
+def joint_row(one: Output) -> list[float]:
+    return [x for name in CURVES for x in getattr(one, name)]
+
+
+def error_row(one: Output) -> list[float]:
+    return [a - b for a, b in zip(one.q, one.q_des, strict=True)]
+
+
+def slow_row(one: Output) -> list[float]:
+    return [*one.tau_x, *one.theta_hat, float(one.mode)]
+
+
+def error_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
+    return desk.arrays("/viz/m/error")
+
+
+def slow_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
+    """The slow arrays put together again, in the order of `slow_row`."""
+    parts = [desk.arrays(f"/viz/m/{name}") for name in ("tau_x", "theta_hat", "mode")]
+    assert len({tuple(t for t, _ in part) for part in parts}) == 1
+    return [(rows[0][0], [x for _, row in rows for x in row]) for rows in zip(*parts, strict=True)]
+
+
+def joint_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
+    """Of the joint states what `joint_row` has; of a reference there are angles alone."""
+    rows = desk.arrays("/viz/m/joint_states")
+    assert all(math.isnan(x) for _, row in rows for x in row[6:8] + row[10:])
+    return [(t_ns, row[:6] + row[8:10]) for t_ns, row in rows]
+
+
+@given(st.lists(st.lists(finite, min_size=3, max_size=3), min_size=1, max_size=30))
+def test_the_envelope_of_a_column_is_its_extremes_in_the_order_in_which_they_came(
+    rows: list[list[float]],
+) -> None:
+    columns = list(zip(*rows, strict=True))
+    first, second = envelope(columns)
+    for a, b, column in zip(first, second, columns, strict=True):
+        assert {a, b} == {min(column), max(column)}
+        assert column.index(a) <= column.index(b)
+
+
+@st.composite
+def runs(draw: st.DrawFn) -> list[Output]:
+    """Some ticks of a second, in any order, with small or arbitrary numbers."""
+    ticks = draw(st.lists(st.integers(0, 450), unique=True, min_size=1, max_size=120))
+    if draw(st.booleans()):
+        ticks.sort()
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    numbers = rng.integers(-3, 4, (len(ticks), 17)) * rng.choice([1.0, 1e-9, 1e5], 17)
+    modes = rng.choice([Mode.RUN, Mode.HOLD, Mode.DIVERGED], len(ticks), p=[0.9, 0.05, 0.05])
+    return [
+        record(tick, row.tolist(), Mode(mode)) for tick, row, mode in zip(ticks, numbers, modes, strict=True)
+    ]
+
+
+def buckets(records: Iterable[Output], length: int) -> dict[int, list[Output]]:
+    by: dict[int, list[Output]] = defaultdict(list)
+    for one in records:
+        by[one.tick // length].append(one)
+    return by
+
+
+@given(runs())
+def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: list[Output]) -> None:
+    """In whatever order the records come."""
+    desk = Desk(100.0)
+    desk.take(records)
+    desk.finish()
+    for arrays_of, row_of, length in (
+        (joint_arrays, joint_row, BUCKET),
+        (error_arrays, error_row, BUCKET),
+        (slow_arrays, slow_row, SLOW),
+    ):
+        put: dict[int, list[list[float]]] = defaultdict(list)
+        for t_ns, row in arrays_of(desk):
+            put[t_ns // (length * 10**6)].append(row)
+        wanted = buckets(records, length)
+        assert set(put) == set(wanted)
+        for number, ones in wanted.items():
+            columns = zip(*map(row_of, ones), strict=True)
+            for column, shown in zip(columns, zip(*put[number], strict=True), strict=True):
+                assert min(shown) == min(column)
+                assert max(shown) == max(column)
+                assert set(shown) <= set(column)
+
+
+@given(runs())
+def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records: list[Output]) -> None:
+    desk = Desk(100.0, epoch_ns=EPOCH_NS)
+    desk.take(records)
+    desk.finish()
+    have = {EPOCH_NS + one.t_ns for one in records}
+    assert {seen.publish_ns for seen in desk.seen} <= have
+    log_ns = [seen.log_ns for seen in desk.seen]
+    assert log_ns == sorted(log_ns)
+    if [one.tick for one in records] == sorted(one.tick for one in records):
+        for topic in ("/viz/m/joint_states", "/viz/m/error", "/viz/m/theta_hat"):
+            times = [t_ns for t_ns, _ in desk.arrays(topic)]
+            assert times == sorted(set(times))
+
+
+@pytest.mark.parametrize("tick", [0, 7, 219, 399])
+def test_a_spike_of_one_tick_survives(tick: int) -> None:
+    """In each number of a record, by itself."""
+    for number in range(17):
+        records = []
+        for k in range(400):
+            numbers = [math.sin(k / 50 + n) for n in range(17)]
+            numbers[number] += 5.0 * (k == tick)
+            records.append(record(k, numbers))
+        desk = Desk(100.0)
+        desk.take(records)
+        desk.finish()
+        for arrays_of, row_of, most in (
+            (joint_arrays, joint_row, 40),
+            (error_arrays, error_row, 40),
+            (slow_arrays, slow_row, 4),
+        ):
+            whole = np.array([row_of(one) for one in records])
+            shown = np.array([row for _, row in arrays_of(desk)])
+            assert np.array_equal(shown.max(axis=0), whole.max(axis=0))
+            assert np.array_equal(shown.min(axis=0), whole.min(axis=0))
+            assert len(shown) <= most
+
+
+def test_a_live_recorder_sees_one_message_every_ten_ms_on_either_clock() -> None:
+    """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
+    desk = Desk(100.0)
+    desk.take(record(k, [float(k)] * 17) for k in range(1000))
+    seen = [s for s in desk.seen if s.topic == "/viz/m/joint_states"]
+    assert [s.publish_ns // 10**6 for s in seen] == list(range(0, 980, 10))
+    assert [s.log_ns for s in seen] == list(range(20, 1000, 10))
+
+
+@pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL])
+def test_full_is_every_record_as_it_was(views_hz: float) -> None:
+    records = [record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
+    desk = Desk(views_hz)
+    desk.take(records)
+    desk.finish()
+    assert joint_arrays(desk) == [(one.t_ns, joint_row(one)) for one in records]
+    if views_hz == FULL:
+        assert slow_arrays(desk) == [(one.t_ns, slow_row(one)) for one in records]
+
+
+@given(runs())
+def test_a_record_of_the_wire_and_one_of_the_simulation_look_the_same(records: list[Output]) -> None:
+    states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
+    assert columns_of(states) == columns_of(records)
+
+
+def test_what_waits_is_bounded_by_the_bucket_and_not_by_the_silence() -> None:
+    """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
+    desk = Desk(100.0)
+    desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
+    (lane,) = [lane for lane in desk.views.lanes if lane._first]
+    assert len(lane._open) + len(lane._late) <= 2 * BUCKET
+    assert len(lane._slow_open) <= SLOW // BUCKET * 2
+
+
+def stats(**facts: Any) -> LinkStats:
+    counts = {"accepted": {"s": 1}, "late": {"s": 0}, "duplicate": {"s": 0}, "refused": {"s": 0}}
+    return LinkStats(
+        **{
+            "v": 3, "site": "m", "boot": 1, "tick": 100, "t_ns": 100_000_000, "mode": "run",
+            "age_us": {"s": 1500}, **counts, "dropped": {}, "late_max_us": 70, "busy_max_us": 40,
+            "overruns": 0, **facts,
+        }
+    )  # fmt: skip
+
+
+def test_statistics_are_arrays_with_a_unit_and_what_was_not_measured_is_no_number() -> None:
+    desk = Desk(100.0)
+    clocks = {"offset_us": {"s": -2000}, "bound_us": {"s": 40}}
+    delays = {"delay_us": {"s": 800}, "delay_max_us": {"s": 2500}}
+    desk.take([stats(**clocks, **delays)], "trilat/lab/m/link")
+    shown = {seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in desk.seen}
+    assert shown == {
+        "link_age": [1.5],
+        "link_delay": [0.8, 2.5],
+        "link_offset": [-2.0, 0.04],
+        "timing": [70.0, 40.0],
+    }
+    nothing = Desk(100.0)
+    nothing.take([stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})], "trilat/lab/m/link")
+    by_topic = {seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in nothing.seen}
+    assert math.isnan(by_topic["link_age"][0])
+    assert all(map(math.isnan, by_topic["link_delay"] + by_topic["link_offset"]))
+
+
+def test_virtual_time_has_no_clocks_and_no_network_to_show() -> None:
+    desk = Desk(100.0)
+    desk.take([stats()], "trilat/lab/m/link")
+    assert [seen.topic for seen in desk.seen] == ["/viz/m/link_age"]
+
+
+@pytest.mark.parametrize(("kind", "level"), [("end", 20), ("lost", 30), ("diverged", 40)])
+def test_an_event_is_a_text_and_a_line_with_a_level(kind: str, level: int) -> None:
+    desk = Desk(100.0, epoch_ns=EPOCH_NS)
+    event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
+    desk.take([event], "trilat/lab/recorder/event")
+    text, line = desk.seen
+    assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == ("/viz/events", "m: ü happened")
+    shown = _decoder(line.message[0])(line.message[1])
+    assert (line.topic, shown.level, shown.name, shown.msg) == ("/viz/log", level, "m", "ü happened")
+    assert text.publish_ns == line.publish_ns == EPOCH_NS + 5
+
+
+def test_an_event_before_the_epoch_has_the_time_of_its_arrival() -> None:
+    desk = Desk(100.0, epoch_ns=EPOCH_NS)
+    desk.views.takers["trilat/lab/m/event"](Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9)
+    assert desk.seen[0].publish_ns == EPOCH_NS - 9
+
+
+def recorded(views_hz: float, name: str = "paper") -> bytes:
+    stream = io.BytesIO()
+    virtual.record(load(name, {"duration_s": 0.5}), stream, views_hz=views_hz)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("name", ["paper", "jitter"])
+def test_two_virtual_runs_with_views_are_the_same_file(name: str) -> None:
+    first, second = recorded(100.0, name), recorded(100.0, name)
+    assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
+
+
+def test_the_logs_own_messages_are_the_same_with_views_and_without() -> None:
+    own = [
+        [
+            (channel.topic, message.log_time, message.publish_time, message.sequence, message.data)
+            for _, channel, message in make_reader(io.BytesIO(recorded(hz))).iter_messages()
+            if not channel.topic.startswith("/viz")
+        ]
+        for hz in (0.0, 100.0)
+    ]
+    assert own[0] == own[1]
+
+
+def test_the_file_has_its_messages_in_order_of_log_time() -> None:
+    times = [
+        message.log_time
+        for _, _, message in make_reader(io.BytesIO(recorded(100.0))).iter_messages(log_time_order=False)
+    ]
+    assert times == sorted(times)
+
+
+def test_a_log_without_views_has_no_channel_of_them() -> None:
+    summary = make_reader(io.BytesIO(recorded(0.0))).get_summary()
+    assert summary is not None
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"msgpack"}
+
+
+def test_a_part_ends_with_all_that_it_has_seen() -> None:
+    """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
+    scenario = load("two_sites", {"duration_s": 0.2})
+    outputs = [step.output for step in virtual.run(scenario) if step.site.name == "m"]
+    shown = []
+    for part in (outputs[:77], outputs[77:]):
+        stream = io.BytesIO()
+        writer = LogWriter(stream, scenario, "lab", "live", EPOCH_NS, views_hz=100.0)
+        for one in part:
+            payload = encode_state("m", 1, ["s"], one, [], 0, 0)
+            state = decode(payload, State)
+            writer.add(KEY, payload, one.t_ns, EPOCH_NS + one.t_ns, one.tick, state)
+        writer.finish({})
+        reader = make_reader(io.BytesIO(stream.getvalue()), decoder_factories=[DecoderFactory()])
+        shown += [
+            [*ros.position, *ros.velocity[:2], *ros.effort[:2]]
+            for _, _, _, ros in reader.iter_decoded_messages("/viz/m/joint_states")
+        ]
+    whole = np.array([joint_row(one) for one in outputs])
+    assert np.array_equal(np.max(shown, axis=0), whole.max(axis=0))
+    assert np.array_equal(np.min(shown, axis=0), whole.min(axis=0))
+
+
+def test_a_site_with_an_odd_rate_is_shown_no_less_often_than_asked() -> None:
+    scenario = load("two_sites", {"sites.m.rate_hz": 333})
+    desk = Desk(100.0, scenario)
+    desk.take(record(k, [0.0] * 17) for k in range(333))
+    desk.finish()
+    assert 100 <= len(desk.arrays("/viz/m/joint_states")) <= 112

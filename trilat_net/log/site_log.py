@@ -1,0 +1,239 @@
+"""One site's part of a log: its records as arrays with time, or one by one.
+
+Law: what is asked for is decoded, and nothing else; what is no record is an error that names the site,
+whenever it is found.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arm import Array
+from ..core.grid import NS_PER_S
+from ..errors import LogError, WireError
+from ..net.messages import READABLE, State
+from ..net.wire import decode
+from . import columns
+from .columns import Ints, Words
+from .records import ByTick, Records, records
+
+
+class Times(NamedTuple):
+    """When messages came and when they were sent, Unix ns, shape (K,) each."""
+
+    log_ns: Ints
+    publish_ns: Ints
+
+
+class SiteLog:
+    """The records of one site, in tick order.
+
+    Args:
+        name: the site.
+        peers: its peers, in scenario order.
+        rate_hz: its tick rate.
+        payloads: the records as published.
+        source: what errors call the file.
+        times: when they came; None where nobody will ask.
+
+    Attributes:
+        name: the site.
+        peers: its peers, in scenario order.
+        rate_hz: its tick rate, Hz.
+        payloads: the records as published, in tick order.
+        tick: their ticks, shape (K,).
+
+    Raises:
+        LogError: a record cannot be read; every property raises it too, for what it alone looks at.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        peers: tuple[str, ...],
+        rate_hz: int,
+        payloads: Sequence[bytes],
+        source: str,
+        times: Times | None = None,
+    ) -> None:
+        self.name = name
+        self.peers = peers
+        self.rate_hz = rate_hz
+        self._source = source
+        self.payloads = payloads
+        with self._told():
+            self.tick: Ints = columns.ticks(payloads)
+        if (self.tick[1:] < self.tick[:-1]).any():
+            order = np.argsort(self.tick, kind="stable")
+            self.tick = self.tick[order]
+            self.payloads = [payloads[n] for n in order.tolist()]
+            times = None if times is None else Times(*(column[order] for column in times))
+        self._times = times
+
+    def __len__(self) -> int:
+        return len(self.payloads)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return f"<{self.name}: no records>"
+        first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
+        missing = self.missing or "none"
+        return (
+            f"<{self.name}: {len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s, "
+            f"{missing} missing>"
+        )
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except WireError as error:
+            raise LogError(f"{self._source}: a record of {self.name} cannot be read: {error}") from None
+
+    def _vectors(self, field: str) -> Array:
+        with self._told():
+            return columns.vectors(self.payloads, field)
+
+    def numbers(self, field: str) -> Ints:
+        """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
+        with self._told():
+            return columns.numbers(self.payloads, field)
+
+    @cached_property
+    def states(self) -> Sequence[State]:
+        """The records, decoded and checked as a whole."""
+        return records(self.payloads, self._decoded)
+
+    @cached_property
+    def by_tick(self) -> "dict[int, State] | ByTick":
+        """The same, by their ticks; of several with one tick the last."""
+        if isinstance(self.states, Records):
+            return ByTick(self.states, self.tick)
+        return {state.tick: state for state in self.states}
+
+    def _decoded(self, payloads: Sequence[bytes]) -> list[State]:
+        with self._told():
+            return [decode(payload, State, READABLE) for payload in payloads]
+
+    @property
+    def missing(self) -> int:
+        """How many ticks before the last record have none."""
+        return int(self.tick[-1]) + 1 - len(np.unique(self.tick)) if len(self) else 0
+
+    @cached_property
+    def t_ns(self) -> Ints:
+        """Nominal time since the epoch, shape (K,), ns."""
+        return self.numbers("t_ns")
+
+    @cached_property
+    def t_s(self) -> Array:
+        """Nominal time since the epoch, shape (K,), s."""
+        return self.t_ns / NS_PER_S
+
+    @property
+    def log_time_ns(self) -> Ints:
+        """When each record came, shape (K,), Unix ns."""
+        return self._when().log_ns
+
+    @property
+    def publish_time_ns(self) -> Ints:
+        """When each record was sent, by its own stamp, shape (K,), Unix ns."""
+        return self._when().publish_ns
+
+    def _when(self) -> Times:
+        zeros = np.zeros(len(self), dtype=np.int64)
+        return self._times if self._times is not None else Times(zeros, zeros)
+
+    @cached_property
+    def mode(self) -> Words:
+        """What the site was doing, shape (K,): "run", "hold", "brake", "return" or "diverged"."""
+        with self._told():
+            return columns.words(self.payloads, "mode")
+
+    @cached_property
+    def q(self) -> Array:
+        """Joint angles, shape (K, 2), rad."""
+        return self._vectors("q")
+
+    @cached_property
+    def qd(self) -> Array:
+        """Joint velocities, shape (K, 2), rad/s."""
+        return self._vectors("qd")
+
+    @cached_property
+    def q_des(self) -> Array:
+        """Reference of Eq. (6), shape (K, 2), rad."""
+        return self._vectors("q_des")
+
+    @cached_property
+    def qd_des(self) -> Array:
+        """Its derivative, shape (K, 2), rad/s."""
+        return self._vectors("qd_des")
+
+    @property
+    def e(self) -> Array:
+        """Position error q - q_des, Eq. (9), shape (K, 2), rad."""
+        return self.q - self.q_des
+
+    @cached_property
+    def tau(self) -> Array:
+        """Control torque of Eq. (13), shape (K, 2), N m."""
+        return self._vectors("tau")
+
+    @cached_property
+    def tau_x(self) -> Array:
+        """Exogenous torque in the sign of Eq. (8), shape (K, 2), N m; ON the arm acts its negative."""
+        return self._vectors("tau_x")
+
+    @cached_property
+    def theta_hat(self) -> Array:
+        """Estimate of the parameters, Eq. (15), shape (K, 5), kg m^2 and kg m as in Eq. (24)."""
+        return self._vectors("theta_hat")
+
+    @cached_property
+    def late_us(self) -> Ints:
+        """Wake-up minus deadline, shape (K,), us; 0 in virtual time."""
+        return self.numbers("late_us")
+
+    @cached_property
+    def busy_us(self) -> Ints:
+        """Computing time of each tick, shape (K - 1,), us: record k + 1 carries that of tick k."""
+        return self.numbers("busy_us")[1:]
+
+    @cached_property
+    def sent_ns(self) -> Ints:
+        """When each record was sent, by the site's own clock since the epoch on it, shape (K,), ns."""
+        return self.numbers("sent_ns")
+
+    @cached_property
+    def used(self) -> dict[str, Ints]:
+        """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
+        with self._told():
+            return columns.per_peer(self.payloads, "used", self.peers, absent=-1)
+
+    @cached_property
+    def arrivals(self) -> tuple[Ints, Ints]:
+        """How many samples each record took in, shape (K,), and all of them as in `rx`, shape (N, 3)."""
+        with self._told():
+            return columns.arrivals(self.payloads)
+
+    def changes(self) -> dict[int, list[str]]:
+        """Returns the changes that the site took in, by tick, as `cmd` names them."""
+        with self._told():
+            lists = columns.words(self.payloads, "cmd")
+        return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
+
+    def age_s(self, peer: str, rate_hz: int) -> Array:
+        """Returns now minus the stamp of the sample in use, shape (K,), s; NaN before the first.
+
+        Args:
+            peer: which peer.
+            rate_hz: that peer's tick rate.
+        """
+        used = self.used[peer]
+        age = self.t_ns - used * NS_PER_S // rate_hz
+        seconds: Array = np.where(used >= 0, age / NS_PER_S, np.nan)
+        return seconds
