@@ -5,6 +5,7 @@
     log = trilat_net.simulate("paper", set={"control.Kd": 5})
     log["m1"].t_s, log["m1"].q
     log = trilat_net.open_log("run.mcap")
+    log.frame("m1")
 
 One `Site.step`, three drivers: live over a network, in virtual time, and again from the log, the same code
 gives the same numbers bit for bit.
@@ -14,13 +15,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .experiment import open_log, simulate, verify
+    from .experiment import simulate, verify
+    from .log.reader import open_log
     from .trial.running import check
     from .trial.trial import trials
+    from .whatif.rerun import rerun
 
-__all__ = ["check", "open_log", "simulate", "trials", "verify"]
+__all__ = ["check", "open_log", "rerun", "simulate", "trials", "verify"]
 
-_MODULES = {"check": "trial.running", "trials": "trial.trial"}
+_MODULES = {
+    "rerun": "whatif.rerun",
+    "check": "trial.running",
+    "trials": "trial.trial",
+    "open_log": "log.reader",
+}
 
 
 def __getattr__(name: str) -> Any:

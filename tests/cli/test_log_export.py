@@ -1,0 +1,114 @@
+"""`trilat log export`: one sentence on success, one where it fails, and nothing half made."""
+
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.log.dealt import a_file, dealt, messages
+from tests.log_editing import recorded
+
+from .running import trilat
+
+FORMS = {
+    "ros2": "run-ros2.mcap",
+    "csv": "run-csv",
+    "parquet": "run-parquet",
+    "npz": "run.npz",
+    "mat": "run.mat",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    return tmp_path
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_log_is_exported_beside_itself(form: str, folder: Path) -> None:
+    text = trilat("log", "export", "run.mcap", "--to", form, cwd=folder).succeeds()
+    assert text == f"{FORMS[form]}: 360 records of m1, m2, s\n"
+    assert sorted(path.name for path in folder.iterdir()) == sorted(["run.mcap", FORMS[form]])
+
+
+def test_an_export_goes_where_it_is_told_and_replaces_only_what_it_may(folder: Path) -> None:
+    command = ("log", "export", "run.mcap", "--to", "csv", "-o", "tables")
+    trilat(*command, cwd=folder).succeeds()
+    trilat(*command, cwd=folder).refuses("tables: exists", "--force")
+    trilat(*command, "--force", cwd=folder).succeeds()
+    assert pl.read_csv(folder / "tables" / "s_state.csv").height == 120
+    trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder).refuses(
+        "run.mcap: exists"
+    )
+    assert (folder / "run.mcap").read_bytes() == recorded("paper")
+
+
+def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
+    count = len(messages(recorded("paper")))
+    for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
+        (folder / f"run-00{n + 1}.mcap").write_bytes(data)
+    files = ("run-002.mcap", "run-001.mcap")
+    trilat("log", "export", *files, "--to", "npz", "-o", "out.npz", cwd=folder).succeeds()
+    assert np.load(folder / "out.npz")["m1/tick"].tolist() == list(range(120))
+
+
+def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
+    trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder).refuses(
+        "--to", "xlsx", "ros2, parquet, csv"
+    )
+    trilat("log", "export", "none.mcap", "--to", "csv", cwd=folder).refuses("none.mcap: cannot be read")
+    assert [path.name for path in folder.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("form", "module", "name"), [("parquet", "polars", "frames"), ("mat", "scipy.io", "mat")]
+)
+def test_a_package_that_is_missing_is_named_with_what_installs_it(
+    form: str, module: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    done = trilat("log", "export", "run.mcap", "--to", form, cwd=folder)
+    done.refuses(f"pip install 'trilat-net[{name}]'")
+    assert [path.name for path in folder.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("form", ["csv", "npz"])
+def test_csv_and_npz_need_no_extra(form: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("polars", "scipy", "scipy.io"):
+        monkeypatch.setitem(sys.modules, module, None)
+    trilat("log", "export", "run.mcap", "--to", form, cwd=folder).succeeds()
+
+
+def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> None:
+    every = messages(recorded("paper"))
+    topic = next(m[0] for m in every if m[0].endswith("/s/state"))
+    (folder / "bad.mcap").write_bytes(a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)]))
+    trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder).refuses(
+        "bad.mcap: a record of s cannot be"
+    )
+    assert sorted(path.name for path in folder.iterdir()) == ["bad.mcap", "run.mcap"]
+
+
+@contextmanager
+def no_file_longer_than(size: int) -> Iterator[None]:
+    """As a full disk, for every library that writes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_disk_that_is_full_is_one_sentence_and_leaves_nothing_behind(form: str, folder: Path) -> None:
+    with no_file_longer_than(10_000):
+        done = trilat("log", "export", "run.mcap", "--to", form, cwd=folder)
+    done.refuses("cannot be written: File too large", code=5)
+    assert [path.name for path in folder.iterdir()] == ["run.mcap"]
