@@ -59,7 +59,7 @@ def compare(log: Log, executed: Iterable[tuple[str, Output]], *, arrivals: bool)
         executed: the other execution: (site, record), in any order.
         arrivals: whether arrivals must be the same too, or only what was computed from them.
     """
-    by_tick = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+    by_tick = {name: log[name].by_tick for name in log.sites}
     records = agreeing = 0
     first: Difference | None = None
     for site, output in executed:

@@ -4,46 +4,20 @@ Law (L3): two records in a row, and what waits in the links, suffice to resume; 
 counted, and is never a difference.
 """
 
-from collections.abc import Mapping, Sequence
-from functools import cached_property
-from itertools import islice
+from collections.abc import Callable, Mapping, Sequence
 
-from ..core.arm import JOINTS
-from ..core.grid import NS_PER_S
 from ..core.site import MAX_COMMANDS, Site
-from ..core.tick import MAX_ARRIVALS, Arrival, Command, Mode, Output, Tick
+from ..core.tick import MAX_ARRIVALS, Arrival, Command, Output, Tick
 from ..errors import ScenarioError
 from ..log.reader import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, command_from
 from .difference import Difference, close, first_difference, identical, same_bits
+from .resumption import Resumption, recorded_output
 from .verdict import Verdict
 
-_LOOK_BACK = 100
-"""Records before a gap in which to look for the newest sample that had come."""
-
-
-def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
-    """Returns a record as `Site.step` returned it."""
-    modes = {mode.name.lower(): mode for mode in Mode}
-    mem = state.mem if len(state.mem) == JOINTS + 1 else []
-    used = [state.used.get(peer, -1) for peer in peers]
-    return Output(
-        state.tick,
-        state.t_ns,
-        modes.get(state.mode, Mode.DIVERGED),
-        state.q,
-        state.qd,
-        state.q_des,
-        state.qd_des,
-        state.tau,
-        state.tau_x,
-        state.theta_hat,
-        used,
-        state.rx_crc,
-        state.cmd,
-        mem,
-    )
+TOLD_EVERY = 256
+"""Records after which one is told how many are done."""
 
 
 class Execution:
@@ -75,14 +49,19 @@ class Execution:
         self._verdict = verdict
         self._same = same_bits if verdict.whole_run else close
         self._assured = True
-        self._assumed: list[set[int]] = [set() for _ in self._peers]
-        self._lacking: list[set[int]] = [set() for _ in self._peers]
+        self._resumption = Resumption(site_log, self._by_tick, self._ends)
 
-    def run(self) -> None:
-        """Executes every record."""
+    def run(self, told: Callable[[int], None] | None = None) -> None:
+        """Executes every record.
+
+        Args:
+            told: told now and then how many are done.
+        """
         verdict, states = self._verdict, self._log.states
         expected = 0
         for n, state in enumerate(states):
+            if told is not None and n % TOLD_EVERY == 0:
+                told(n)
             verdict.records += 1
             if state.tick == expected - 1:
                 verdict.differ(Difference(state.site, state.tick, "tick", state.tick, expected))
@@ -142,13 +121,7 @@ class Execution:
         return commands[:MAX_COMMANDS], None
 
     def _book(self, state: State, output: Output, difference: Difference) -> None:
-        in_doubt = any(
-            output.used[j] in self._assumed[j]
-            or state.used.get(peer, -1) in self._assumed[j]
-            or state.used.get(peer, -1) in self._lacking[j]
-            for j, peer in enumerate(self._peers)
-        )
-        if in_doubt:
+        if self._resumption.in_doubt(state, output):
             self._verdict.unjudged += 1
             self._assured = False
         else:
@@ -169,7 +142,7 @@ class Execution:
             if sample is not None:
                 arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
             elif 0 <= tick <= self._ends[peer]:
-                self._lacking[peer].add(tick)
+                self._resumption.lacking[peer].add(tick)
                 lacking = Difference(state.site, state.tick, "", tick, None)
             else:
                 valid = f"a tick from 0 to {self._ends[peer]}"
@@ -178,68 +151,10 @@ class Execution:
 
     def _resume(self, n: int) -> bool:
         """Brings the site to where record n finds it, if the two records before it stand in a row."""
-        states = self._log.states
-        if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
+        if not self._resumption.possible(n):
             return False
-        before, last = (recorded_output(states[m], self._peers) for m in (n - 2, n - 1))
-        in_use: list[Arrival | None] = []
-        waiting: list[Arrival] = []
-        for j, used in enumerate(last.used):
-            sample = self._by_tick[j].get(used)
-            if used >= 0 and sample is None:
-                return False
-            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
-            certain, self._assumed[j] = self._came_before(n, j, used)
-            for tick in sorted(certain | self._assumed[j]):
-                if (came := self._by_tick[j].get(tick)) is not None:
-                    waiting.append(Arrival(j, tick, came.q, came.qd))
-                else:
-                    self._lacking[j].add(tick)
-        for command in self._commands(states[n].tick - 1)[0]:  # given in the gap
+        for command in self._commands(self._log.states[n].tick - 1)[0]:  # given in the gap
             self._site.order(command)
-        self._site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
-        self._site.resume(before, last)
+        self._resumption.place(self._site, n)
         self._assured = True
         return True
-
-    def _came_before(self, n: int, peer: int, used: int) -> tuple[set[int], set[int]]:
-        """Returns which samples newer than the one in use had come before record n: (certainly, probably).
-
-        Certain are those that a record before n lists. Probable are those that no record lists at all
-        and that are older than record n, or than the first sample that came after it.
-        """
-        t_ns = self._log.states[n].t_ns
-        by_time = -(-t_ns * self._site.peer_rate_hz(peer) // NS_PER_S) - 1
-        first_listed = self._first_listed[peer]
-        newest = max(by_time, self._next_listed(peer, n) - 1)
-        before = (
-            tick
-            for state in self._log.states[max(0, n - _LOOK_BACK) : n]
-            for j, tick, _ in state.rx
-            if j == peer
-        )
-        highest = max(before, default=-1)
-        certain: set[int] = set()
-        probable: set[int] = set()
-        for tick in range(used + 1, min(max(newest, highest), self._ends[peer]) + 1):
-            listed = first_listed.get(tick)
-            if listed is None and tick <= newest:
-                probable.add(tick)
-            elif listed is not None and listed < n:
-                certain.add(tick)
-        return certain, probable
-
-    @cached_property
-    def _first_listed(self) -> list[dict[int, int]]:
-        """Per peer and sample, the first record (by its place) that lists it."""
-        listed: list[dict[int, int]] = [{} for _ in self._peers]
-        for m, state in enumerate(self._log.states):
-            for peer, tick, _ in state.rx:
-                if 0 <= peer < len(listed):
-                    listed[peer].setdefault(tick, m)
-        return listed
-
-    def _next_listed(self, peer: int, n: int) -> int:
-        """Returns the tick of the first sample of a peer that record n or a later one lists."""
-        later = (tick for state in islice(self._log.states, n, None) for j, tick, _ in state.rx if j == peer)
-        return next(later, self._ends[peer] + 1)

@@ -8,7 +8,7 @@ from .commands import command, command_from, later_tables, owner, present_links,
 from .expectation import Expect
 from .links import Link
 from .model import Scenario
-from .reader import load, override, parse, shipped, shipped_text, site_named, template_text
+from .reader import embedded, load, override, parse, shipped, shipped_text, site_named, template_text
 from .site import Adaptive, Arm, Limits, OnStale, ProportionalDamped, Pulse, SiteSpec
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "SiteSpec",
     "command",
     "command_from",
+    "embedded",
     "later_tables",
     "load",
     "override",

@@ -33,13 +33,13 @@ def resolve_row(row: Table, names: list[str], own: int, path: str) -> Table:
     return {peer: float(row.get(peer, 0.0)) for peer in names if peer != names[own]}
 
 
-def resolve_links(tables: Table, names: list[str], folder: Path) -> Table:
+def resolve_links(tables: Table, names: list[str], folder: Path | None) -> Table:
     """Returns every link, complete, from [link] and [links].
 
     Args:
         tables: the scenario's.
         names: the sites.
-        folder: where a trace's file lies.
+        folder: where a trace's file lies; None where no file may be named.
     """
     every = [f"{j}->{i}" for i in names for j in names if i != j]
     written = known(tables.get("links", {}), every, "links")
@@ -88,7 +88,7 @@ def resolve_link(written: Any, base: Table, path: str) -> Table:
     return link
 
 
-def _with_trace(link: Table, name: str, path: str, folder: Path) -> Table:
+def _with_trace(link: Table, name: str, path: str, folder: Path | None) -> Table:
     """Returns a link that holds the trace of its file; of a log that of the link of its name, or of `of`."""
     link = dict(link)
     file, of = (link.pop(key, None) for key in _FILE)
@@ -98,6 +98,8 @@ def _with_trace(link: Table, name: str, path: str, folder: Path) -> Table:
     if file is None and of is not None:
         raise ScenarioError("names a link of the log that file names", path=f"{path}.of")
     if file is not None:
+        if folder is None:
+            raise ScenarioError("no file may be named here", path=f"{path}.file")
         try:
             link["trace"] = read_trace(folder / str(file), str(of or name))
         except ScenarioError as error:

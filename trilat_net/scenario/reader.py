@@ -6,15 +6,21 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ..core.delay import LIMIT_US
+from ..core.link import AHEAD_LIMIT_S, SAMPLE, calendar_pages
 from ..errors import ScenarioError
 from .conversion import convert
 from .model import Scenario
 from .resolution import resolve
 from .site import SiteSpec
+from .spreading import spread
 from .tables import Table, nearest
 
 _KINDS = ("model", "preset", "law")
 """Keys that say which other keys a table has."""
+
+MAX_LINKS_BYTES = 64 << 20
+"""Memory of a site's links, at most, in a scenario that somebody else wrote."""
 
 _FOLDER = resources.files("trilat_net") / "scenarios"
 
@@ -45,14 +51,17 @@ def load(source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[
     """Returns a scenario by the name of a shipped one or by path, with overrides applied.
 
     Args:
-        source: a shipped name, a path, or a scenario.
+        source: a shipped name, a path, or a scenario, in which a key of a group counts for all (`spreading`).
         overrides: `{"control.Kd": 5}` or `["control.Kd=5"]`.
 
     Raises:
         ScenarioError: the source cannot be read or is not a valid scenario.
     """
     if isinstance(source, Scenario):
-        return parse(source.text, source.name, overrides) if overrides else source
+        try:
+            return parse(source.text, source.name, spread(source, _pairs(overrides))) if overrides else source
+        except ScenarioError as error:
+            raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     name = str(source)
     if isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name:
         try:
@@ -82,7 +91,7 @@ def parse(
     text: str,
     source: str = "",
     overrides: Mapping[str, Any] | Sequence[str] = (),
-    folder: Path = Path(),
+    folder: Path | None = Path(),
 ) -> Scenario:
     """Returns the scenario that a TOML text describes.
 
@@ -90,20 +99,61 @@ def parse(
         text: the TOML text.
         source: what errors call it.
         overrides: see `load`.
-        folder: where the files that it names lie.
+        folder: where the files that it names lie; None where it may name none.
 
     Raises:
         ScenarioError: with the path of the offending key.
     """
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"is not TOML: {error}", source=source) from None
-    try:
+        tables = _tables(text)
         override(tables, overrides)
         return convert(resolve(tables, folder))
     except ScenarioError as error:
         raise ScenarioError(error.problem, path=error.path, source=source) from None
+    except RecursionError:
+        raise ScenarioError("is nested too deep", source=source) from None
+
+
+def _tables(text: str) -> Table:
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
+        raise ScenarioError(f"is not TOML: {error}") from None
+
+
+def embedded(text: str, source: str = "") -> Scenario:
+    """Returns the scenario that a log or a peer holds: resolved, and written by who knows whom.
+
+    Args:
+        text: the TOML text.
+        source: what errors call it.
+
+    Raises:
+        ScenarioError: it is none, or names a file, or leaves to defaults what would fill the memory.
+    """
+    scenario = parse(text, source, folder=None)
+    changed = (change.after for change in scenario.timeline if change.link)
+    traces = sum(len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed))
+    if traces > len(text):
+        raise ScenarioError("its traces are not written out, link by link", source=source)
+    for name in scenario.names:
+        rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(name)]
+        if sum(map(_pages_at_most, rates)) * SAMPLE.itemsize <= MAX_LINKS_BYTES:
+            continue  # plainly little: the compiled core takes half a second to load, and a log opens faster
+        pages = sum(map(calendar_pages, rates))
+        if pages * SAMPLE.itemsize > MAX_LINKS_BYTES:
+            wanted = pages * SAMPLE.itemsize >> 20
+            raise ScenarioError(
+                f"its links would take {wanted} MiB, at most {MAX_LINKS_BYTES >> 20} are given",
+                path=f"sites.{name}",
+                source=source,
+            )
+    return scenario
+
+
+def _pages_at_most(rate_hz: int) -> int:
+    """Returns what `calendar_pages` does not exceed."""
+    return 2 * ((LIMIT_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3)
 
 
 def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> None:

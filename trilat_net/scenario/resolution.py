@@ -46,6 +46,8 @@ _VECTORS = {
 }
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
+MAX_SITES = 32
+"""Most sites of an experiment: every pair of them has two links."""
 
 
 def _vectors(table: Table) -> Table:
@@ -58,12 +60,12 @@ def _vectors(table: Table) -> Table:
     }
 
 
-def resolve(tables: Table, folder: Path) -> Table:
+def resolve(tables: Table, folder: Path | None) -> Table:
     """Returns the tables with every default written out, in the shape of `Scenario`.
 
     Args:
         tables: as an author wrote them.
-        folder: where files that they name lie.
+        folder: where files that they name lie; None where they may name none.
     """
     known(tables, _TOP + _TABLES, "")
     finite(tables, "")
@@ -137,6 +139,8 @@ def _resolve_sites(tables: Table) -> Table:
             raise ScenarioError(f"must be a list of tables [[{path}.hands]]", path=f"{path}.hands")
         site["hands"] = [_vectors(known(h, fields(Pulse), f"{path}.hands[{n}]")) for n, h in enumerate(hands)]
         sites[name] = {key: site[key] for key in fields(SiteSpec)}
+    if len(sites) > MAX_SITES:
+        raise ScenarioError(f"has {len(sites)} sites, at most {MAX_SITES} are taken", path="sites")
     if len(sites) < 2:
         raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")
     return sites

@@ -52,9 +52,11 @@ def one_of(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def finite(value: Any, path: str) -> None:
-    """Refuses a number that is not finite, however deep it lies."""
+    """Refuses a number that is not finite, or has more than 64 bits, however deep it lies."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ScenarioError(f"must be a number of at most 64 bits, has {value.bit_length()}", path=path)
     if isinstance(value, dict):
         for key, entry in value.items():
             finite(entry, f"{path}.{key}" if path else key)

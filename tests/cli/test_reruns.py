@@ -1,0 +1,118 @@
+"""`trilat rerun`: what it prints, writes, refuses, and how it ends."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.log_editing import edited
+from trilat_net.experiment import open_log
+
+from .running import trilat
+
+
+def test_nothing_changed_says_that_it_is_the_log(log_file: Path) -> None:
+    text = trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent).succeeds()
+    assert "open loop: s executed afresh; m1, m2 as recorded" in text
+    assert "nothing is changed" in text
+    (row,) = [line.split() for line in text.splitlines() if line.startswith("s ")]
+    assert row[:3] == ["s", "500", "500"]
+    assert "note" not in text
+
+
+def test_a_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None:
+    done = trilat("rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent)
+    text = done.succeeds()
+    for words in (
+        "control.Kd of s: 3 -> 5",
+        "rms e rad",
+        "max tau N m",
+        "s: q is up to",
+        "s: the first difference is at tick 1 (0.001 s): tau[0] was",
+        "note: m1 and m2 are as recorded: nothing is changed there, and they do not react",
+    ):
+        assert words in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_a_closed_loop_has_a_row_for_every_site_and_tells_of_its_links(log_file: Path) -> None:
+    options = ("--closed-loop", "--set", "link.delay_ms=300")
+    text = trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds()
+    assert "closed loop: m1, m2, s executed afresh\n" in text
+    assert "every link: 200 ms -> 300 ms" in text
+    assert sum(line.split()[0] in ("m1", "m2", "s") for line in text.splitlines() if line[:1] in "ms") == 3
+    assert "link m1->s: samples in use were 200 ms old" in text
+
+
+def test_the_outcome_is_a_log_that_every_command_reads(log_file: Path) -> None:
+    cwd = log_file.parent
+    options = ("--replace", "s", "--set", "control.Kd=5", "-o", "again.mcap")
+    assert "again.mcap" in trilat("rerun", log_file, *options, cwd=cwd).succeeds()
+    assert open_log(cwd / "again.mcap").driver == "rerun"
+    text = trilat("verify", "again.mcap", "--virtual", cwd=cwd).succeeds()
+    assert "500/500 records identical" in text
+    assert "m1 and m2 stand as recorded" in text
+    trilat("rerun", log_file, *options, cwd=cwd).refuses("again.mcap", "--force")
+    trilat("rerun", log_file, *options, "--force", cwd=cwd).succeeds()
+    trilat("log", "check", "again.mcap", cwd=cwd).succeeds()
+
+
+def test_json_says_all_of_it(log_file: Path) -> None:
+    options = ("--replace", "s", "--set", "control.Kd=5", "--json", "-o", "again.mcap")
+    facts = json.loads(trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds())
+    assert facts["replaced"] == ["s"]
+    assert facts["file"] == "again.mcap"
+    assert facts["sites"]["s"]["executed"] == 500
+    assert facts["sites"]["s"]["error_max_rad"]["before"] > 0.0
+
+
+def test_a_site_that_diverges_is_an_answer_and_a_failure(log_file: Path) -> None:
+    options = ("--replace", "s", "--set", "limits.qd_limit_rad_s=0.5", "--set", "control.Kd=0")
+    done = trilat("rerun", log_file, *options, cwd=log_file.parent)
+    assert done.code == 1, done
+    assert "s: diverged at 0." in done.out
+
+
+def test_a_log_that_is_not_what_it_says_is_a_failure(log_file: Path, short_log: bytes) -> None:
+    def record(r: dict[str, object]) -> dict[str, object]:
+        if (r["site"], r["tick"]) == ("s", 300):
+            r["tau"] = [1.0, 2.0]
+        return r
+
+    log_file.write_bytes(edited(short_log, record=record))
+    done = trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent)
+    assert done.code == 1, done
+    assert "tick 300" in done.out
+
+
+@pytest.mark.parametrize(
+    ("options", "facts"),
+    [
+        ((), ("--replace", "--closed-loop")),
+        (("--replace", "s", "--closed-loop"), ("--replace", "--closed-loop")),
+        (("--replace", "x"), ("no site 'x'", "m1, m2, s")),
+        (("--replace", "s", "--set", "control.Kdd=5"), ("control.Kdd", "did you mean 'Kd'")),
+        (("--replace", "s", "--set", "sites.m1.control.Kd=5"), ("sites.m1.control.Kd", "--replace m1")),
+        (("--replace", "s", "--set", "rate_hz=500"), ("rate_hz", "--closed-loop")),
+        (("--closed-loop", "--set", "duration_s=99"), ("duration_s", "not known")),
+        (("--replace", "s", "-o", "run.mcap"), ("run.mcap", "the log itself")),
+        (("--replace", "s", "-o", "run.mcap", "--force"), ("run.mcap", "the log itself")),
+        (("--replace", "s", "-o", "no/such/a.mcap"), ("a.mcap",)),
+    ],
+    ids=" ".join,
+)
+def test_bad_input_is_one_sentence(options: tuple[str, ...], facts: tuple[str, ...], log_file: Path) -> None:
+    before = log_file.read_bytes()
+    trilat("rerun", log_file, *options, cwd=log_file.parent).refuses(*facts)
+    assert log_file.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\x89MCAP0\r\n"])
+def test_a_file_that_is_no_log_is_bad_input(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(content)
+    trilat("rerun", "bad.mcap", "--closed-loop", cwd=tmp_path).refuses("bad.mcap")
+
+
+def test_a_log_of_a_version_to_come_is_bad_input(log_file: Path, short_log: bytes) -> None:
+    log_file.write_bytes(edited(short_log, record=lambda r: {**r, "v": 99}))
+    trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent).refuses("version 99")

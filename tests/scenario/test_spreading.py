@@ -1,0 +1,77 @@
+"""Overrides of a resolved scenario: a key of a group counts for all that can have it."""
+
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load
+
+PAPER = load("paper")
+
+
+@pytest.mark.parametrize("name", ["paper", "free", "two_sites"])
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"control.Kd": 5},
+        {"control": {"Kp": 2.0, "Kd": 5}},
+        {"limits.tau_limit_nm": 50.0},
+        {"arm.m2_kg": 2.0},
+        {"on_stale": {"action": "hold", "age_ms": 3000.0}},
+        {"link.preset": "4g", "link.loss": 0.1},
+        {"link.model": "uniform", "link.delay_ms": 50.0, "link.half_width_ms": 10.0},
+        {"rate_hz": 500},
+        {"seed": 9, "duration_s": 3.0},
+    ],
+    ids=str,
+)
+def test_it_is_what_the_same_override_gives_as_the_scenario_is_loaded(
+    name: str, overrides: dict[str, object]
+) -> None:
+    """Of scenarios whose sites and links have nothing of their own."""
+    assert load(load(name), overrides) == load(name, overrides)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
+    texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][::order]
+    scenario = load(PAPER, texts)
+    assert [site.control.Kd[0] for site in scenario.sites.values()] == [5.0, 5.0, 7.0]
+    assert {name: link.loss for name, link in scenario.links.items() if link.loss != 0.1} == {"m1->s": 0.2}
+
+
+def test_another_law_has_its_own_gains_from_the_start() -> None:
+    control = load(PAPER, ["control.law=p_d", "control.K=20"]).sites["m2"].control
+    assert (control.K, control.d) == ((20.0, 20.0), (3.0, 3.0))
+
+
+def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
+    mixed = load(PAPER, ["sites.m1.control.law=p_d", "links.m1->s.model=measured"])
+    again = load(mixed, ["control.Kd=5", "control.K=30", "link.delay_ms=50"])
+    assert again.sites["m1"].control.K == (30.0, 30.0)
+    assert again.sites["s"].control.Kd == (5.0, 5.0)
+    assert again.links["m1->s"].measured
+    assert again.links["m2->s"].delay_ms == 50.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "facts"),
+    [
+        (["control.Kdd=5"], ["control.Kdd", "did you mean 'Kd'"]),
+        (["control.K=5"], ["control.K", "belongs to law p_d", "adaptive", "control.law"]),
+        (["link.half_width_ms=5"], ["link.half_width_ms", "belongs to model uniform", "link.model"]),
+        (["link.playout=5"], ["link.playout", "did you mean 'playout_ms'"]),
+        (["link.preset=4h"], ["4h", "did you mean '4g'"]),
+        (["link.model=constnt"], ["constnt", "did you mean 'constant'"]),
+        (["control.law=pd"], ["pd", "did you mean 'p_d'"]),
+        (["limits.tau_limit=5"], ["limits.tau_limit", "did you mean 'tau_limit_nm'"]),
+        (["control=5"], ["control", "must be a table"]),
+        (["link=5"], ["link", "must be a table"]),
+        (["nonsense.x=5"], ["nonsense", "unknown key"]),
+    ],
+    ids=str,
+)
+def test_a_key_that_nothing_can_have_is_refused(overrides: list[str], facts: list[str]) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load(PAPER, overrides)
+    assert str(caught.value).startswith("paper: ")
+    assert all(fact in str(caught.value) for fact in facts), caught.value

@@ -1,0 +1,179 @@
+"""What is asked of a log: which sites are executed afresh, and what is changed of the experiment.
+
+Law: only what is executed can be changed. A key that concerns nobody who is executed is refused; one that
+concerns others too changes nothing of theirs, and that is said.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ..errors import ScenarioError, UsageError
+from ..log.reader import Log
+from ..scenario import Scenario, load, owner, parse, site_named
+
+Overrides = Mapping[str, Any] | Sequence[str]
+
+_WORDS = ("name", "title", "about", "assumed", "expect")
+
+
+class Changed(NamedTuple):
+    """One value that the rerun has otherwise.
+
+    Attributes:
+        key: its dotted path in the resolved scenario.
+        before: what the log has.
+        after: what the rerun has.
+    """
+
+    key: str
+    before: Any
+    after: Any
+
+
+@dataclass(frozen=True)
+class Premise:
+    """A rerun, as it is meant.
+
+    Attributes:
+        original: the experiment of the log.
+        scenario: what holds in it: changed for the sites that are executed, the log's for the others.
+        replaced: the sites that are executed, in scenario order.
+        recorded: the others.
+        changes: what is otherwise than in the log.
+        without_effect: what was asked for besides, of sites that stand as recorded.
+    """
+
+    original: Scenario
+    scenario: Scenario
+    replaced: tuple[str, ...]
+    recorded: tuple[str, ...]
+    changes: list[Changed]
+    without_effect: list[Changed] = field(default_factory=list)
+
+    @property
+    def closed(self) -> bool:
+        """True where every site is executed: then each reacts to the others."""
+        return not self.recorded
+
+    @property
+    def mode(self) -> str:
+        """In a word: "closed loop" or "open loop"."""
+        return "closed loop" if self.closed else "open loop"
+
+
+def premise(log: Log, replace: Sequence[str], overrides: Overrides, *, closed_loop: bool) -> Premise:
+    """Returns what is asked of a log, checked.
+
+    Args:
+        log: the log.
+        replace: the sites to execute.
+        overrides: what to change, as `load` takes it.
+        closed_loop: whether to execute all of them.
+
+    Raises:
+        UsageError: it is not said which sites to execute, or in two ways.
+        ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
+    """
+    original = log.scenario
+    names = original.names
+    if closed_loop and replace:
+        raise UsageError("--closed-loop executes every site: leave out --replace, or --closed-loop")
+    if not closed_loop and not replace:
+        hint = f"--replace NAME (of {', '.join(names)}), or --closed-loop for all of them"
+        raise UsageError(f"which sites are to be executed afresh? Give {hint}")
+    for name in replace:
+        site_named(original, name)
+    replaced = tuple(name for name in names if closed_loop or name in replace)
+    recorded = tuple(name for name in names if name not in replaced)
+    for key in _keys(overrides):
+        _check_key(key, replaced, recorded)
+    wanted = load(original, overrides)
+    _check_frame(original, wanted, recorded)
+    scenario = _joined(original, wanted, recorded) if recorded else wanted
+    changes = _changes(original, scenario)
+    without = [changed for changed in _changes(original, wanted) if changed not in changes]
+    return Premise(original, scenario, replaced, recorded, changes, without)
+
+
+def _keys(overrides: Overrides) -> list[str]:
+    """Returns the keys that overrides name; what is none is refused where they are read."""
+    if isinstance(overrides, Mapping):
+        return list(overrides)
+    return [text.partition("=")[0].strip() for text in overrides]
+
+
+def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
+    """Refuses a key that a rerun has no use for, and one of a site that stands as recorded."""
+    group, _, rest = key.partition(".")
+    if group in _WORDS:
+        raise ScenarioError("is nothing that is executed: a rerun has no use for it", path=key)
+    if group == "rate_hz" or rest.endswith(".rate_hz"):
+        if recorded:
+            raise ScenarioError(
+                "cannot change in an open loop: samples come at the ticks of the log; use --closed-loop",
+                path=key,
+            )
+        return
+    member = rest.partition(".")[0]
+    concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(group, "")
+    if concerned in recorded:
+        why = f"{concerned} stands as recorded" + (
+            ", and a link belongs to its receiver" if group == "links" else ""
+        )
+        only = ", ".join(replaced)
+        raise ScenarioError(
+            f"has no effect: {why}; only {only} is executed: add --replace {concerned}", path=key
+        )
+
+
+def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
+    """Refuses other sites, and a run beyond the end of the log."""
+    if wanted.names != original.names:
+        raise ScenarioError(f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites")
+    if wanted.duration_s > original.duration_s:
+        raise ScenarioError(
+            f"the experiment of the log lasts {original.duration_s:g} s: what the network would have done "
+            f"until {wanted.duration_s:g} s is not known",
+            path="duration_s",
+        )
+    for name in original.names if recorded else ():
+        if wanted.sites[name].rate_hz != original.sites[name].rate_hz:
+            raise ScenarioError(
+                "cannot change in an open loop; use --closed-loop", path=f"sites.{name}.rate_hz"
+            )
+
+
+def _joined(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> Scenario:
+    """Returns the wanted scenario, with all that belongs to recorded sites as it was."""
+
+    def chosen(name: str) -> Scenario:
+        return original if name in recorded else wanted
+
+    timeline = [change for change in original.timeline if owner(change) in recorded]
+    timeline += [change for change in wanted.timeline if owner(change) not in recorded]
+    joined = msgspec.structs.replace(
+        wanted,
+        sites={name: chosen(name).sites[name] for name in original.names},
+        dominance={name: chosen(name).dominance[name] for name in original.names},
+        links={name: chosen(name.partition("->")[2]).links[name] for name in original.links},
+        timeline=tuple(sorted(timeline, key=lambda change: change.at_s)),
+    )
+    return parse(joined.text, original.name)
+
+
+def _changes(original: Scenario, other: Scenario) -> list[Changed]:
+    """Returns every value in which two scenarios differ."""
+    before, after = (dict(_leaves(msgspec.to_builtins(scenario), "")) for scenario in (original, other))
+    keys = [*before, *(key for key in after if key not in before)]
+    return [
+        Changed(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)
+    ]
+
+
+def _leaves(value: Any, path: str) -> list[tuple[str, Any]]:
+    if not isinstance(value, dict):
+        return [(path, value)]
+    return [leaf for key, entry in value.items() for leaf in _leaves(entry, f"{path}.{key}" if path else key)]
