@@ -22,8 +22,16 @@ def paused() -> Iterator[None]:
             gc.enable()
 
 
-def off_for_good() -> None:
-    """Puts all that exists out of the collector's sight and stops it: for a loop that must not pause."""
+def settle() -> None:
+    """Puts all that exists out of the collector's sight: from now on a round looks at what is new alone.
+
+    A full round over all that a program has imported takes a quarter of a second.
+    """
     gc.collect()
     gc.freeze()
+
+
+def off_for_good() -> None:
+    """Puts all that exists out of the collector's sight and stops it: for a loop that must not pause."""
+    settle()
     gc.disable()

@@ -6,10 +6,10 @@ Law: nothing is claimed that was not executed again just now.
 import itertools
 import multiprocessing
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,10 @@ from .analysis.notes import run_lines
 from .analysis.tables import VerdictLine
 from .errors import UsageError
 from .experiment import compare_with_virtual, twin_without_hands
+from .log.chunks import Progress
 from .log.reader import Log, open_log
 from .replay.comparison import Comparison
-from .replay.verify import Verdict, last_ticks, verify
+from .replay.verify import Verdict, executed_sites, last_ticks, verify
 from .scenario import Scenario
 
 
@@ -51,12 +52,53 @@ class Conclusion(NamedTuple):
         return all(line.passed for line in self.lines if line.label != _RECORDS)
 
 
-def conclude(log: Log, folder: Path) -> Conclusion:
+class Checked(NamedTuple):
+    """What executing a log again showed.
+
+    Attributes:
+        verdict: every site executed from its records.
+        lines: that and the other checks, a line each.
+    """
+
+    verdict: Verdict
+    lines: list[VerdictLine]
+
+    @property
+    def passed(self) -> bool:
+        """True where every execution agreed with the log, complete or not."""
+        return all(line.passed for line in self.lines)
+
+    def facts(self) -> dict[str, Any]:
+        """Returns the same for a program: every gap, and the first difference with both values."""
+        verdict, first = self.verdict, self.verdict.first
+        return {
+            "passed": self.passed,
+            "whole_run": verdict.whole_run,
+            "records": verdict.records,
+            "identical": verdict.identical,
+            "differing": verdict.differing,
+            "unjudged": verdict.unjudged,
+            "gaps": [{"site": site, "first": a, "last": b} for site, a, b in verdict.gaps],
+            "first_difference": None
+            if first is None
+            else {
+                "site": first.site,
+                "tick": first.tick,
+                "field": first.field,
+                "logged": repr(first.logged),
+                "computed": repr(first.computed),
+            },
+            "checks": [line._asdict() for line in self.lines],
+        }
+
+
+def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:
     """Verifies a log, compares it with virtual time, and writes figures, page and summary.
 
     Args:
         log: the log, from a file.
         folder: where the results go; exists.
+        progress: told how many figures are drawn, and how many there are.
 
     Raises:
         LogError: a record cannot be read.
@@ -65,7 +107,7 @@ def conclude(log: Log, folder: Path) -> Conclusion:
 
     lines: list[VerdictLine] = []
     with _worker() as pool:  # two cores: the log is executed while its figures are drawn
-        checking = pool.submit(_check_file, log.source)
+        checking = pool.submit(_check_files, log.sources)
         twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
         notes = run_lines(log)
 
@@ -73,9 +115,9 @@ def conclude(log: Log, folder: Path) -> Conclusion:
             lines.extend(checking.result())
             yield from lines
 
-        made = write_report(log, folder, twin=twin, verdicts=verdicts())
+        made = write_report(log, folder, twin=twin, verdicts=verdicts(), progress=progress)
     rows = [_row(log, site) for site in log.sites]
-    return Conclusion(_COLUMNS, rows, notes, lines, [Path(log.source), *made])
+    return Conclusion(_COLUMNS, rows, notes, lines, [*map(Path, log.sources), *made])
 
 
 def _worker() -> ProcessPoolExecutor:
@@ -84,23 +126,28 @@ def _worker() -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
 
 
-def _check_file(source: str) -> list[VerdictLine]:
-    return list(_checks(open_log(source), virtual=True))
+def _check_files(sources: Sequence[str]) -> list[VerdictLine]:
+    log = open_log(*sources)
+    return list(_checks(log, verify(log), virtual=True))
 
 
-def check_lines(log: Log, *, virtual: bool) -> list[VerdictLine]:
+def checked(log: Log, *, virtual: bool, progress: Progress | None = None) -> Checked:
     """Returns what executing a log again showed.
 
     Args:
         log: the log.
         virtual: whether to compare it with virtual time as well.
+        progress: told how many records are done, and how many there are.
 
     Raises:
         LogError: a record cannot be read.
     """
-    lines = list(_checks(log, virtual=virtual))
+    verdict = verify(log, progress)
+    lines = list(_checks(log, verdict, virtual=virtual, progress=progress))
     # whether a log is complete is not what its execution shows: reported, and no failure of it
-    return [line._replace(passed=True) if line.label == _RECORDS else line for line in lines]
+    return Checked(
+        verdict, [line._replace(passed=True) if line.label == _RECORDS else line for line in lines]
+    )
 
 
 def results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
@@ -156,15 +203,19 @@ def _link_facts(scenario: Scenario) -> Iterator[str]:
         yield f"link {name}: {text}"
 
 
-def _checks(log: Log, *, virtual: bool) -> Iterator[VerdictLine]:
+def _checks(
+    log: Log, verdict: Verdict, *, virtual: bool, progress: Progress | None = None
+) -> Iterator[VerdictLine]:
     yield _records_line(log)
-    yield _verify_line(verify(log))
+    yield _verify_line(verdict, _standing(log))
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield VerdictLine("scenario", "is not the one whose hash the log names: it was changed", False)
-    if virtual:
-        twins = compare_with_virtual(log)
+    if virtual and (standing := _standing(log)):
+        yield VerdictLine("virtual time", f"is another run: {standing} as recorded, and did not react", True)
+    elif virtual:
+        twins = compare_with_virtual(log, progress)
         yield _twin_line("virtual time fed with the log's arrivals", twins.fed, None)
-        if log.scenario.measured and log.driver == "live":
+        if log.scenario.measured and log.driver != "virtual":
             yield VerdictLine("plain virtual time", "is another run: a link was measured, not modelled", True)
             return
         late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
@@ -182,18 +233,26 @@ def _records_line(log: Log) -> VerdictLine:
     text = f"{have}/{want} in the file" if not silent else f"{have} in the file"
     if silent:
         text += f"; {', '.join(silent)} never said how many ticks were made"
-    if not log.complete:
+    if log.damaged:
+        text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
+    elif not log.complete:
         text += "; the file was not finished"
     return VerdictLine(_RECORDS, text, not silent and have == want and log.complete)
 
 
-def _verify_line(verdict: Verdict) -> VerdictLine:
+def _standing(log: Log) -> str:
+    """Says which sites an open-loop rerun did not execute, if the log is one; "" where all can be."""
+    others = [name for name in log.sites if name not in executed_sites(log)]
+    return f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
+
+
+def _verify_line(verdict: Verdict, standing: str) -> VerdictLine:
     how = "whole runs, bit for bit" if verdict.whole_run else "tick by tick to 1e-9: another platform made it"
     text = f"{verdict.identical}/{verdict.records} records identical ({how})"
-    for site, first, last in verdict.gaps[:5]:
-        text += f"; gap: {site} has no records of ticks {first} to {last}"
-    if len(verdict.gaps) > 5:
-        text += f"; and {len(verdict.gaps) - 5} more gaps"
+    if verdict.gaps:
+        text += f"; no records of {_gaps_text(verdict.gaps)}"
+    if standing:
+        text += f"; {standing} as recorded, against other samples than the file has"
     if verdict.unjudged:
         text += f"; {verdict.unjudged} behind gaps could not be judged"
     if verdict.first:
@@ -201,6 +260,19 @@ def _verify_line(verdict: Verdict) -> VerdictLine:
     if not verdict.records:
         return VerdictLine("executed again", "no records to execute", False)
     return VerdictLine("executed again", text, verdict.passed)
+
+
+def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
+    """Names every gap, by site; of very many the first ones."""
+    texts = []
+    left = MOST_GAPS
+    for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):
+        ranges = [f"{first}-{last}" if last > first else f"{first}" for _, first, last in group]
+        if left > 0:
+            texts.append(f"{site} {', '.join(ranges[:left])}")
+        left -= len(ranges)
+    more = f" and {-left} more ranges, which --json names" if left < 0 else ""
+    return "; ".join(texts) + more
 
 
 def _twin_line(label: str, comparison: Comparison, late_from: int | None) -> VerdictLine:
@@ -213,6 +285,8 @@ def _twin_line(label: str, comparison: Comparison, late_from: int | None) -> Ver
     return VerdictLine(label, f"{text}; the first that differs: {first}", excused)
 
 
+MOST_GAPS = 60
+"""Gaps that a line names."""
 _RECORDS = "records"
 _COLUMNS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
 

@@ -8,9 +8,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
+
 from . import collector
 from .core.tick import Output
+from .log.chunks import Progress
+from .log.logfile import new_log
 from .log.reader import Log, open_log
+from .log.views import VIEWS_HZ
 from .log.writer import new_file
 from .replay.comparison import Comparison, LateSample, compare, late_samples, schedule
 from .replay.verify import Verdict, verify
@@ -51,7 +56,12 @@ def simulate(
 
 
 def record_virtual(
-    scenario: Scenario, path: Path, *, force: bool = False, stopped: Callable[[], bool] = lambda: False
+    scenario: Scenario,
+    path: Path,
+    *,
+    force: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+    views_hz: float = VIEWS_HZ,
 ) -> bool:
     """Runs a scenario in virtual time into a file; False where the run diverged.
 
@@ -60,13 +70,14 @@ def record_virtual(
         path: the file.
         force: whether it may replace one.
         stopped: True once the run was asked to end.
+        views_hz: messages a second of the standard channels, see `log.views`; 0 for none.
 
     Raises:
         UsageError: the file exists, or cannot be made.
-        LogError: the disk refused.
+        LogRefused: the disk refused; says what is kept.
     """
-    with new_file(path, force=force) as stream:
-        return virtual.record(scenario, stream, stopped=stopped)
+    with new_log(path, force=force) as stream:
+        return virtual.record(scenario, stream, stopped=stopped, views_hz=views_hz)
 
 
 class Twins(NamedTuple):
@@ -83,18 +94,33 @@ class Twins(NamedTuple):
     late: list[LateSample]
 
 
-def compare_with_virtual(log: Log) -> Twins:
-    """Runs a log's scenario again in virtual time, with its arrivals and without, and compares."""
-    scenario = log.scenario
+def compare_with_virtual(log: Log, progress: Progress | None = None) -> Twins:
+    """Runs a log's scenario again in virtual time, with its arrivals and without, and compares.
+
+    Args:
+        log: the log; what is behind its last record is not run.
+        progress: told how many ticks are done, and how many there are.
+    """
+    scenario = _as_long_as(log)
+    total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
     with collector.paused():
         recorded = RecordedNetwork(schedule(log), peers)
         ordered = {name: log.commands(name) for name in scenario.names}
         return Twins(
-            compare(log, _outputs(scenario, recorded, ordered), arrivals=True),
-            compare(log, _outputs(scenario, None, ordered), arrivals=False),
+            compare(log, _told(_outputs(scenario, recorded, ordered), progress, 0, total), arrivals=True),
+            compare(
+                log, _told(_outputs(scenario, None, ordered), progress, total // 2, total), arrivals=False
+            ),
             late_samples(log),
         )
+
+
+def _as_long_as(log: Log) -> Scenario:
+    """Returns a log's scenario, as long as there are records: a torn log is a short run."""
+    ends_s = [(int(log[name].tick[-1]) + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
+    duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
+    return msgspec.structs.replace(log.scenario, duration_s=duration_s)
 
 
 def _outputs(
@@ -103,6 +129,16 @@ def _outputs(
     return ((site.name, output) for site, _, output in virtual.run(scenario, network, commands))
 
 
+def _told(
+    outputs: Iterator[tuple[str, Output]], progress: Progress | None, before: int, total: int
+) -> Iterator[tuple[str, Output]]:
+    """Yields the same, and tells now and then how many there were."""
+    for n, output in enumerate(outputs):
+        if progress is not None and n % 256 == 0:
+            progress(before + n, total)
+        yield output
+
+
 def twin_without_hands(log: Log) -> Log:
     """Returns the log's experiment in virtual time with nobody at the arms."""
-    return simulate(log.scenario.without_hands())
+    return simulate(_as_long_as(log).without_hands())

@@ -229,6 +229,4 @@ def in_modes(modes: Sequence[str]) -> SiteLog:
     """The first records of a site of `paper`, with other modes."""
     part = simulated("paper")["m1"]
     states = [replaced(state, mode=mode) for state, mode in zip(part.states, modes, strict=False)]
-    changed = SiteLog("m1", part.peers, part.rate_hz, [], "again")
-    changed.states = states
-    return changed
+    return SiteLog("m1", part.peers, part.rate_hz, [encode(state) for state in states], "again")

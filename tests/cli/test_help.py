@@ -14,8 +14,15 @@ COMMANDS = [
     ["router"],
     ["sim"],
     ["test"],
+    ["rerun"],
     ["verify"],
     ["report"],
+    ["replay"],
+    ["log", "info"],
+    ["log", "check"],
+    ["log", "recover"],
+    ["log", "export"],
+    ["log", "view"],
     ["set", "link"],
     ["set", "dominance"],
     ["scenario", "list"],
@@ -52,7 +59,8 @@ def test_these_are_all_the_commands() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "test", "show", "check")]
+    "command",
+    [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "test", "show", "check") and c[0] != "log"],
 )
 def test_every_command_that_takes_a_scenario_takes_overrides(command: list[str]) -> None:
     assert "--set" in printed(*command, "--help")

@@ -32,7 +32,7 @@ def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> No
         stderr=subprocess.PIPE,
         text=True,
     )
-    path = tmp_path / "long.mcap"
+    path = tmp_path / "long.mcap.active"
     until(lambda: path.exists() and path.stat().st_size > 100_000, timeout_s=60)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)

@@ -343,7 +343,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def read_by_all(path: Path) -> dict[str, str]:
-    """Has everybody read a file; returns what each said against it. Anything but a `TrilatError` is raised."""
+    """Has everybody read a file; returns what each said against it. Other than a `TrilatError` is raised."""
     complaints = {}
     for name, reader in READERS.items():
         try:

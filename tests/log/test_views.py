@@ -296,18 +296,21 @@ def test_virtual_time_has_no_clocks_and_no_network_to_show() -> None:
 def test_an_event_is_a_text_and_a_line_with_a_level(kind: str, level: int) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
-    desk.take([event], "trilat/lab/recorder/event")
+    desk.views.takers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
     text, line = desk.seen
     assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == ("/viz/events", "m: ü happened")
     shown = _decoder(line.message[0])(line.message[1])
     assert (line.topic, shown.level, shown.name, shown.msg) == ("/viz/log", level, "m", "ü happened")
-    assert text.publish_ns == line.publish_ns == EPOCH_NS + 5
+    assert shown.stamp.sec * 10**9 + shown.stamp.nanosec == EPOCH_NS + 5
+    assert text.publish_ns == text.log_ns == line.publish_ns == line.log_ns == EPOCH_NS + 9
 
 
 def test_an_event_before_the_epoch_has_the_time_of_its_arrival() -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.views.takers["trilat/lab/m/event"](Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9)
-    assert desk.seen[0].publish_ns == EPOCH_NS - 9
+    kind, data = desk.seen[1].message
+    stamp = _decoder(kind)(data).stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
 
 
 def recorded(views_hz: float, name: str = "paper") -> bytes:

@@ -4,7 +4,6 @@ Law (L3): a record names its inputs. What a missing record would have named is u
 neither as come nor as missing.
 """
 
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -40,9 +39,8 @@ class Arrivals(NamedTuple):
 def arrivals(log: Log, site: str) -> dict[str, Arrivals]:
     """Returns what came to a site, per peer."""
     part = log[site]
-    lists = [state.rx for state in part.states]
-    tick = np.repeat(part.tick, [len(rx) for rx in lists])
-    entries = np.array(list(chain.from_iterable(lists)), dtype=np.int64).reshape(-1, 3)
+    counts, entries = part.arrivals
+    tick = np.repeat(part.tick, counts)
     found = {}
     for index, peer in enumerate(part.peers):
         here = entries[:, 0] == index

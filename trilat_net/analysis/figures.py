@@ -5,6 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from ..log.chunks import Progress
 from ..log.reader import Log
 from . import style
 from .ages import delay_distributions, sample_age, varied
@@ -27,6 +28,10 @@ __all__ = [
 ]
 
 
+MOST_FIGURES = 9
+"""As many as a log can have."""
+
+
 def all_figures(log: Log, twin: Log | None) -> Iterator[tuple[str, Figure]]:
     """Yields every figure with the name of its file, without suffix.
 
@@ -46,10 +51,12 @@ def all_figures(log: Log, twin: Log | None) -> Iterator[tuple[str, Figure]]:
     yield "loop_timing", loop_timing(log)
 
 
-def write_figures(log: Log, folder: Path, twin: Log | None) -> list[Path]:
+def write_figures(log: Log, folder: Path, twin: Log | None, progress: Progress | None = None) -> list[Path]:
     """Writes every figure as PNG into a folder that exists, and returns the paths."""
     paths = []
-    for name, figure in all_figures(log, twin):
+    for n, (name, figure) in enumerate(all_figures(log, twin)):
+        if progress is not None:
+            progress(n, MOST_FIGURES)
         path = folder / f"{name}.png"
         figure.savefig(path, dpi=style.DPI)
         paths.append(path)

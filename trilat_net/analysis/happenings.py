@@ -10,7 +10,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.grid import NS_PER_S
 from ..errors import LogError
 from ..log.reader import Log, SiteLog
 from ..scenario import owner
@@ -120,7 +119,7 @@ def end_s(log: Log) -> float:
 
 def spans(part: SiteLog) -> list[Span]:
     """Returns when a site held, braked or returned, in order."""
-    modes = [state.mode for state in part.states]
+    modes: list[str] = part.mode.tolist()
     if all(mode in FOLLOWING for mode in modes):
         return []
     found = []
@@ -136,5 +135,4 @@ def spans(part: SiteLog) -> list[Span]:
 
 def diverged_at_s(part: SiteLog) -> float | None:
     """Returns when a site left its limits, s; None where it never did."""
-    last = part.states[-1] if len(part) else None
-    return last.t_ns / NS_PER_S if last is not None and last.mode == "diverged" else None
+    return float(part.t_s[-1]) if len(part) and part.mode[-1] == "diverged" else None

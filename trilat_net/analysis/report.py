@@ -11,6 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from ..log.chunks import Progress
 from ..log.reader import Log
 from . import charts, link_tables, motion, strip, style, tables, timing
 from .figures import write_figures
@@ -52,7 +53,12 @@ _CLOCKS = "The sender's clock against the receiver's, as it was estimated while 
 
 
 def write_report(
-    log: Log, folder: Path, *, twin: Log | None = None, verdicts: Iterable[VerdictLine] = ()
+    log: Log,
+    folder: Path,
+    *,
+    twin: Log | None = None,
+    verdicts: Iterable[VerdictLine] = (),
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
 
@@ -63,10 +69,11 @@ def write_report(
         folder: where to; made if it does not exist.
         twin: the same experiment with nobody at the arms, or None.
         verdicts: what was checked and how it came out.
+        progress: told how many figures are drawn, and how many there are.
     """
     folder.mkdir(parents=True, exist_ok=True)
     facts = summarise(log, twin)
-    figures = write_figures(log, folder, twin)
+    figures = write_figures(log, folder, twin, progress)
     lines = list(verdicts)
     checks = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"

@@ -135,6 +135,9 @@ def versions_html(log: Log) -> str:
 def _driven(log: Log) -> str:
     if log.driver == "virtual":
         return "virtual time"
+    if log.driver == "rerun":
+        sites, source = (log.session.get(f"rerun_{key}", "") for key in ("executed", "of"))
+        return f"rerun of {source or 'a log'}: {sites.replace(' ', ', ')} executed afresh"
     epoch_ns = int(log.session.get("epoch_unix_ns", "0"))
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)
     return f"live, session {log.session.get('session', '')}, epoch {began:%Y-%m-%d %H:%M:%S} UTC"

@@ -103,7 +103,20 @@ ClockDriftOption = Annotated[
     ),
 ]
 
+ViewsOption = Annotated[
+    str,
+    typer.Option(
+        "--views",
+        metavar="off|full|HZ",
+        help="Standard channels for other viewers beside the log's own: messages a second, extremes kept.",
+    ),
+]
+
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
+LogsArgument = Annotated[
+    list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")]
 
 
 def chosen_scenario(

@@ -19,6 +19,7 @@ from .options import (
     ScenarioArgument,
     SeedOption,
     SetOption,
+    ViewsOption,
     ZenohConfigOption,
     chosen_connection,
     chosen_scenario,
@@ -139,7 +140,7 @@ def site(
     raise typer.Exit(code)
 
 
-@app.command(epilog="Example: trilat record --session paper -o run.mcap")
+@app.command(epilog="Example: trilat record --session paper -o run.mcap --split-duration 600")
 def record(
     session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session to record.")],
     listen: ListenOption = None,
@@ -163,39 +164,76 @@ def record(
     concluded: Annotated[
         bool, typer.Option("--conclude", help="Verify and report it afterwards, in the folder of the log.")
     ] = False,
+    include: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--include", metavar="KEYS", help="Record these channels alone, as '**/m1/**'; repeatable."
+        ),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option("--exclude", metavar="KEYS", help="Leave these channels out, as '**/link'; repeatable."),
+    ] = None,
+    split_size: Annotated[
+        float | None, typer.Option("--split-size", metavar="MIB", help="Parts of at most this size, MiB.")
+    ] = None,
+    split_duration: Annotated[
+        float | None, typer.Option("--split-duration", metavar="S", help="Parts of this duration, s.")
+    ] = None,
+    carry_on: Annotated[
+        bool, typer.Option("--continue", help="Where the log exists, write the part that follows it.")
+    ] = False,
+    durable: Annotated[
+        bool, typer.Option("--durable", help="Put every 100 ms onto the disk, not every second.")
+    ] = False,
+    views: ViewsOption = "100",
     force: ForceOption = False,
 ) -> None:
     """Records one session, from its epoch to its end or to Ctrl-C.
 
-    Without endpoints it asks the first site, at its loopback port, who the others are.
+    Without endpoints it asks the first site, at its loopback port, who the others are. Parts are called
+    FILE-001.mcap and so on. A file bears .active at its end until it is finished.
     """
     from recorder.process import record_session
 
+    from ..log.choice import choice
+    from ..log.names import existing
+    from ..log.parts import storage
+    from ..log.views import views_rate
     from ..net.clock import system_clock
 
     connection = chosen_connection(listen, connect, router, zenoh_config, [], None)
     path = output if output is not None else Path(f"{session_name(session)}.mcap")
-    if path.exists() and (not force or path.is_dir()):
-        raise UsageError(f"{path}: exists; choose another name, or replace a file with --force")
+    place = storage(
+        path,
+        split_mib=split_size,
+        split_s=split_duration,
+        choice=choice(include or [], exclude or []),
+        force=force,
+        carry_on=carry_on,
+        durable=durable,
+        views_hz=views_rate(views),
+    )
+    place.first()  # a name that is taken is refused before anybody waits
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
     page = path.parent / "report.html"
     if concluded and page.exists() and not force:
         raise UsageError(f"{page}: exists; give the log a folder of its own, or use --force")
-    path.unlink(missing_ok=True)
     clock = system_clock(clock_offset, clock_drift)
-    then = (lambda: _conclude(path)) if concluded else lambda: None
-    code = record_session(session_name(session), path, connection, join_timeout, clock, say, then)
+    then = (lambda: _conclude(list(existing(path).values()))) if concluded else lambda: None
+    code = record_session(session_name(session), place, connection, join_timeout, clock, say, then)
     raise typer.Exit(code)
 
 
-def _conclude(path: Path) -> None:
+def _conclude(parts: list[Path]) -> None:
     """Verifies and reports a log, into its own folder."""
     from ..conclusion import conclude
     from ..experiment import open_log
 
     out.print("checking the log and drawing ...")
-    log = open_log(path)
+    path = parts[0]
+    log = open_log(*parts)
     conclusion = conclude(log, path.parent)
     show_conclusion(conclusion)
     if not conclusion.passed:

@@ -11,6 +11,12 @@ if TYPE_CHECKING:
     from ..conclusion import Conclusion
 
 
+def shown(text: object, most: int = 300) -> str:
+    """Returns a text of strangers as a terminal may have it: no control characters, and no endless one."""
+    plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1])
+    return plain if len(plain) <= most else plain[:most] + "..."
+
+
 def show_conclusion(conclusion: "Conclusion") -> None:
     """Prints what there is to say of a log."""
     table = Table(box=None, pad_edge=False)

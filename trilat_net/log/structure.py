@@ -93,6 +93,7 @@ class Structure:
         self._progress = progress
         self._chunk: ChunkFacts | None = None
         self._entries: dict[int, NDArray[np.uint64]] = {}
+        self._hidden = False  # whether something that cannot be read may have named a channel
 
     @property
     def size(self) -> int:
@@ -126,8 +127,10 @@ class Structure:
                 text = str(error)
                 self._tell("crc" if "CRC" in text else "records", frame.offset, text)
                 self._chunk = None
+                self._hidden = True
             for damage in framing.damaged[before:]:
                 self._tell("whole", damage.offset, str(damage))
+                self._hidden = True
             before = len(framing.damaged)
             if self._progress is not None:
                 self._progress(frame.end, framing.size)
@@ -183,7 +186,8 @@ class Structure:
             self._tell("records", offset, f"{what} {record.id} is not what it was before")
         if opcode == Opcode.SCHEMA and not record.id:
             self._tell("records", offset, "a schema has the number 0, which means none")
-        if opcode == Opcode.CHANNEL and record.schema_id and record.schema_id not in self.schemas:
+        unknown = opcode == Opcode.CHANNEL and record.schema_id and record.schema_id not in self.schemas
+        if unknown and not self._hidden:
             self._tell(
                 "records",
                 offset,
@@ -200,7 +204,7 @@ class Structure:
         if end - start < _MESSAGE.size:
             raise Unreadable("a message is shorter than its head")
         channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, start)
-        if channel not in self.channels and not self.messages[channel]:
+        if channel not in self.channels and not self.messages[channel] and not self._hidden:
             self._tell("records", offset, f"messages of channel {channel}, which comes nowhere before")
         self.messages[channel] += 1
         return Raw(channel, sequence, log_ns, publish_ns, data[start + _MESSAGE.size : end], offset)

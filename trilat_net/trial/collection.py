@@ -60,9 +60,8 @@ def measure_log(log: Log) -> Figures:
     missing = 0
     for name, tally in tallies.items():
         part = log[name]
-        t_ns = np.array([state.t_ns for state in part.states], dtype=np.int64)
         used = np.array([part.used[peer] for peer in part.peers]).T
-        tally.add(Rows(t_ns, part.q, part.qd, part.q_des, part.tau, used))
+        tally.add(Rows(part.t_ns, part.q, part.qd, part.q_des, part.tau, used))
         wanted = made.get(name, 0) if diverged_ns else scenario.ticks(name)
         missing += max(0, wanted - len(part))
     return measured(

@@ -1,0 +1,141 @@
+"""`trilat log info`, `trilat log check` and what every reading command says of a file that is not whole."""
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from tests.cli.running import trilat
+from tests.log_editing import edited, recorded, without
+from trilat_net.cli.show import shown
+
+WHOLE = recorded("paper")
+
+
+def written(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
+    path = folder / name
+    path.write_bytes(data)
+    return path
+
+
+def foreign() -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    for n in range(3):
+        writer.add_message(channel, n * 10_000_000, b"{}", n)
+    writer.finish()
+    return stream.getvalue()
+
+
+def test_info_tells_the_session_its_sites_links_and_channels(tmp_path: Path) -> None:
+    text = trilat("log", "info", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+    for fact in ("paper, virtual", "seed 1", "0.119 s of 0.12 s", "360, none missing", "m2->m1", "m1/state"):
+        assert fact in text
+    assert all(len(line) <= 120 for line in text.splitlines() if not line.startswith("file")), text
+
+
+def test_info_in_json_is_the_same_in_numbers(tmp_path: Path) -> None:
+    path = written(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
+    facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
+    assert facts["kind"] == "trilat"
+    assert facts["session"]["scenario"]["name"] == "paper"
+    assert facts["sites"]["m1"]["missing"] == 3
+    state = facts["channels"]["/trilat/paper/m1/state"]
+    assert (state["messages"], state["missing"], state["gaps"]) == (117, 3, [[5, 6], [90, 90]])
+    assert state["between_ms"]["p50"] == pytest.approx(1.0)
+    assert state["between_ms"]["max"] == pytest.approx(3.0)
+    assert facts["links"]["m2->m1"]["age_ms"]["p50"] == pytest.approx(20.0)
+    (file,) = facts["files"]
+    assert file["size_bytes"] == path.stat().st_size
+    assert file["finished"]
+
+
+def test_info_of_a_file_of_others_tells_its_channels(tmp_path: Path) -> None:
+    path = written(tmp_path, foreign())
+    facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
+    assert facts["kind"] == "mcap"
+    assert facts["session"] is None
+    assert facts["channels"]["/t"]["messages"] == 3
+    assert facts["channels"]["/t"]["rate_hz"] == pytest.approx(100.0)
+    assert "/t" in trilat("log", "info", path, cwd=tmp_path).succeeds()
+
+
+def test_info_of_a_log_that_cannot_be_opened_says_why_and_tells_the_rest(tmp_path: Path) -> None:
+    path = written(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
+    text = trilat("log", "info", path, cwd=tmp_path).succeeds()
+    assert "cannot be opened" in text
+    assert "is not TOML" in text
+    assert "/trilat/paper/m1/state" in text
+
+
+def test_a_sound_log_passes_every_check(tmp_path: Path) -> None:
+    text = trilat("log", "check", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+    assert [line.split()[0] for line in text.splitlines()] == ["ok"] * 10
+
+
+def test_a_log_that_lacks_records_fails_and_names_them(tmp_path: Path) -> None:
+    path = written(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
+    done = trilat("log", "check", path, cwd=tmp_path)
+    assert done.code == 1
+    assert "FAIL sequence" in done.out
+    assert "missing s/state 7-9" in done.out
+    found = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
+    assert not found["sound"]
+    (sequence,) = (each for each in found["checks"] if each["check"] == "sequence")
+    assert {place["text"] for place in sequence["places"]} == {"missing s/state 7-9", "missing s/state 40"}
+
+
+def test_a_file_of_others_is_checked_for_how_it_is_built_and_that_is_said(tmp_path: Path) -> None:
+    done = trilat("log", "check", written(tmp_path, foreign()), cwd=tmp_path)
+    assert done.code == 0
+    assert len(done.out.splitlines()) == 4
+    assert "no log of trilat-net" in done.err
+
+
+@pytest.mark.parametrize("command", ["info", "check"])
+def test_a_file_that_is_not_there_is_bad_input(command: str, tmp_path: Path) -> None:
+    trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
+
+
+def test_info_of_what_is_no_mcap_file_is_bad_input_and_check_says_it(tmp_path: Path) -> None:
+    path = written(tmp_path, b"text")
+    trilat("log", "info", path, cwd=tmp_path).refuses("is no MCAP file")
+    assert trilat("log", "check", path, cwd=tmp_path).code == 1
+
+
+@pytest.mark.parametrize("command", [["log", "info"], ["log", "check"], ["verify"]], ids=" ".join)
+def test_every_command_says_what_mends_a_torn_file(command: list[str], tmp_path: Path) -> None:
+    data = edited(WHOLE, chunk_bytes=4096)
+    path = written(tmp_path, data[: len(data) // 2], "run.mcap.active")
+    done = trilat(*command, path, cwd=tmp_path)
+    notes = [line for line in done.err.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 1, done
+    assert f"trilat log recover {path}" in notes[0]
+
+
+def test_verify_names_every_gap_and_goes_on_behind_it(tmp_path: Path) -> None:
+    lost = {3 * n for n in range(10, 30)}
+    path = written(tmp_path, edited(WHOLE, record=without("m2", lost)))
+    done = trilat("verify", path, cwd=tmp_path)
+    assert done.code == 0, done
+    assert f"m2 {', '.join(map(str, sorted(lost)))}" in done.out
+    facts = json.loads(trilat("verify", "--json", path, cwd=tmp_path).out)
+    assert facts["passed"]
+    assert facts["gaps"] == [{"site": "m2", "first": n, "last": n} for n in sorted(lost)]
+    assert facts["records"] == 360 - len(lost)
+    assert facts["identical"] + facts["unjudged"] == facts["records"]
+    assert 0 < facts["unjudged"] < 150
+
+
+def test_what_a_file_says_reaches_no_terminal_as_it_is(tmp_path: Path) -> None:
+    """An escape sequence in a name could clear the screen, or write what was never there."""
+    assert shown("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
+    assert len(shown("x" * 10_000)) < 400
+    path = written(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
+    done = trilat("log", "info", path, cwd=tmp_path)
+    assert "\x1b" not in done.out + done.err
+    assert "\x07" not in done.out + done.err

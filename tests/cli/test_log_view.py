@@ -1,0 +1,48 @@
+"""`log view`, and `--views` where logs are made."""
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from trilat_net.log.standard import channels_of
+
+from .running import trilat
+
+
+@pytest.mark.parametrize(("views", "least", "most"), [("off", 0, 0), ("50", 13, 14), ("full", 250, 250)])
+def test_a_simulation_shows_itself_as_often_as_asked(
+    tmp_path: Path, views: str, least: int, most: int
+) -> None:
+    duration = ("--duration", "0.25", "-o", "x.mcap")
+    trilat("sim", "two_sites", *duration, "--views", views, cwd=tmp_path).succeeds()
+    with (tmp_path / "x.mcap").open("rb") as stream:
+        count = sum(1 for _ in make_reader(stream).iter_messages("/viz/m/joint_states"))
+    assert least <= count <= most
+
+
+def test_views_are_on_by_default(tmp_path: Path) -> None:
+    trilat("sim", "two_sites", "--duration", "0.1", "-o", "x.mcap", cwd=tmp_path).succeeds()
+    assert "/viz/m/joint_states" in channels_of(tmp_path / "x.mcap")
+
+
+@pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])
+@pytest.mark.parametrize("command", [("sim", "two_sites"), ("record", "--session", "x")])
+def test_a_rate_that_is_none_is_refused(tmp_path: Path, command: tuple[str, ...], views: str) -> None:
+    done = trilat(*command, "--views", views, cwd=tmp_path)
+    done.refuses("--views is off, full, or messages a second from 1 on", repr(views))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_shown_can_be_kept(log_file: Path, tmp_path: Path) -> None:
+    """Of a log without views as well."""
+    text = trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).succeeds()
+    assert "run.rrd: open it with: rerun run.rrd" in text
+    assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")
+    trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).refuses("run.rrd: exists", "--force")
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"nonsense")
+    trilat("log", "view", "x.mcap", "--save", "x.rrd", cwd=tmp_path).refuses("x.mcap: is no MCAP file")
+    trilat("log", "view", "none.mcap", "--save", "x.rrd", cwd=tmp_path).refuses("none.mcap", "No such file")

@@ -1,0 +1,191 @@
+"""Walking through a file: all that is whole is found, what is not is named, and nothing is believed."""
+
+import io
+import struct
+
+import lz4.frame
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+
+from tests.log.hostility import chunk
+from tests.log_editing import edited, recorded
+from trilat_net.errors import LogError
+from trilat_net.log import packed
+from trilat_net.log.chunks import Item, Walk
+from trilat_net.log.framing import HEAD, Frame, Framing
+from trilat_net.log.packed import Unreadable, unpacked
+
+DATA = edited(recorded("paper"), chunk_bytes=4096)
+FRAMES = list(Framing(io.BytesIO(DATA)).frames())
+CHUNKS = [frame for frame in FRAMES if frame.opcode == Opcode.CHUNK]
+
+
+def walked(data: bytes) -> tuple[Walk, list[Item]]:
+    walk = Walk(io.BytesIO(data), "file")
+    return walk, list(walk.messages())
+
+
+WALK, ITEMS = walked(DATA)
+
+
+def in_chunk(frame: Frame) -> list[Item]:
+    """The messages of one chunk: what is in the file with it, without those without it."""
+    _, others = walked(DATA[: frame.offset] + DATA[frame.end :])
+    return [item for item in ITEMS if item not in others]
+
+
+def test_messages_come_with_their_times_and_their_numbers() -> None:
+    """A message is what the `mcap` package reads, in the order of the file."""
+    from mcap.reader import make_reader
+
+    theirs = [
+        (c.topic, m.data, m.log_time, m.publish_time, m.sequence)
+        for _, c, m in make_reader(io.BytesIO(DATA)).iter_messages(log_time_order=False)
+    ]
+    assert [tuple(item) for item in ITEMS] == theirs
+    assert WALK.complete
+    assert not WALK.damaged
+    assert WALK.torn is None
+    assert sum(WALK.chunks.values()) == len(CHUNKS)
+    assert {channel.encoding for channel in WALK.channels.values()} == {"msgpack"}
+
+
+@settings(max_examples=60)
+@given(st.integers(0, len(DATA) - 1))
+def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
+    """Wherever it is cut, what lies in whole chunks before is read, and the cut is told."""
+    whole = [frame for frame in CHUNKS if frame.end <= size]
+    if size < 8:
+        with pytest.raises(LogError, match="no MCAP file"):
+            walked(DATA[:size])
+        return
+    walk, items = walked(DATA[:size])
+    assert not walk.complete
+    assert walk.torn is not None or size == FRAMES[-1].end
+    assert sum(walk.chunks.values()) == len(whole)
+    assert items == ITEMS[: len(items)]
+
+
+@settings(max_examples=40)
+@given(st.integers(0, len(CHUNKS) - 1), st.data())
+def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObject) -> None:
+    """A bit that is wrong in the data of a chunk costs that chunk, and no other."""
+    frame = CHUNKS[number]
+    head = Framing(io.BytesIO(DATA)).head(frame)
+    place = data.draw(st.integers(frame.offset + HEAD + head.data_offset, frame.end - 1))
+    changed = bytearray(DATA)
+    changed[place] ^= 1 << data.draw(st.integers(0, 7))
+    walk, items = walked(bytes(changed))
+    if not walk.damaged:  # a bit that the compression does not look at
+        assert items == ITEMS
+        return
+    assert [(part.offset, part.length) for part in walk.damaged] == [(frame.offset, HEAD + frame.length)]
+    assert walk.complete
+    assert [item for item in ITEMS if item not in items] == in_chunk(frame)
+
+
+@settings(max_examples=60)
+@given(st.sampled_from(FRAMES), st.integers(0, (1 << 64) - 1))
+def test_a_record_that_lies_about_its_length_hides_no_more_than_a_chunk_or_two(
+    frame: Frame, length: int
+) -> None:
+    """Reading goes on at the next chunk that makes sense, and what is between is named."""
+    changed = bytearray(DATA)
+    struct.pack_into("<Q", changed, frame.offset + 1, length)
+    try:
+        walk, items = walked(bytes(changed))
+    except LogError:
+        return
+    told = length in (frame.length,) or walk.damaged or walk.torn is not None
+    near = length < len(DATA)  # within the file it may skip what is whole, or look like a longer record
+    assert told or near
+    if length > len(DATA) and frame.opcode != Opcode.FOOTER:
+        hidden = in_chunk(frame) if frame.opcode == Opcode.CHUNK else []
+        assert [item for item in ITEMS if item not in items] == hidden
+
+
+def test_a_chunk_unpacks_to_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However it is packed, and whatever it says: nothing is unpacked beyond the limit."""
+    monkeypatch.setattr(packed, "UNPACKED_BYTES", 10_000)
+    fine, bomb = bytes(10_000), bytes(1_000_000)
+    for compression in ("zstd", "lz4", ""):
+        assert unpacked(chunk(fine, compression=compression)[HEAD:]) == fine
+    for compression in ("zstd", "lz4"):
+        for size in (len(bomb), 10_000, 1 << 62, 0):
+            with pytest.raises(Unreadable):
+                unpacked(chunk(bomb, size=size, compression=compression)[HEAD:])
+
+
+@pytest.mark.parametrize("claim", [1 << 40, (1 << 63) - 1])
+def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
+    """The sizes inside the compressed data are compared before a byte is set aside for them."""
+    zstd = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", claim) + b"\x01\x00\x00"
+    head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(zstd))
+    with pytest.raises(Unreadable):
+        unpacked(head + zstd)
+    honest = lz4.frame.compress(bytes(100), store_size=True)
+    lz4_ = honest[:6] + struct.pack("<Q", claim) + honest[14:]
+    head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 3) + b"lz4" + struct.pack("<Q", len(lz4_))
+    with pytest.raises(Unreadable):
+        unpacked(head + lz4_)
+
+
+def test_a_file_that_holds_absurdly_much_is_refused_with_the_place() -> None:
+    """Who keeps messages is given no more than there is room for; who lets them go is given all."""
+    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
+    bombs = chunk(message * 500_000) * 3
+    data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
+    with pytest.raises(LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"):
+        walked(data)
+    streaming = Walk(io.BytesIO(data), "file", kept=False)
+    assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 1_500_000
+
+
+def test_a_chunk_in_a_chunk_is_no_message_and_is_not_looked_into() -> None:
+    inner = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
+    data = DATA[: CHUNKS[1].offset] + chunk(inner) + DATA[CHUNKS[1].offset :]
+    assert walked(data)[1] == ITEMS
+
+
+def test_a_channel_is_what_it_was_first_called() -> None:
+    """A second definition of its number changes nothing; a message of no channel has no topic."""
+
+    def channel(number: int, topic: bytes) -> bytes:
+        text = struct.pack("<HH", number, 0) + struct.pack("<I", len(topic)) + topic
+        content = text + struct.pack("<I", 0) + struct.pack("<I", 0)
+        return struct.pack("<BQ", 4, len(content)) + content
+
+    message = struct.pack("<BQHIQQ", 5, 23, 7, 1, 2, 3) + b"x"
+    lost = struct.pack("<BQHIQQ", 5, 22, 9, 1, 2, 3)
+    data = DATA[: CHUNKS[0].offset] + chunk(channel(7, b"/a") + message + channel(7, b"/b") + message + lost)
+    _, items = walked(data)
+    assert items == [Item("/a", b"x", 2, 3, 1), Item("/a", b"x", 2, 3, 1), Item("", b"", 2, 3, 1)]
+
+
+def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
+    frame = next(frame for frame in FRAMES if frame.opcode == Opcode.ATTACHMENT)
+    changed = bytearray(DATA)
+    changed[frame.end - 100] ^= 1
+    walk, items = walked(bytes(changed))
+    assert "scenario.toml" not in walk.attachments
+    assert [part.offset for part in walk.damaged] == [frame.offset]
+    assert items == ITEMS
+
+
+def test_progress_is_told_up_to_the_end() -> None:
+    told: list[tuple[int, int]] = []
+    list(Walk(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
+    assert told == sorted(told)
+    assert {total for _, total in told} == {len(DATA)}
+    assert told[-1][0] >= len(DATA) - 8
+
+
+def test_zstd_without_a_size_in_its_frame_is_read() -> None:
+    """Other writers stream; their chunks say the size, their frames do not."""
+    records = bytes(range(256)) * 10
+    streamed = zstandard.ZstdCompressor(write_content_size=False).compress(records)
+    head = struct.pack("<QQQI", 0, 0, len(records), 0) + struct.pack("<I", 4) + b"zstd"
+    assert unpacked(head + struct.pack("<Q", len(streamed)) + streamed) == records

@@ -1,0 +1,193 @@
+"""Nobody who reads a log believes it: a sentence or an answer, never a traceback, never much memory."""
+
+import io
+import json
+import os
+import random
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+
+from tests.log.hostility import CHANGES, READERS, chunk, mangled, read_by_all
+from tests.log_editing import edited, opened, recorded
+from trilat_net.analysis.overview import overview
+from trilat_net.errors import LogError, ScenarioError
+from trilat_net.log.framing import Framing
+from trilat_net.log.packed import unpacked
+from trilat_net.replay.verify import verify
+from trilat_net.scenario import embedded, load
+
+SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
+DATA = edited(recorded("paper", SHORT), chunk_bytes=4096)
+WHOLE = recorded("paper", SHORT)
+MEMORY_MIB = 256
+
+
+@pytest.mark.parametrize("change", dict.fromkeys(CHANGES), ids=lambda change: change.__name__)
+@settings(max_examples=12)
+@given(seed=st.integers(0, 2**32), whole=st.booleans())
+def test_whatever_is_changed_everybody_answers_in_a_sentence(
+    change: Callable[[bytes, Any], bytes], seed: int, whole: bool
+) -> None:
+    """open_log and its arrays, verify, info, check, recover and replay: an answer or a `TrilatError`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "changed.mcap"
+        path.write_bytes(change(WHOLE if whole else DATA, random.Random(seed)))
+        for complaint in read_by_all(path).values():
+            assert "Traceback" not in complaint
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32))
+def test_several_changes_at_once(seed: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "changed.mcap"
+        path.write_bytes(mangled(DATA, random.Random(seed)))
+        read_by_all(path)
+
+
+def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
+    """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
+    log = edited(WHOLE, scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"))
+    framing = Framing(io.BytesIO(log))
+    first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
+    inside, names = unpacked(framing.content(first)), b""
+    channel, at = 0, 0
+    while at < len(inside):
+        opcode, length = struct.unpack_from("<BQ", inside, at)
+        record = inside[at : at + 9 + length]
+        if opcode == Opcode.MESSAGE:
+            if not channel and b"/m1/state" in names:
+                channel = struct.unpack_from("<H", record, 9)[0]
+        else:
+            names += record
+        at += len(record)
+    padding = os.urandom(1_000_000)
+    content = struct.pack("<QQIIQ", 0, 0, 0, 0, len(padding)) + padding + bytes(4)
+    records = [
+        struct.pack("<BQHIQQ", 5, 22 + len(payload), channel, 0, 0, 0) + payload
+        for _, payload in zip(range(most), messages, strict=False)
+    ]
+    packed = [chunk(names + b"".join(records[k : k + 20_000])) for k in range(0, len(records), 20_000)]
+    return log[: first.offset] + struct.pack("<BQ", 9, len(content)) + content + b"".join(packed)
+
+
+def _records(**fields: Any) -> Iterator[bytes]:
+    """Records of m1 that are valid, small, and say what is given besides."""
+    zeros = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
+    about = {"v": 3, "site": "m1", "boot": 1, "mode": "run", "used": {}, "rx": [], "rx_crc": 0, "cmd": []}
+    plain = (
+        {name: [0] * count for name, count in zeros.items()} | about | {"mem": [], "late_us": 0, "busy_us": 0}
+    )
+    k = 0
+    while True:
+        yield msgpack.packb({**plain, "tick": k, "t_ns": k * 1_000_000, **fields})
+        k += 1
+
+
+HUGE: dict[str, Callable[[], bytes]] = {
+    "records that take in what nobody sent": lambda: _file(_records(rx=[[0, 0, 0]] * 30), 23_000),
+    "messages without a byte": lambda: _file(iter(lambda: b"", None), 100_000),
+}
+
+
+@pytest.mark.parametrize("kind", HUGE)
+def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None:
+    """Peak resident memory of a process in which everybody reads such a file, the interpreter and all."""
+    path = tmp_path / "huge.mcap"
+    path.write_bytes(HUGE[kind]())
+    assert path.stat().st_size < 1.3 * 2**20
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from tests.log.hostility import READERS\n"
+        "from trilat_net.errors import TrilatError\n"
+        "open('/proc/self/clear_refs', 'w').write('5')\n"
+        "for name in sys.argv[2:]:\n"
+        "    try: READERS[name](Path(sys.argv[1]))\n"
+        "    except TrilatError: pass\n"
+        "print(*(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')))\n"
+    )
+    command = [sys.executable, "-c", program, str(path), *READERS]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) / 1024 < MEMORY_MIB
+
+
+def test_a_tick_that_the_scenario_does_not_have_is_refused() -> None:
+    """Nobody counts up to a number that a stranger wrote, nor keeps a place for every one before it."""
+    data = edited(DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r)
+    log = opened(data)
+    with pytest.raises(LogError, match=r"has a record of tick 1099511627775; the scenario has 40"):
+        _ = log["m1"]
+
+
+def test_a_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
+    log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
+    endless = [msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events]
+    log.events = endless
+    assert verify(log).gaps == [(site, 31, 39) for site in log.sites]
+    assert [log.missing(site) for site in log.sites] == [9] * 3
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a = " + "[" * 5000, "nested too deep"),
+        ("a = " + "1" * 5000, "is not TOML"),
+        ("seed = 0x" + "f" * 4000, "at most 64 bits, has 16000"),
+        ("[" + "a." * 3000 + "a]", "unknown key"),
+        ("name = 'x'\n[dominance]\n" + "".join(f"[sites.a{n}]\n" for n in range(40)), "at most 32"),
+    ],
+)
+def test_a_scenario_of_a_stranger_is_refused_in_a_sentence(text: str, problem: str) -> None:
+    with pytest.raises(ScenarioError, match=problem):
+        embedded(text)
+
+
+def test_a_scenario_in_a_log_names_no_file() -> None:
+    """It is resolved; a name in it would have the reader open what a stranger likes."""
+    constant = re.compile(r'model = "constant"\ndelay_ms = [0-9.]+\n')
+    text = constant.sub('model = "trace"\nfile = "/dev/zero"\n', load("paper").text, count=1)
+    with pytest.raises(ScenarioError, match="no file may be named here"):
+        embedded(text)
+
+
+def test_a_trace_that_stands_for_many_links_is_refused() -> None:
+    """Written out it would fill the memory; a scenario that ran has every link's own."""
+    text = load("paper").text
+    head, _, links = text.partition("[links.")
+    points = ", ".join(f"{n} 1" for n in range(0, 90_000, 3))
+    assert links
+    text = head + f'[link]\nmodel = "trace"\ntrace = "{points}"\n'
+    with pytest.raises(ScenarioError, match="not written out"):
+        embedded(text)
+
+
+def test_links_that_would_fill_the_memory_are_refused() -> None:
+    """A calendar of twenty seconds at 20 kHz for each of many peers."""
+    names = [f"a{n}" for n in range(6)]
+    sites = "".join(f"[sites.{name}]\n" for name in names)
+    rows = "".join(f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names))
+    text = f"name = 'x'\nrate_hz = 20000\n[link]\ndelay_ms = 1.0\n{sites}{rows}"
+    assert embedded(text.replace("20000", "1000")).names == tuple(names)
+    with pytest.raises(ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"):
+        embedded(text)
+
+
+def test_json_of_anything_is_finite(tmp_path: Path) -> None:
+    """What a machine is told can be read by it, whatever the file says."""
+    path = tmp_path / "strange.mcap"
+    path.write_bytes(edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62}))
+    json.dumps(overview([path]), allow_nan=False)

@@ -1,0 +1,255 @@
+"""`check`: what is sound passes, and what is wrong fails the one check that it is a matter of."""
+
+import io
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.writer import Writer
+
+from tests.log.hostility import chunk
+from tests.log_editing import edited, recorded, without
+from trilat_net.errors import LogError
+from trilat_net.log.framing import HEAD, MAGIC, Frame, Framing
+from trilat_net.log.packed import unpacked
+from trilat_net.log.soundness import Soundness, soundness
+
+WHOLE = recorded("paper")
+DATA = edited(WHOLE, chunk_bytes=8192)
+BUILT = {"whole", "checksums", "records", "index"}
+OURS = {"sequence", "accounts", "schema", "times", "rates", "scenario"}
+
+
+def judged(folder: Path, *files: bytes) -> Soundness:
+    paths = []
+    for n, data in enumerate(files):
+        paths.append(folder / f"part{n}.mcap")
+        paths[-1].write_bytes(data)
+    return soundness(paths)
+
+
+def failed(found: Soundness) -> set[str]:
+    return {finding.check for finding in found.findings if not finding.passed}
+
+
+def frames(data: bytes, opcode: int) -> list[Frame]:
+    return [frame for frame in Framing(io.BytesIO(data)).frames() if frame.opcode == opcode]
+
+
+def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
+    changed = bytearray(data)
+    changed[offset] ^= flip
+    return bytes(changed)
+
+
+def cut_out(data: bytes, frame: Frame) -> bytes:
+    return data[: frame.offset] + data[frame.end :]
+
+
+@pytest.mark.parametrize("data", [WHOLE, DATA, recorded("jitter", {"duration_s": 0.1})])
+def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
+    found = judged(tmp_path, data)
+    assert found.passed, found
+    assert found.ours
+    assert {finding.check for finding in found.findings} == BUILT | OURS
+
+
+def first(opcode: int) -> Frame:
+    return frames(DATA, opcode)[0]
+
+
+STATISTICS, FOOTER = first(Opcode.STATISTICS), first(Opcode.FOOTER)
+CHUNK, CHUNK_INDEX = first(Opcode.CHUNK), first(Opcode.CHUNK_INDEX)
+WRONG: dict[str, tuple[bytes, set[str]]] = {
+    "cut off": (DATA[:-3000], {"whole"}),
+    "without its last mark": (DATA[:-8], {"whole"}),
+    "more behind the end": (DATA + b"more", {"whole"}),
+    "a byte of a chunk": (poked(DATA, CHUNK.end - 20), {"records", "sequence"}),
+    "the checksum of a chunk": (poked(DATA, CHUNK.offset + HEAD + 24), {"checksums", "sequence"}),
+    "a byte of the scenario": (poked(DATA, first(Opcode.ATTACHMENT).end - 99), {"checksums", "index"}),
+    "a number in the statistics": (poked(DATA, STATISTICS.offset + HEAD), {"index", "checksums"}),
+    "the place of a chunk": (poked(DATA, CHUNK_INDEX.offset + HEAD + 16), {"index", "checksums"}),
+    "the length of a chunk": (poked(DATA, CHUNK_INDEX.offset + HEAD + 24), {"index", "checksums"}),
+    "the place of metadata": (
+        poked(DATA, first(Opcode.METADATA_INDEX).offset + HEAD),
+        {"index", "checksums"},
+    ),
+    "where the index begins": (poked(DATA, FOOTER.offset + HEAD), {"index", "checksums"}),
+    "the checksum of the index": (poked(DATA, FOOTER.end - 1), {"checksums"}),
+    "an entry of a message index": (poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1), {"index"}),
+    "the times of a chunk": (poked(DATA, CHUNK.offset + HEAD + 8), {"index"}),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_what_is_wrong_with_the_file_fails_its_check(kind: str, tmp_path: Path) -> None:
+    data, checks = WRONG[kind]
+    found = judged(tmp_path, data)
+    built = failed(found) & BUILT
+    assert built == checks & BUILT, found.findings
+    named = [finding for finding in found.findings if finding.check in built]
+    assert all(finding.places[0].offset is not None for finding in named)
+
+
+@settings(max_examples=80)
+@given(st.integers(0, len(WHOLE) - 1), st.integers(0, 7))
+def test_no_bit_of_a_file_can_be_changed_unseen(place: int, bit: int) -> None:
+    """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
+    found = _of(poked(WHOLE, place, 1 << bit))
+    frame = next((f for f in _FRAMES if f.offset <= place < f.end), None)
+    inside = place - (frame.offset + HEAD) if frame is not None else 0
+    free = frame is not None and (
+        # the header's words, the entries of metadata, and a CRC of 0 for "none" are under no checksum
+        frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.DATA_END)
+        # the last bits of a compressed stream may mean nothing; its size and its CRC are compared
+        or (frame.opcode == Opcode.CHUNK and inside > 40)
+        or inside < 0
+    )
+    assert free or not found.passed
+
+
+_FRAMES = list(Framing(io.BytesIO(WHOLE)).frames())
+
+
+def _of(data: bytes) -> Soundness:
+    with tempfile.TemporaryDirectory() as folder:
+        return judged(Path(folder), data)
+
+
+SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
+    "records are missing": (
+        lambda: edited(DATA, record=without("m1", {7, 8, 9, 40})),
+        {"sequence", "accounts"},
+        "4 missing in 2 ranges",
+    ),
+    "the last records are missing": (
+        lambda: edited(DATA, record=without("s", {118, 119})),
+        {"sequence", "accounts"},
+        "2 missing in 1 range",
+    ),
+    "a number twice": (
+        lambda: edited(DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r),
+        {"sequence", "accounts"},
+        "number 5 is there twice",
+    ),
+    "a message of another site": (
+        lambda: edited(DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r),
+        {"schema"},
+        "a message says that it is of 'm2'",
+    ),
+    "a message that is none": (
+        lambda: edited(DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r),
+        {"schema", "sequence", "accounts"},
+        "q has 1 numbers, not 2",
+    ),
+    "sent at another time": (
+        lambda: edited(DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r),
+        {"times"},
+        "was sent at 5 ns, not 3000000",
+    ),
+    "another scenario": (
+        lambda: edited(DATA, scenario=lambda text: text + "# and more\n"),
+        {"scenario"},
+        "SHA-256",
+    ),
+    "another seed": (lambda: edited(DATA, session={"seed": "7"}), {"scenario"}, "has seed 1"),
+    "another version": (
+        lambda: edited(DATA, session={"schema_version": "2"}),
+        {"schema"},
+        "has the schema trilat.State.v3, not trilat.State.v2",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SAID)
+def test_what_is_wrong_with_the_session_fails_its_check(kind: str, tmp_path: Path) -> None:
+    data, checks, text = SAID[kind]
+    found = judged(tmp_path, data())
+    assert failed(found) == checks, found.findings
+    assert any(text in f"{f.text} {f.places}" for f in found.findings if not f.passed), found.findings
+
+
+def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
+    """Each alone lacks what the other has; together nothing is missing."""
+    early = edited(DATA, record=lambda r: r if r["tick"] < 60 else None)
+    late = edited(DATA, record=lambda r: r if r["tick"] >= 60 else None)
+    assert "sequence" in failed(judged(tmp_path, early))
+    both = judged(tmp_path, early, late)
+    assert "sequence" not in failed(both), both.findings
+
+
+def test_files_of_different_sessions_are_not_judged_as_one(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="another session"):
+        judged(tmp_path, DATA, edited(DATA, session={"session": "other"}))
+
+
+def test_a_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    writer.add_message(channel, 1, b"{}", 1)
+    writer.finish()
+    found = judged(tmp_path, stream.getvalue())
+    assert found.passed
+    assert not found.ours
+    assert {finding.check for finding in found.findings} == BUILT
+
+
+def test_what_a_chunk_may_not_hold_is_told(tmp_path: Path) -> None:
+    """A chunk in a chunk, a message of no channel, a channel that is two things."""
+    records = unpacked(Framing(io.BytesIO(DATA)).content(CHUNK))
+    lost = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)
+    for more, text in ((lost, "channel 999"), (chunk(b""), "kind 6")):
+        new = chunk(records + more)
+        found = judged(tmp_path, DATA[: CHUNK.offset] + new + DATA[CHUNK.end :])
+        assert "records" in failed(found)
+        assert any(text in str(f.places) for f in found.findings)
+
+
+@pytest.mark.parametrize("data", [b"", b"text", MAGIC])
+def test_what_is_no_mcap_file_is_not_sound(data: bytes, tmp_path: Path) -> None:
+    assert "whole" in failed(judged(tmp_path, data))
+
+
+def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="cannot be read"):
+        soundness([tmp_path / "none.mcap"])
+
+
+def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
+    """Another program, run beside: on how files are built it and we agree."""
+    kinds = ["a byte of a chunk", "cut off", "the length of a chunk", "the checksum of the index"]
+    cases = {"sound": DATA, "as written": WHOLE, **{kind: WRONG[kind][0] for kind in kinds}}
+    executable = Path(sys.executable).with_name("pymcap-cli")
+    running = {}
+    for n, (kind, data) in enumerate(cases.items()):
+        path = tmp_path / f"{n}.mcap"
+        path.write_bytes(data)
+        running[kind] = subprocess.Popen(
+            [executable, "doctor", path], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+    theirs = {kind: process.wait() == 0 for kind, process in running.items()}
+    ours = {kind: not failed(_of(data)) & BUILT for kind, data in cases.items()}
+    assert theirs == ours
+
+
+def test_the_checksum_of_the_data_is_compared_where_there_is_one(tmp_path: Path) -> None:
+    """Our writer makes none; of a file that has one it is told when a byte of the data changed."""
+    stream = io.BytesIO()
+    writer = Writer(stream, enable_data_crcs=True)
+    writer.start()
+    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    for n in range(100):
+        writer.add_message(channel, n, b"{}", n)
+    writer.finish()
+    data = stream.getvalue()
+    assert judged(tmp_path, data).passed
+    assert failed(judged(tmp_path, poked(data, data.index(b"mcap") + 2))) == {"checksums"}

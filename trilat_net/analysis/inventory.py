@@ -1,0 +1,150 @@
+"""What is in files: how they are packed, and every channel with its messages, its gaps and its rhythm.
+
+Law: nothing is decoded. A file of anybody has an inventory; gaps are told only of channels whose numbers
+are known to count.
+"""
+
+from array import array
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.grid import NS_PER_S
+from ..errors import LogError
+from ..log.accounting import Account
+from ..log.chunks import Channel, Item, Progress, Walk
+from ..log.reader import Ints
+from ..net import topics
+from ..net.stats import ticks_between
+
+Facts = dict[str, Any]
+
+MOST_GAPS = 1000
+"""Gaps of a channel that are named."""
+_NUMBERED_EVENTS_SINCE = 3
+
+
+class Inventory:
+    """What is in a file, or in the files of one log.
+
+    Args:
+        paths: the files.
+        progress: told how many bytes are read, and how many there are in all.
+
+    Attributes:
+        files: facts of every file, keys ending in their units.
+        metadata: of all files, by name; where several have one name, of the last.
+
+    Raises:
+        LogError: a file cannot be read, or is no MCAP file.
+    """
+
+    def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
+        self.files: list[Facts] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._about: dict[str, Channel] = {}
+        self._log_ns: dict[str, array[int]] = {}
+        self._sequence: dict[str, array[int]] = {}
+        self._bytes: dict[str, int] = {}
+        total = sum(path.stat().st_size for path in paths if path.is_file())
+        before = 0
+        for path in paths:
+            told = None if progress is None else _shifted(progress, before, total)
+            try:
+                with path.open("rb") as stream:
+                    self._read(path, Walk(stream, str(path), told))
+            except OSError as error:
+                raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+            before += path.stat().st_size
+
+    def _read(self, path: Path, walk: Walk) -> None:
+        for item in walk.messages():
+            self._take(item)
+        self._about = {**walk.channels, **self._about}
+        self.metadata.update(walk.metadata)
+        self.files.append(
+            {
+                "path": str(path),
+                "size_bytes": walk.size,
+                "library": walk.library,
+                "finished": walk.complete,
+                "cut_off_at_byte": None if walk.torn is None else walk.torn.offset,
+                "damaged": [
+                    {"offset": part.offset, "length": part.length, "problem": part.problem}
+                    for part in walk.damaged
+                ],
+                "chunks": walk.chunks.total(),
+                "compression": {name or "none": count for name, count in walk.chunks.items()},
+                "packed_bytes": walk.packed_bytes,
+                "unpacked_bytes": walk.unpacked_bytes,
+                "attachments": {name: len(data) for name, data in walk.attachments.items()},
+                "metadata": sorted(walk.metadata),
+                "part": walk.metadata.get("trilat.part", {}),
+            }
+        )
+
+    def _take(self, item: Item) -> None:
+        topic = item.topic
+        try:
+            self._log_ns[topic].append(item.log_time_ns)
+        except KeyError:
+            self._log_ns[topic] = array("Q", (item.log_time_ns,))
+            self._sequence[topic] = array("Q")
+            self._bytes[topic] = 0
+        self._sequence[topic].append(item.sequence)
+        self._bytes[topic] += len(item.payload)
+
+    def channels(self, session: str = "", rates_hz: Mapping[str, int] | None = None) -> dict[str, Facts]:
+        """Returns the facts of every channel by topic, keys ending in their units.
+
+        Args:
+            session: the session, if these are files of ours.
+            rates_hz: the tick rate of its sites.
+        """
+        names = [*self._about, *(topic for topic in self._log_ns if topic not in self._about)]
+        return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
+
+    def _channel(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> Facts:
+        about = self._about.get(topic, Channel(topic, "", "", "", {}))
+        log_ns = np.frombuffer(self._log_ns.get(topic, array("Q")), dtype=np.uint64)
+        first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
+        span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
+        return {
+            "messages": len(log_ns),
+            "bytes": self._bytes.get(topic, 0),
+            "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
+            "first_log_time_ns": first_ns,
+            "last_log_time_ns": last_ns,
+            "between_ms": _between_ms(log_ns),
+            "encoding": about.encoding,
+            "schema": about.schema,
+            **self._numbers(topic, session, rates_hz),
+        }
+
+    def _numbers(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> Facts:
+        """Returns what is missing of a channel whose messages are numbered; else nothing."""
+        where = topics.address(topic.removeprefix("/"))
+        of_a_site = where is not None and where.session == session and where.member in rates_hz
+        if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
+            return {"missing": None, "gaps": None, "duplicates": None}
+        every = ticks_between(rates_hz[where.member]) if where.channel == topics.LINK else 1
+        account = Account()
+        for sequence in self._sequence.get(topic, ()):
+            account.take(sequence // every)
+        gaps = account.gaps[:MOST_GAPS]
+        return {"missing": account.missing, "gaps": gaps, "duplicates": account.duplicate}
+
+
+def _between_ms(log_ns: Any) -> Facts | None:
+    """Returns how much time lay between messages as they came, ms; None where there are no two."""
+    if len(log_ns) < 2:
+        return None
+    passed: Ints = np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64))
+    p50, p99, largest = np.percentile(passed, (50.0, 99.0, 100.0)).tolist()
+    return {"p50": p50 / 1e6, "p99": p99 / 1e6, "max": largest / 1e6}
+
+
+def _shifted(progress: Progress, before: int, total: int) -> Progress:
+    return lambda done, _: progress(before + done, total)
