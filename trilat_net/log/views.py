@@ -261,9 +261,10 @@ class Views:
             self.takers[topics.key(session, site, topics.EVENT)] = self._event
 
     def _event(self, event: Event, log_ns: int) -> None:
+        """Writes an event as of when it came: members that send at once need not arrive in that order."""
         stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
         for name, data in event_messages(event, stamp_ns):
-            self._put(f"{_ROOT}/{name}", data, stamp_ns, log_ns)
+            self._put(f"{_ROOT}/{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
         """Lets out what has not been written yet.

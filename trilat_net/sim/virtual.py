@@ -7,13 +7,14 @@ runs of one scenario and seed are the same file, SHA-256 and all.
 import bisect
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from .. import collector
 from ..core.grid import NS_PER_S
 from ..core.site import Site
 from ..core.tick import Arrival, Command, Mode, Output, Tick, diverged_text, mode_text
 from ..log.accounting import Account
+from ..log.container import Sink
 from ..log.writer import LogWriter
 from ..net import topics
 from ..net.messages import Event
@@ -122,9 +123,10 @@ class _Member:
 
 def record(
     scenario: Scenario,
-    stream: BinaryIO,
+    stream: Sink,
     network: Network | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    views_hz: float = 0.0,
 ) -> bool:
     """Runs a scenario in virtual time and writes its log.
 
@@ -133,6 +135,7 @@ def record(
         stream: where the log goes; stays open.
         network: what joins the sites.
         stopped: True once the run was asked to end; then the file is finished with what there is.
+        views_hz: messages a second of the standard channels beside the log's own, see `log.views`.
 
     Returns:
         True where the run stayed within its limits, False where it diverged.
@@ -140,7 +143,7 @@ def record(
     Raises:
         LogError: the disk refused.
     """
-    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
+    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
     members: dict[str, _Member] = {}
     within = True
     t_ns = 0
@@ -155,9 +158,12 @@ def record(
                 if stopped():
                     break
     finally:  # whatever ends the run leaves a file that is finished
-        for name, member in members.items():
-            member.say("end", f"{name} made {member.ticks} ticks", t_ns)
-        writer.finish(
-            {topic: text for member in members.values() for topic, text in member.accounts().items()}
-        )
+        try:
+            for name, member in members.items():
+                if not writer.ended:
+                    member.say("end", f"{name} made {member.ticks} ticks", t_ns)
+        finally:
+            writer.finish(
+                {topic: text for member in members.values() for topic, text in member.accounts().items()}
+            )
     return within

@@ -1,0 +1,1 @@
+"""A log in Rerun: what is shown where, and the viewer itself."""
