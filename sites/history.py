@@ -4,6 +4,8 @@ Law (L6): bounded in memory, a minute of every channel, and in time, one chunk p
 answers in the slack of its ticks, or not yet.
 """
 
+from array import array
+
 from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.answers import Past, Wanted
@@ -14,8 +16,10 @@ from trilat_net.net.wire import decode, encode
 KEPT_S = 60
 RECORDS = 120_000
 """Most records that are kept: a minute up to 2 kHz, less above."""
-EVENTS = 4096
-"""Events that are kept: they are few, and the first ones say how the session began."""
+RECORD_BYTES = 640
+"""What a record takes on average, at most, for a minute of them to be kept."""
+STATISTICS_BYTES = 4_096
+EVENTS, EVENTS_BYTES = 4_096, 4_000_000
 CHUNK = 64
 CHUNK_BYTES = 40_000
 """Most messages in one answer, and most bytes, unless a single message has more."""
@@ -24,22 +28,38 @@ CHUNK_BYTES = 40_000
 class Ring:
     """The last messages of one channel; their numbers are their places, from 0.
 
+    They lie in one piece of memory that is there from the start: nothing is allocated while the loop runs.
+
     Args:
-        capacity: how many it holds.
+        capacity: how many it holds, at most.
+        size_bytes: how many bytes of them, at most; more than one message has.
 
     Attributes:
         made: how many messages there have been.
+        oldest: number of the oldest one that is left.
     """
 
-    def __init__(self, capacity: int) -> None:
-        self.made = 0
-        self._capacity = capacity
-        self._payloads = [b""] * capacity
+    def __init__(self, capacity: int, size_bytes: int) -> None:
+        self.made = self.oldest = 0
+        self._capacity, self._size = capacity, size_bytes
+        self._bytes = bytearray().ljust(size_bytes, b"\xff")  # touched, so that it stands in memory
+        self._starts, self._lengths = array("q", bytes(8 * capacity)), array("q", bytes(8 * capacity))
+        self._head = 0  # bytes written since the start, and those left out at the end of the memory
 
     def keep(self, payload: bytes) -> None:
-        """Takes the next message; the oldest one makes room."""
-        self._payloads[self.made % self._capacity] = payload
+        """Takes the next message; the oldest ones make room."""
+        length, at = len(payload), self._head % self._size
+        if at + length > self._size:  # a message lies in one piece
+            self._head += self._size - at
+            at = 0
+        self._bytes[at : at + length] = payload
+        slot = self.made % self._capacity
+        self._starts[slot], self._lengths[slot] = self._head, length
+        self._head += length
         self.made += 1
+        self.oldest = max(self.oldest, self.made - self._capacity)
+        while self._starts[self.oldest % self._capacity] < self._head - self._size:
+            self.oldest += 1
 
     def chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns messages from a number on, as many as one answer takes, and the number of the first.
@@ -48,15 +68,16 @@ class Ring:
             first: number of the first one wanted; where it is gone, the oldest one that is left comes first.
             last: number of the last one wanted.
         """
-        first = max(first, self.made - self._capacity)
+        first = max(first, self.oldest)
         payloads: list[bytes] = []
         size = 0
         for number in range(first, min(last + 1, self.made, first + CHUNK)):
-            payload = self._payloads[number % self._capacity]
-            size += len(payload)
+            slot = number % self._capacity
+            at, length = self._starts[slot] % self._size, self._lengths[slot]
+            size += length
             if payloads and size > CHUNK_BYTES:
                 break
-            payloads.append(payload)
+            payloads.append(bytes(self._bytes[at : at + length]))
         return first, payloads
 
 
@@ -75,10 +96,11 @@ class History:
 
     def __init__(self, site: str, boot: int, rate_hz: int, questions: Questions) -> None:
         self._site, self._boot, self._questions = site, boot, questions
+        records, statistics = min(KEPT_S * rate_hz, RECORDS), KEPT_S * PER_SECOND
         self.rings = {
-            topics.STATE: Ring(min(KEPT_S * rate_hz, RECORDS)),
-            topics.LINK: Ring(KEPT_S * PER_SECOND),
-            topics.EVENT: Ring(EVENTS),
+            topics.STATE: Ring(records, max(records * RECORD_BYTES, EVENTS_BYTES)),
+            topics.LINK: Ring(statistics, statistics * STATISTICS_BYTES),
+            topics.EVENT: Ring(EVENTS, EVENTS_BYTES),
         }
 
     def answer(self) -> bool:

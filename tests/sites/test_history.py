@@ -36,31 +36,48 @@ class Desk:
 
 @given(
     capacity=st.integers(1, 200),
-    made=st.integers(0, 400),
-    first=st.integers(0, 500),
-    length=st.integers(1, 500),
-    size=st.integers(1, 2000),
+    size_bytes=st.integers(3000, 40_000),
+    sizes=st.lists(st.integers(0, 3000), max_size=300),
+    first=st.integers(0, 400),
+    length=st.integers(1, 400),
 )
 def test_a_ring_tells_what_it_still_has_in_chunks(
-    capacity: int, made: int, first: int, length: int, size: int
+    capacity: int, size_bytes: int, sizes: list[int], first: int, length: int
 ) -> None:
     """Asked again and again from behind what it has told, it tells exactly what is left of a range."""
-    ring = Ring(capacity)
-    payloads = [str(n).zfill(size).encode() for n in range(made)]
+    ring = Ring(capacity, size_bytes)
+    payloads = [str(n).encode()[-size:].zfill(size) for n, size in enumerate(sizes)]
     for payload in payloads:
         ring.keep(payload)
     last, told, at = first + length - 1, [], first
     while True:
         begun, chunk = ring.chunk(at, last)
-        assert begun == max(at, made - capacity)
+        assert begun == max(at, ring.oldest)
         assert len(chunk) <= CHUNK
-        assert sum(map(len, chunk)) <= max(CHUNK_BYTES, size)
+        assert sum(map(len, chunk)) <= CHUNK_BYTES
         if not chunk:
             break
         told += [(begun + n, payload) for n, payload in enumerate(chunk)]
         at = begun + len(chunk)
-    left = range(max(first, made - capacity), min(last + 1, made))
+    left = range(max(first, ring.oldest), min(last + 1, ring.made))
     assert told == [(n, payloads[n]) for n in left]
+
+
+@given(
+    capacity=st.integers(1, 200),
+    size_bytes=st.integers(3000, 40_000),
+    sizes=st.lists(st.integers(0, 3000), max_size=300),
+)
+def test_a_ring_forgets_no_more_than_it_must(capacity: int, size_bytes: int, sizes: list[int]) -> None:
+    """What is left fills the memory, but for the piece of a message at its end, or the places."""
+    ring = Ring(capacity, size_bytes)
+    for size in sizes:
+        ring.keep(b"x" * size)
+    left = ring.made - ring.oldest
+    assert left <= capacity
+    assert sum(sizes[ring.oldest :]) <= size_bytes
+    if ring.oldest and left < capacity:
+        assert sum(sizes[ring.oldest - 1 :]) > size_bytes - 3000
 
 
 def test_every_channel_is_told_apart() -> None:
@@ -79,13 +96,12 @@ def test_memory_holds_a_minute_and_no_more() -> None:
     rings = Desk(1000).history.rings
     for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS), strict=True):
         for _ in range(capacity + 5):
-            ring.keep(b"x")
-        assert ring.chunk(0, 10)[0] == 5
-    assert Desk(20_000).history.rings[topics.STATE].chunk(0, 0)[0] == 0
+            ring.keep(b"x" * 600)
+        assert ring.oldest == 5
     fast = Desk(20_000).history.rings[topics.STATE]
     for _ in range(RECORDS + 1):
-        fast.keep(b"x")
-    assert fast.chunk(0, 10)[0] == 1
+        fast.keep(b"x" * 600)
+    assert fast.oldest == 1
 
 
 def test_the_largest_messages_fit_an_answer() -> None:

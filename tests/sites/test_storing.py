@@ -42,7 +42,7 @@ def records(path: Path) -> dict[str, int]:
 
 def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    session = session_of(path, 0.5)
+    session = session_of(path, 0.4)
     looks: list[tuple[int, int]] = []
 
     def look(_: Bus, clock: RelayClock) -> None:
@@ -55,17 +55,17 @@ def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(t
                 walk = Walk(stream, "look")
                 count = Counter(item.topic for item in walk.messages())
             epoch_ns = int(walk.metadata["trilat.session"]["epoch_unix_ns"])
-            due = min(500, (clock.unix_ns() - 100 * MS - epoch_ns) // MS)
+            due = min(400, (clock.unix_ns() - 100 * MS - epoch_ns) // MS)
             looks.extend((count[f"/trilat/{SESSION}/{site}/state"], due) for site in SITES)
 
     session.stranger(look)
     session.run()
     assert len(looks) > 40
-    assert max(due for _, due in looks) > 300
+    assert max(due for _, due in looks) > 200
     assert all(have >= due for have, due in looks)
 
 
-@pytest.mark.parametrize("room", range(160_000, 300_000, 27_000))
+@pytest.mark.parametrize("room", range(160_000, 300_000, 45_000))
 def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
