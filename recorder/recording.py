@@ -24,6 +24,8 @@ from .tap import Arrived, Tap
 
 SETTLE_NS = 1_000_000_000
 """How long to wait for what may still be under way of a site that has ended and is gone."""
+UNDER_WAY_NS = 100_000_000
+"""What comes within this time of a site whose token has disappeared was under way."""
 AWAY_NS = 15_000_000_000
 """How long to wait for a site that is gone without a word: a link that is cut may heal."""
 LAST_NS = 6_000_000_000
@@ -94,6 +96,7 @@ class Recording:
         self._stored: set[str] = set()
         self._gone: set[str] = set()
         self._gone_since_ns: dict[str, int] = {}
+        self._missed_ns: dict[str, int] = {}
         self._overflowed = 0
 
     def late(self, now_ns: int) -> None:
@@ -123,7 +126,7 @@ class Recording:
         self._drain(tap, now_ns)
         log_time_ns = self._epoch.unix_ns + now_ns - self._epoch.mono_ns
         for name, filling in self._fillings.items():
-            for filled in filling.poll(now_ns, alive=name not in self._gone):
+            for filled in filling.poll(now_ns, alive=not self._is_gone(name, now_ns)):
                 key = topics.key(self._session, name, filled.channel)
                 sent_ns = max(filled.message.t_ns, 0)  # what was said before the epoch bears no time
                 self._add(key, filled.payload, filled.message, sent_ns, log_time_ns)
@@ -189,6 +192,18 @@ class Recording:
             return
         (self._gone.discard if alive else self._gone.add)(where.member)
 
+    def _is_gone(self, site: str, now_ns: int) -> bool:
+        """True where a site's token has disappeared, and nothing has come of it since.
+
+        A connection that is made anew may tell that a token went and came in the wrong order.
+        """
+        if site not in self._gone:
+            self._missed_ns.pop(site, None)
+            return False
+        missed_ns = self._missed_ns.setdefault(site, now_ns)
+        heard_ns = self._senders[site].heard_ns
+        return heard_ns is None or heard_ns < missed_ns + UNDER_WAY_NS
+
     def over(self, now_ns: int) -> bool:
         """True once all that can be had of every site is here, or the site is gone for good."""
         left = [self._left(name, now_ns) for name in self._senders]
@@ -198,7 +213,7 @@ class Recording:
         """True once nothing more of a site will come."""
         if site in self._stored:
             return True
-        if site not in self._gone:
+        if not self._is_gone(site, now_ns):
             self._gone_since_ns.pop(site, None)
             return False
         since_ns = self._gone_since_ns.setdefault(site, now_ns)

@@ -32,7 +32,7 @@ class Ports:
         stopped: True once the loop was asked to end.
         commands: what the site is ordered at a tick.
         news: called after a tick that took a command in, or at which the mode changed.
-        spare: called after a tick that left half of its period.
+        spare: called after a tick that left a quarter of its period.
     """
 
     clock: Clock
@@ -61,7 +61,7 @@ def run_loop(site: Site, boot: int, ticks: int, stats: LoopStats, ports: Ports) 
         The last record: its mode says whether the run stayed within its limits. None if it made no tick.
     """
     clock, intake, timing = ports.clock, ports.intake, ports.timing
-    half_ns = NS_PER_S // (2 * site.rate_hz)
+    quarter_ns = NS_PER_S // (4 * site.rate_hz)
     busy_us = 0
     mode = Mode.RUN
     output = None
@@ -87,7 +87,7 @@ def run_loop(site: Site, boot: int, ticks: int, stats: LoopStats, ports: Ports) 
         if output.cmd or output.mode is not mode:
             mode = output.mode
             ports.news(output)
-        if timing.grid.deadline(k + 1) - clock.monotonic_ns() > half_ns:
+        if timing.grid.deadline(k + 1) - clock.monotonic_ns() > quarter_ns:
             ports.spare()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000
     return output

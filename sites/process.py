@@ -40,6 +40,8 @@ LINGER_S = 5
 POLL_NS = 5_000_000
 LAST_WORD_NS = 100_000_000
 PARTING_NS = 2_000_000_000
+ASKED_NS = 1_000_000_000
+"""A recorder that has asked within this time is there, whatever its token says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,12 +283,15 @@ class Member:
         """
         clock, company = self._clock, self._company
         give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
+        asked_ns = 0
         while clock.monotonic_ns() < give_up_ns and not (company.stored and self._interrupt.requested()):
             self._voice.answer()
             while self._history.answer():
-                give_up_ns = max(give_up_ns, clock.monotonic_ns() + LINGER_S * 1_000_000_000)
+                asked_ns = clock.monotonic_ns()
+                give_up_ns = max(give_up_ns, asked_ns + LINGER_S * 1_000_000_000)
             company.watch(self._voice, t_ns)
-            if not company.recorders:  # its last word may still be under way; or its process ends
+            away = not company.recorders and clock.monotonic_ns() - asked_ns > ASKED_NS
+            if away:  # its last word may still be under way; or its process ends
                 patience_ns = PARTING_NS if company.stored else LAST_WORD_NS
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
             if company.hear_recorders(ticks) and company.recorders <= company.stored:

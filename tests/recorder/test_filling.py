@@ -293,15 +293,30 @@ def test_a_late_message_that_was_given_up_is_welcome() -> None:
     assert "missing 0" in log.account("m")
 
 
+def vanish(run: Run) -> None:
+    """The tokens of both sites disappear."""
+    for name in ("m", "s"):
+        run.desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False)
+
+
 def test_a_site_that_is_gone_is_not_asked_and_what_it_owes_ends_nothing() -> None:
     run = Run(Way(lost=set(range(30, 60))))
-    run.desk.recording.presence(topics.key(SESSION, "m", topics.ALIVE) + f"/{BOOTS['m']}", False)
-    run.desk.recording.presence(topics.key(SESSION, "s", topics.ALIVE) + f"/{BOOTS['s']}", False)
-    run.live(2100 * MS)
+    run.live(25 * MS)
+    vanish(run)
     assert not run.desk.over()
     run.desk.rounds(90, run.site, step_ns=100 * MS)
     assert run.site.asked == []
     assert run.desk.over()
+
+
+def test_a_site_that_goes_on_is_there_whatever_its_token_says() -> None:
+    """A connection that is made anew may tell that a token went and came in the wrong order."""
+    run = Run(Way(lost=set(range(30, 60))))
+    vanish(run)
+    run.live(2100 * MS)
+    run.until_stored()
+    assert run.site.asked
+    assert "missing 0" in run.desk.log().account("m")
 
 
 def test_what_is_not_what_its_answer_says_is_counted_and_not_written() -> None:
