@@ -69,7 +69,7 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
 
 
 def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(stage: Stage) -> None:
-    session = Session(stage, "paper", SITES, "--duration", "6")
+    session = Session(stage, "paper", SITES, "--duration", "60")
     session.all()
     session.recording()
     first = session.processes["recorder"]
@@ -80,14 +80,18 @@ def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(
         *("record", "--session", "t", "-o", str(session.log), "--continue"),
         *("--listen", session.recorder_endpoint, *connections(session.endpoints)),
     )
+    again.prints("joins the session")
+    for name in SITES:
+        session.processes[name].signal(signal.SIGINT)
     assert again.code() == 0, again
-    assert [session.processes[name].code() for name in SITES] == [0, 0, 0]
+    assert [session.processes[name].code() for name in SITES] == [130, 130, 130]
     torn = recover(active(session.log))
     assert torn.lossless
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)
     for name in SITES:
-        assert [state.tick for state in log[name].states] == list(range(6000))
+        (made,) = (event.ticks for event in log.events if (event.member, event.kind) == (name, "end"))
+        assert [state.tick for state in log[name].states] == list(range(made))
     with second.open("rb") as stream:
         metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}
     assert metadata["trilat.part"] == {"index": "2", "previous": "run.mcap"}

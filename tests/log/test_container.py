@@ -76,7 +76,7 @@ def read(data: bytes) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(calls=CALLS, chunk_bytes=st.sampled_from([1, 200, 1 << 20]))
 def test_every_reader_finds_what_it_finds_in_a_file_of_mcaps_own(
     calls: list[tuple[Any, ...]], chunk_bytes: int

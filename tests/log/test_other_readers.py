@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,10 +18,10 @@ from rosbags.rosbag2 import Reader
 from trilat_net.core.tick import Mode
 from trilat_net.log.reader import Log, open_log
 
+from .programs import PYMCAP, RERUN, printed, rerun_faults
 from .standard_files import EPOCH_NS, KINDS, SCENARIO, made, outputs
 
 BUCKET = 20
-RERUN = (sys.executable, "-m", "rerun")
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +45,6 @@ def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
                 decode = DecoderFactory().decoder_for("cdr", schema)
                 assert decode is not None
                 yield channel.topic, decode(message.data), message
-
-
-def program(*command: str) -> str:
-    """Runs a program of other people; returns what it printed."""
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
 
 
 def test_the_mcap_package_reads_the_same_with_the_index_and_without(log_file: Path) -> None:
@@ -207,19 +198,14 @@ def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
 
 @pytest.mark.parametrize("kind", [*KINDS, "bag"])
 def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
-    text = program(*RERUN, "mcap", "check", "--full", str(files[kind]))
-    rows = [
-        line.split() for line in text.splitlines() if "/" in line and line.strip()[:2] in ("ok", "wa", "er")
-    ]
-    assert rows
-    assert {row[0] for row in rows} == {"ok"}, text
+    assert rerun_faults(files[kind], "--full") == []
 
 
 def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_path: Path) -> None:
     """Of a recording as it converts it, the names of the series and their numbers."""
     recording = tmp_path / "run.rrd"
-    program(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
-    text = program(*RERUN, "rrd", "print", "-vvv", str(recording))
+    printed(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
+    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
     for site in SCENARIO.names:
         for entity in (f"/viz/{site}/joint_states/position", f"/viz/{site}/error", f"/viz/{site}/link_delay"):
             assert entity in text
@@ -231,7 +217,6 @@ def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_p
 @pytest.mark.parametrize("kind", ["live", "recovered", "bag"])
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     """A program of others under another license: run, never imported."""
-    executable = str(Path(sys.executable).with_name("pymcap-cli"))
-    assert "passed" in program(executable, "doctor", "--strict-message-order", str(files[kind]))
+    assert "passed" in printed(*PYMCAP, "doctor", "--strict-message-order", str(files[kind]))
     if kind == "live":
-        assert "/viz/m/joint_states" in program(executable, "info", str(files[kind]))
+        assert "/viz/m/joint_states" in printed(*PYMCAP, "info", str(files[kind]))

@@ -76,7 +76,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     steps=STEPS,
     size=st.none() | st.integers(10_000, 120_000),
@@ -232,7 +232,7 @@ def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]
 def test_a_disk_that_is_full_at_a_seam_keeps_the_parts_before(tmp_path: Path) -> None:
     """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
-    for room in range(80_000, 200_000, 1700):
+    for room in range(80_000, 200_000, 2900):
         path = cleared(tmp_path)
         taken = recorded_on(room, path, messages)
         found = [message for _, part in sorted(existing(path).items()) for message in read(part)[0]]

@@ -28,7 +28,7 @@ from trilat_net.log.reader import open_log
 from trilat_net.log.recover import Recovery, recover, recovered_path
 from trilat_net.replay.verify import verify
 
-anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
+anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 positions = st.floats(0, 1, exclude_max=True)
 
 

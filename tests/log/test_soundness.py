@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from hypothesis import given, settings
@@ -15,11 +16,18 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 from tests.log.hostility import chunk
-from tests.log_editing import edited, recorded, without
+from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError
+from trilat_net.log.accounting import Account
+from trilat_net.log.chunks import Walk
 from trilat_net.log.framing import HEAD, MAGIC, Frame, Framing
 from trilat_net.log.packed import unpacked
+from trilat_net.log.parts import LogParts, Storage
+from trilat_net.log.reader import open_log
+from trilat_net.log.recover import recover
 from trilat_net.log.soundness import Soundness, soundness
+from trilat_net.log.writer import LogWriter
+from trilat_net.replay.verify import verify
 
 WHOLE = recorded("paper")
 DATA = edited(WHOLE, chunk_bytes=8192)
@@ -183,6 +191,67 @@ def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
     assert "sequence" in failed(judged(tmp_path, early))
     both = judged(tmp_path, early, late)
     assert "sequence" not in failed(both), both.findings
+
+
+def split(folder: Path, *, refilled: range) -> list[Path]:
+    """A log in three parts, into which some records of `s` came later than others, out of its memory."""
+    scenario = opened(WHOLE).scenario
+    items = [item for item in Walk(io.BytesIO(WHOLE), "log").messages() if item.topic]
+    kept_back = [i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled]
+    items = [item for item in items if item not in kept_back]
+    items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
+    accounts = {item.topic: Account() for item in items}
+
+    def told() -> dict[str, str]:
+        return {topic: account.as_text() for topic, account in accounts.items()}
+
+    place = Storage(folder / "run.mcap", split_ns=40_000_000)
+    now_ns = 0
+    with LogParts(
+        place, lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part)
+    ) as log:
+        log.so_far = told
+        for item in items:
+            now_ns = max(now_ns, item.log_time_ns)
+            number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
+            accounts[item.topic].take(number)
+            log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
+        log.finish(told())
+    return sorted(folder.glob("run-*.mcap"))
+
+
+def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
+    """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
+    parts = split(tmp_path, refilled=range(30, 50))
+    assert len(parts) >= 3
+    found = soundness(parts)
+    assert found.passed, found.findings
+    assert "20 came late" in next(f.text for f in found.findings if f.check == "sequence")
+    verdict = verify(open_log(*parts))
+    assert (verdict.records, verdict.identical, verdict.gaps) == (360, 360, [])
+
+
+def test_a_part_alone_is_judged_from_where_it_begins(tmp_path: Path) -> None:
+    """What came before is in the parts before; what it lacks itself is missing all the same."""
+    parts = split(tmp_path, refilled=range(0))
+    assert soundness(parts[1:2]).passed
+    first_and_last = soundness([parts[0], parts[2]])
+    assert failed(first_and_last) == {"sequence", "accounts"}
+    assert verify(open_log(parts[0], parts[2])).gaps
+
+
+def test_a_recovered_file_is_sound_but_for_what_was_lost(tmp_path: Path) -> None:
+    torn = tmp_path / "run.mcap.active"
+    torn.write_bytes(DATA[: len(DATA) // 2])
+    with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
+        made = recover(torn).output
+    assert "whole" in failed(soundness([torn]))
+    found = soundness([made])
+    assert failed(found) & BUILT == set(), found.findings
+    assert "accounts" not in failed(found), found.findings
+    verdict = verify(open_log(made))
+    assert verdict.passed
+    assert verdict.records == sum(len(open_log(torn)[site]) for site in ("m1", "m2", "s"))
 
 
 def test_files_of_different_sessions_are_not_judged_as_one(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 import hashlib
 import io
 import math
-from collections import defaultdict
+import random
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -195,6 +196,18 @@ def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records
         for topic in ("/viz/m/joint_states", "/viz/m/error", "/viz/m/theta_hat"):
             times = [t_ns for t_ns, _ in desk.arrays(topic)]
             assert times == sorted(set(times))
+
+
+@given(runs(), st.randoms(use_true_random=False))
+def test_disorder_within_a_bucket_does_not_show(records: list[Output], chance: random.Random) -> None:
+    in_order = sorted(records, key=lambda one: one.tick)
+    shuffled = sorted(in_order, key=lambda one: (one.tick // BUCKET, chance.random()))
+    desks = Desk(100.0), Desk(100.0)
+    for desk, ones in zip(desks, (in_order, shuffled), strict=True):
+        desk.take(ones)
+        desk.finish()
+    first, second = ([(s.topic, s.message, s.publish_ns) for s in desk.seen] for desk in desks)
+    assert Counter(first) == Counter(second)
 
 
 @pytest.mark.parametrize("tick", [0, 7, 219, 399])

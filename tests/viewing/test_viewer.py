@@ -1,13 +1,13 @@
 """How Rerun is called: with the log itself, or with what was made of it, and with its layout."""
 
 import re
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
+from tests.log.programs import RERUN, printed
 from tests.log.standard_files import made
 from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.log.reader import Log, open_log
@@ -142,14 +142,7 @@ def test_rerun_takes_log_and_layout_into_one_recording(files: dict[str, Path], t
     """The program itself: the layout is of the log's own application, so that Rerun applies it."""
     recording = tmp_path / "run.rrd"
     open_viewer([files["live"]], never, Show(save=recording), lambda _: None)
-    done = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", str(recording)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0
-    stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', done.stdout))
+    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', text))
     assert stores == {("Blueprint", "live"), ("Recording", "live")}
-    assert "m: joint angles and reference (rad)" in done.stdout
-    assert "/viz/m/joint_states/position" in done.stdout
+    assert "/viz/m/joint_states/position" in text

@@ -34,8 +34,8 @@ def show_overview(facts: Facts) -> None:
     channels: dict[str, Facts] = facts["channels"]
     views = {topic: channel for topic, channel in channels.items() if topic.startswith(_VIEWS)}
     own = {topic: channel for topic, channel in channels.items() if topic not in views}
-    _show_channels("channel", own, session)
-    _show_channels("view", views, session)
+    _show_channels(own, session)
+    _show_views(views)
     if session is not None:
         _show_accounts(session)
         _show_origin(session)
@@ -115,7 +115,18 @@ def _show_links(links: dict[str, Facts]) -> None:
     _table([*heads, "late", "lost", "twice"], rows)
 
 
-def _show_channels(head: str, channels: dict[str, Facts], session: Facts | None) -> None:
+def _show_views(views: dict[str, Facts]) -> None:
+    """Prints the channels that show to viewers what others hold."""
+    if views:
+        heads = ("view, for other tools", "messages", "rate Hz", "size", "as")
+        facts = [
+            (topic, v["messages"], _number(v["rate_hz"]), _size(v["bytes"]), v["schema"].rpartition("/")[2])
+            for topic, v in views.items()
+        ]
+        _table(heads, facts)
+
+
+def _show_channels(channels: dict[str, Facts], session: Facts | None) -> None:
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
@@ -130,7 +141,7 @@ def _show_channels(head: str, channels: dict[str, Facts], session: Facts | None)
         )
         for topic, channel in channels.items()
     ]
-    _table((head, "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
+    _table(("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
     for topic, channel in channels.items():
         if channel["gaps"]:
             words = [f"{a}-{b}" if b > a else str(a) for a, b in channel["gaps"][:_MOST_GAPS]]

@@ -8,6 +8,7 @@ import typer
 from rich.markup import escape
 
 from ..errors import RunFailed, UsageError
+from .opening import opened
 from .options import (
     ClockDriftOption,
     ClockOffsetOption,
@@ -29,6 +30,7 @@ from .options import (
     say,
     session_name,
 )
+from .progress import bar
 from .show import show_conclusion
 
 app = typer.Typer()
@@ -50,7 +52,6 @@ def demo(
     from sites.display import Display
 
     from ..conclusion import conclude, results_folder
-    from ..experiment import open_log
 
     chosen = chosen_scenario(scenario, overrides, duration, seed)
     results = results_folder(folder, chosen.name, force=force)
@@ -70,7 +71,9 @@ def demo(
     if not outcome.log.exists():
         raise typer.Exit(1)
     out.print("checking the log and drawing ...")
-    conclusion = conclude(open_log(outcome.log), results)
+    log = opened(outcome.log)
+    with bar("executing and drawing") as progress:
+        conclusion = conclude(log, results, progress)
     show_conclusion(conclusion)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(1)
@@ -229,12 +232,12 @@ def record(
 def _conclude(parts: list[Path]) -> None:
     """Verifies and reports a log, into its own folder."""
     from ..conclusion import conclude
-    from ..experiment import open_log
 
     out.print("checking the log and drawing ...")
     path = parts[0]
-    log = open_log(*parts)
-    conclusion = conclude(log, path.parent)
+    log = opened(*parts)
+    with bar("executing and drawing") as progress:
+        conclusion = conclude(log, path.parent, progress)
     show_conclusion(conclusion)
     if not conclusion.passed:
         raise RunFailed(f"{path}: failed a check")

@@ -176,7 +176,9 @@ class Lane:
             case Event():
                 if message.kind == "end":
                     self.ends = message.ticks
-                sent_ns = message.t_ns if message.t_ns >= 0 else None
+                # what a recorder says itself is stamped as it hears it; before the epoch there is no time
+                stamped = message.t_ns >= 0 and message.member != topics.RECORDER
+                sent_ns = message.t_ns if stamped else None
                 return Said(message.member, message.boot, message.n, max(0, message.n), sent_ns)
         whole = self.accounts.get(message.boot)
         number = 0 if whole is None else whole.expected

@@ -1,0 +1,23 @@
+"""Programs of other people that read MCAP files; run as processes, never imported."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+RERUN = (sys.executable, "-m", "rerun")
+PYMCAP = (str(Path(sys.executable).with_name("pymcap-cli")),)  # GPL
+
+
+def printed(*command: str) -> str:
+    """What a program prints, if it ends well."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def rerun_faults(path: Path, *options: str) -> list[str]:
+    """The channels with which `rerun mcap check` finds fault, and why."""
+    table = printed(*RERUN, "mcap", "check", *options, str(path)).partition("Status")[2].splitlines()[2:]
+    rows = [line for line in table if line.strip()]
+    assert rows
+    return [row for row in rows if row.split()[0] != "ok"]
