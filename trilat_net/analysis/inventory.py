@@ -13,17 +13,16 @@ import numpy as np
 
 from ..core.grid import NS_PER_S
 from ..errors import LogError
-from ..log.accounting import Account
-from ..log.chunks import Channel, Item, Progress, Walk
+from ..log.chunks import Channel, Progress, Walk
 from ..log.reader import Ints
 from ..net import topics
 from ..net.stats import ticks_between
 
 Facts = dict[str, Any]
 
+_NOTHING = (array("Q"), array("Q"), array("Q"))
 MOST_GAPS = 1000
 """Gaps of a channel that are named."""
-_NUMBERED_EVENTS_SINCE = 3
 
 
 class Inventory:
@@ -45,9 +44,7 @@ class Inventory:
         self.files: list[Facts] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._about: dict[str, Channel] = {}
-        self._log_ns: dict[str, array[int]] = {}
-        self._sequence: dict[str, array[int]] = {}
-        self._bytes: dict[str, int] = {}
+        self._came: dict[str, tuple[array[int], array[int], array[int]]] = {}  # log time, sequence, size
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
@@ -60,8 +57,14 @@ class Inventory:
             before += path.stat().st_size
 
     def _read(self, path: Path, walk: Walk) -> None:
-        for item in walk.messages():
-            self._take(item)
+        for topic, payload, log_ns, _, sequence in walk.messages():
+            try:
+                times, sequences, sizes = self._came[topic]
+            except KeyError:
+                times, sequences, sizes = self._came[topic] = (array("Q"), array("Q"), array("Q"))
+            times.append(log_ns)
+            sequences.append(sequence)
+            sizes.append(len(payload))
         self._about = {**walk.channels, **self._about}
         self.metadata.update(walk.metadata)
         self.files.append(
@@ -85,17 +88,6 @@ class Inventory:
             }
         )
 
-    def _take(self, item: Item) -> None:
-        topic = item.topic
-        try:
-            self._log_ns[topic].append(item.log_time_ns)
-        except KeyError:
-            self._log_ns[topic] = array("Q", (item.log_time_ns,))
-            self._sequence[topic] = array("Q")
-            self._bytes[topic] = 0
-        self._sequence[topic].append(item.sequence)
-        self._bytes[topic] += len(item.payload)
-
     def channels(self, session: str = "", rates_hz: Mapping[str, int] | None = None) -> dict[str, Facts]:
         """Returns the facts of every channel by topic, keys ending in their units.
 
@@ -103,38 +95,41 @@ class Inventory:
             session: the session, if these are files of ours.
             rates_hz: the tick rate of its sites.
         """
-        names = [*self._about, *(topic for topic in self._log_ns if topic not in self._about)]
+        names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
         return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
 
     def _channel(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> Facts:
         about = self._about.get(topic, Channel(topic, "", "", "", {}))
-        log_ns = np.frombuffer(self._log_ns.get(topic, array("Q")), dtype=np.uint64)
+        log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came.get(topic, _NOTHING))
         first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
         span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
         return {
             "messages": len(log_ns),
-            "bytes": self._bytes.get(topic, 0),
+            "bytes": int(sizes.sum()),
             "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
             "between_ms": _between_ms(log_ns),
             "encoding": about.encoding,
             "schema": about.schema,
-            **self._numbers(topic, session, rates_hz),
+            **_numbers(topic, sequence, session, rates_hz),
         }
 
-    def _numbers(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> Facts:
-        """Returns what is missing of a channel whose messages are numbered; else nothing."""
-        where = topics.address(topic.removeprefix("/"))
-        of_a_site = where is not None and where.session == session and where.member in rates_hz
-        if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
-            return {"missing": None, "gaps": None, "duplicates": None}
-        every = ticks_between(rates_hz[where.member]) if where.channel == topics.LINK else 1
-        account = Account()
-        for sequence in self._sequence.get(topic, ()):
-            account.take(sequence // every)
-        gaps = account.gaps[:MOST_GAPS]
-        return {"missing": account.missing, "gaps": gaps, "duplicates": account.duplicate}
+
+def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int]) -> Facts:
+    """Returns what is missing of a channel whose messages are numbered; else nothing."""
+    where = topics.address(topic.removeprefix("/"))
+    of_a_site = where is not None and where.session == session and where.member in rates_hz
+    if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
+        return {"missing": None, "gaps": None, "duplicates": None}
+    every = ticks_between(rates_hz[where.member]) if where.channel == topics.LINK else 1
+    came = sequence.astype(np.int64) // every
+    there = np.unique(came)
+    steps = np.diff(there, prepend=-1)
+    before = np.flatnonzero(steps > 1)[:MOST_GAPS]
+    gaps = [[int(there[n] - steps[n] + 1), int(there[n] - 1)] for n in before]
+    missing = int(there[-1]) + 1 - len(there) if len(there) else 0
+    return {"missing": missing, "gaps": gaps, "duplicates": len(came) - len(there)}
 
 
 def _between_ms(log_ns: Any) -> Facts | None:

@@ -23,7 +23,7 @@ def session_facts(log: Log) -> Facts:
     """Returns what a log says of its session."""
     said, scenario = log.session, log.scenario
     epoch_ns = _number(said.get("epoch_unix_ns", ""))
-    seconds = [float(log[site].t_s[-1]) for site in log.sites if len(log[site])]
+    seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
     live = log.driver == "live" and epoch_ns is not None
     return {
         "session": said["session"],
