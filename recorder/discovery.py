@@ -12,7 +12,7 @@ from trilat_net.net.messages import Info
 from trilat_net.net.voice import token
 from trilat_net.net.wire import decode
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import parse
+from trilat_net.scenario import embedded
 
 
 class Discovery:
@@ -44,7 +44,7 @@ class Discovery:
             clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
             while (reply := replies.poll()) is not None:
                 try:
-                    names = parse(decode(reply[1], Info).scenario, self._session).names
+                    names = embedded(decode(reply[1], Info).scenario, self._session).names
                 except (WireError, ScenarioError):
                     continue  # no site of ours
                 return list(default_endpoints(self._session, names).values())

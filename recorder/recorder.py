@@ -24,7 +24,7 @@ from trilat_net.net.messages import Info
 from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
 from trilat_net.net.voice import Voice
-from trilat_net.scenario import Scenario, parse
+from trilat_net.scenario import Scenario, embedded
 
 from .recording import Recording
 from .report import Report
@@ -161,7 +161,7 @@ class Recorder:
     def _scenario(self, epoch: Epoch) -> Scenario:
         """Returns the scenario, as a member of the session has it."""
         return next(
-            parse(info.scenario, info.member)
+            embedded(info.scenario, info.member)
             for info in self._joining.meeting.met.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )

@@ -20,7 +20,7 @@ from trilat_net.net.messages import Info, LinkStats
 from trilat_net.net.offset import Estimate, known
 from trilat_net.net.pinging import PACE_NS, Pinger
 from trilat_net.net.wire import decode
-from trilat_net.scenario import parse
+from trilat_net.scenario import embedded
 
 POLL_NS = 1_000_000
 GATHER_NS = 600_000_000
@@ -186,7 +186,7 @@ def _everywhere(probe: Probe, session: str) -> list[str]:
     """Returns the default endpoints of the sites that a member's scenario names."""
     for info in probe.infos.values():
         try:
-            return list(default_endpoints(session, parse(info.scenario, session).names).values())
+            return list(default_endpoints(session, embedded(info.scenario, session).names).values())
         except ScenarioError:
             continue  # the recorder's, which has none
     return [default_endpoint(session, 0)]

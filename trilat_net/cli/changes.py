@@ -111,13 +111,13 @@ def _place(context: typer.Context, site: str, order: dict[str, Any]) -> None:
     from ..net.answers import Order
     from ..net.clock import SystemClock
     from ..net.ordering import place_order
-    from ..scenario import parse
+    from ..scenario import embedded
 
     session, connection = context.obj
     if session is None:
         raise UsageError("which session? say trilat set --session ID ...")
     reply = place_order(
-        connection, SystemClock(), session, site, Order(**order), lambda text: parse(text, session).names
+        connection, SystemClock(), session, site, Order(**order), lambda text: embedded(text, session).names
     )
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")

@@ -10,7 +10,7 @@ _NUMBER = re.compile(r"(.+)-(\d{3,})")
 
 def active(path: Path) -> Path:
     """Returns where a log is while it is written."""
-    return path.with_name(path.name + ACTIVE)
+    return path.with_name(path.name + ACTIVE) if path.name else path  # "." is a folder, and refused as one
 
 
 def unfinished(path: Path) -> str:
