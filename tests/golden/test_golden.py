@@ -1,8 +1,8 @@
 """Logs of every released schema version stay readable, and execute to the same numbers.
 
 `v1.mcap` is 0.4 s of `asymmetric` in virtual time, with shorter delays so that samples come into use;
-`v2.mcap` has random links, a loss in bursts, an outage, a stale peer, and changes of a link and of shares; `v3.mcap`
-is the same experiment, with numbered events and views.
+`v2.mcap` has random links, a loss in bursts, an outage, a stale peer, and changes of a link and of shares;
+`v3.mcap` is the same experiment, with numbered events and views.
 """
 
 from pathlib import Path
