@@ -58,7 +58,7 @@ def test_it_tells_what_there_is_from_a_number_on_up_to_the_next_gap(
 @given(st.integers(0, 150), st.integers(0, 150), st.integers(0, 150), st.sampled_from([1, 900]))
 def test_where_nothing_is_missing_it_answers_as_a_site(count: int, first: int, more: int, size: int) -> None:
     """Messages of 2 bytes, and of 1800, of which fewer fit an answer."""
-    ring = Ring(200)
+    ring = Ring(200, 400_000)
     for number in range(count):
         ring.keep(number.to_bytes(2, "big") * size)
     memory = remembered(list(range(count)), count, size)
