@@ -9,6 +9,7 @@ import pytest
 import recorder.process
 from tests.cli.running import trilat
 from trilat_net.experiment import record_virtual
+from trilat_net.log.parts import Storage
 from trilat_net.scenario import load
 
 from .processes import Session, Stage
@@ -31,8 +32,8 @@ def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None
 def test_a_run_that_diverged_fails_though_its_log_is_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def recorded(_session: str, path: Path, *others: object) -> int:
-        assert not record_virtual(load("two_sites", {"limits.qd_limit_rad_s": 0.01}), path)
+    def recorded(_session: str, storage: Storage, *others: object) -> int:
+        assert not record_virtual(load("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path)
         *_, afterwards = others
         assert isinstance(afterwards, Callable)
         afterwards()

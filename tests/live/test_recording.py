@@ -97,6 +97,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_
 def test_two_recorders_at_once_have_the_same_records(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
     session.all()
+    session.begun()
     twin = another_recorder(stage, session, stage.folder / "twin.mcap")
     assert interrupted(session) == {"m": 130, "s": 130}
     assert (session.processes["recorder"].code(), twin.code()) == (0, 0)
