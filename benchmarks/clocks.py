@@ -1,15 +1,12 @@
 """Measured delays against the truth, a minute long: real processes on clocks seconds apart that drift."""
 
-import tempfile
-from pathlib import Path
-
 import numpy as np
 
-from tests.live.processes import Session, Stage
 from tests.truth import Judged, judged, offset_errors
 from trilat_net.log.reader import open_log
 
-SITES = ("m1", "m2", "s")
+from .sessions import SITES, paper
+
 SKEWS = {
     "m2": ("--clock-offset-s", "3", "--clock-drift-ppm", "100"),
     "s": ("--clock-offset-s", "-2", "--clock-drift-ppm", "-50"),
@@ -18,17 +15,12 @@ DURATION_S = 62
 
 
 def run() -> list[str]:
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(Path(folder))
-        try:
-            session = Session(stage, "paper", SITES, "--duration", str(DURATION_S))
-            session.recorder()
-            for name in SITES:
-                session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
-            for process in session.processes.values():
-                process.code(DURATION_S + 60.0)
-        finally:
-            stage.clear()
+    with paper(DURATION_S) as session:
+        session.recorder()
+        for name in SITES:
+            session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
+        for process in session.processes.values():
+            process.code(DURATION_S + 60.0)
         log = open_log(session.log)
         links = [(site, peer) for site in SITES for peer in log.scenario.peers(site)]
         samples = {link: judged(log, *link) for link in links}

@@ -1,33 +1,27 @@
 """Ten minutes of three sites and a recorder: what is in the file, what the processes hold and take."""
 
 import os
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from tests.live.processes import Session, Stage
 from trilat_net.log.reader import open_log
 
-SITES = ("m1", "m2", "s")
+from .sessions import SITES, paper
+
 DURATION_S = 600
 WARM_S = 30.0
 
 
 def run() -> list[str]:
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(Path(folder))
-        try:
-            session = Session(stage, "paper", SITES, "--duration", str(DURATION_S))
-            session.all()
-            session.begun()
-            samples = np.array(list(_samples({name: p.pid for name, p in session.processes.items()})))
-            for process in session.processes.values():
-                process.code()
-        finally:
-            stage.clear()
+    with paper(DURATION_S) as session:
+        session.all()
+        session.begun()
+        samples = np.array(list(_samples({name: p.pid for name, p in session.processes.items()})))
+        for process in session.processes.values():
+            process.code()
         log = open_log(session.log)
         have = sum(len(log[name]) for name in SITES)
         told = [f"  {name}: {log.account(name)}" for name in SITES]

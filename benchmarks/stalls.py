@@ -4,16 +4,14 @@ Pairs of runs, one with the stall and one without, in turns, so that the machine
 """
 
 import signal
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 
-from tests.live.processes import Session, Stage
 from trilat_net.log.reader import Log, open_log
 
-SITES = ("m1", "m2", "s")
+from .sessions import SITES, paper
+
 PAIRS = 5
 DURATION_S = 15
 STALL_S = 3.0
@@ -35,20 +33,15 @@ def run() -> list[str]:
 
 def _run(stalled: bool) -> Log:
     """One run; every record must be in its file."""
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(Path(folder))
-        try:
-            session = Session(stage, "paper", SITES, "--duration", str(DURATION_S))
-            session.all()
-            session.begun()
-            if stalled:
-                time.sleep(3.0)
-                session.processes["recorder"].signal(signal.SIGSTOP)
-                time.sleep(STALL_S)
-                session.processes["recorder"].signal(signal.SIGCONT)
-            session.codes()
-        finally:
-            stage.clear()
+    with paper(DURATION_S) as session:
+        session.all()
+        session.begun()
+        if stalled:
+            time.sleep(3.0)
+            session.processes["recorder"].signal(signal.SIGSTOP)
+            time.sleep(STALL_S)
+            session.processes["recorder"].signal(signal.SIGCONT)
+        session.codes()
         log = open_log(session.log)
         have = sum(len(log[name]) for name in SITES)
         refilled = [log.account(name) for name in SITES] if stalled else []

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from trilat_net.errors import WireError
 from trilat_net.log.writer import CHANNELS
 from trilat_net.net import topics
-from trilat_net.net.answers import Past, Wanted
+from trilat_net.net.answers import CHUNK, Past, Wanted
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.wire import decode, encode
 
@@ -30,8 +30,6 @@ REST_NS = 250_000_000
 """Before the next question, where an answer brought nothing that was wanted."""
 VAIN = 20
 """So many of these in a row, and the channel's gaps are given up."""
-CHUNK = 64
-"""Messages that are asked for at once, at most: fewer where answers do not come."""
 GIVE_UP_NS = 10_000_000_000
 """How long to ask a site that has ended and does not answer."""
 
@@ -76,6 +74,7 @@ class Filling:
         self._vain = dict.fromkeys(CHANNELS, 0)
         self._open: _Open | None = None
         self._due_ns: int | None = None
+        # fewer at once where answers do not come
         self._patience_ns, self._chunk = ANSWER_NS[0], CHUNK
         self._ended_ns: int | None = None
 

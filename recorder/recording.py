@@ -95,7 +95,6 @@ class Recording:
         } | self._own
         self._stored: set[str] = set()
         self._gone: set[str] = set()
-        self._gone_since_ns: dict[str, int] = {}
         self._missed_ns: dict[str, int] = {}
         self._overflowed = 0
 
@@ -126,7 +125,7 @@ class Recording:
         self._drain(tap, now_ns)
         log_time_ns = self._epoch.unix_ns + now_ns - self._epoch.mono_ns
         for name, filling in self._fillings.items():
-            for filled in filling.poll(now_ns, alive=not self._is_gone(name, now_ns)):
+            for filled in filling.poll(now_ns, alive=self._goes_on(name, now_ns)):
                 key = topics.key(self._session, name, filled.channel)
                 sent_ns = max(filled.message.t_ns, 0)  # what was said before the epoch bears no time
                 self._add(key, filled.payload, filled.message, sent_ns, log_time_ns)
@@ -192,17 +191,23 @@ class Recording:
             return
         (self._gone.discard if alive else self._gone.add)(where.member)
 
-    def _is_gone(self, site: str, now_ns: int) -> bool:
-        """True where a site's token has disappeared, and nothing has come of it since.
+    def _silent_since_ns(self, site: str, now_ns: int) -> int | None:
+        """Returns since when a site is gone; None while its token is there.
 
-        A connection that is made anew may tell that a token went and came in the wrong order.
+        A connection that is made anew may tell that a token went and came in the wrong order: what comes of a
+        site later than what was under way shows that it was there still.
         """
         if site not in self._gone:
             self._missed_ns.pop(site, None)
-            return False
+            return None
         missed_ns = self._missed_ns.setdefault(site, now_ns)
         heard_ns = self._senders[site].heard_ns
-        return heard_ns is None or heard_ns < missed_ns + UNDER_WAY_NS
+        return missed_ns if heard_ns is None or heard_ns < missed_ns + UNDER_WAY_NS else heard_ns
+
+    def _goes_on(self, site: str, now_ns: int) -> bool:
+        """True where a site's token is there, or something came of it after the token had disappeared."""
+        since_ns = self._silent_since_ns(site, now_ns)
+        return since_ns is None or since_ns > self._missed_ns[site]
 
     def over(self, now_ns: int) -> bool:
         """True once all that can be had of every site is here, or the site is gone for good."""
@@ -213,10 +218,9 @@ class Recording:
         """True once nothing more of a site will come."""
         if site in self._stored:
             return True
-        if not self._is_gone(site, now_ns):
-            self._gone_since_ns.pop(site, None)
+        since_ns = self._silent_since_ns(site, now_ns)
+        if since_ns is None:
             return False
-        since_ns = self._gone_since_ns.setdefault(site, now_ns)
         patience_ns = SETTLE_NS
         if self._senders[site].made is None:
             patience_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))

@@ -8,7 +8,7 @@ from array import array
 
 from trilat_net.errors import WireError
 from trilat_net.net import topics
-from trilat_net.net.answers import Past, Wanted
+from trilat_net.net.answers import CHUNK, CHUNK_BYTES, Past, Wanted
 from trilat_net.net.bus import Question, Questions
 from trilat_net.net.stats import PER_SECOND
 from trilat_net.net.wire import decode, encode
@@ -20,9 +20,6 @@ RECORD_BYTES = 640
 """What a record takes on average, at most, for a minute of them to be kept."""
 STATISTICS_BYTES = 4_096
 EVENTS, EVENTS_BYTES = 4_096, 4_000_000
-CHUNK = 64
-CHUNK_BYTES = 40_000
-"""Most messages in one answer, and most bytes, unless a single message has more."""
 
 
 class Ring:

@@ -1,5 +1,4 @@
 import io
-from pathlib import Path
 
 import pytest
 
@@ -13,11 +12,3 @@ def short_log() -> bytes:
     stream = io.BytesIO()
     virtual.record(load("paper", {"duration_s": 0.3}), stream)
     return stream.getvalue()
-
-
-@pytest.fixture
-def log_file(short_log: bytes, tmp_path: Path) -> Path:
-    """That log as a file of the test's own."""
-    path = tmp_path / "run.mcap"
-    path.write_bytes(short_log)
-    return path

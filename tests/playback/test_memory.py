@@ -4,8 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.history import Ring
+from trilat_net.net.answers import CHUNK, CHUNK_BYTES
 from trilat_net.playback.block import Gathering
-from trilat_net.playback.memory import CHUNK, CHUNK_BYTES, Memory
+from trilat_net.playback.memory import Memory
 
 CHANNEL, OTHER = 3, 4
 

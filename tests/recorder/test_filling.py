@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorder.filling import ANSWER_NS, CHUNK, GIVE_UP_NS, SILENT_NS, VAIN
+from recorder.filling import ANSWER_NS, GIVE_UP_NS, SILENT_NS, VAIN
 from trilat_net.net import topics
-from trilat_net.net.answers import Past
+from trilat_net.net.answers import CHUNK, Past
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import Event, RecorderStats, State
 from trilat_net.net.wire import decode, encode
@@ -317,6 +317,19 @@ def test_a_site_that_goes_on_is_there_whatever_its_token_says() -> None:
     run.until_stored()
     assert run.site.asked
     assert "missing 0" in run.desk.log().account("m")
+
+
+def test_a_site_that_goes_on_and_then_dies_ends_the_recording() -> None:
+    """Its token had disappeared before, and nothing will tell of it once more."""
+    run = Run(Way(lost=set(range(30, 60))))
+    vanish(run)
+    run.live(25 * MS)
+    run.desk.rounds(5, run.site, step_ns=40 * MS)
+    run.desk.take("m", "state", MADE["state"][25])
+    run.desk.rounds(5, run.site, step_ns=40 * MS)
+    assert not run.desk.over()
+    run.desk.rounds(90, run.site, step_ns=100 * MS)
+    assert run.desk.over()
 
 
 def test_what_is_not_what_its_answer_says_is_counted_and_not_written() -> None:

@@ -3,9 +3,9 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.history import CHUNK, CHUNK_BYTES, EVENTS, KEPT_S, RECORDS, History, Ring
+from sites.history import EVENTS, KEPT_S, RECORDS, History, Ring
 from trilat_net.net import topics
-from trilat_net.net.answers import Past, Wanted
+from trilat_net.net.answers import CHUNK, CHUNK_BYTES, Past, Wanted
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.messages import VERSION
 from trilat_net.net.wire import MAX_BYTES, decode, encode

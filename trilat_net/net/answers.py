@@ -10,6 +10,10 @@ import msgspec
 
 from .messages import U64, VERSION, Instant, TickNumber
 
+CHUNK = 64
+CHUNK_BYTES = 40_000
+"""Most messages in one `Past`, and most bytes of them, unless a single message has more."""
+
 
 class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a member answers to a ping, at once.

@@ -10,12 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..net.answers import CHUNK, CHUNK_BYTES
 from .block import Block
 from .order import Ints
-
-CHUNK = 64
-CHUNK_BYTES = 40_000
-"""Most messages in one answer, and most bytes, unless a single message has more: as `sites.history`."""
 
 
 class _Stretch(NamedTuple):
