@@ -97,6 +97,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     tick: TickNumber
     q: list[float]
     qd: list[float]
+    tau_x: list[float]
     sent_ns: Instant = 0
     echo: list[Stamp] = []
 
@@ -294,9 +295,10 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     boots: dict[str, int] = {}
 
 
-SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}
+SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS, "tau_x": JOINTS}
 STATE_VECTORS = {
-    **SAMPLE_VECTORS,
+    "q": JOINTS,
+    "qd": JOINTS,
     "q_des": JOINTS,
     "qd_des": JOINTS,
     "tau": JOINTS,

@@ -167,7 +167,7 @@ class Execution:
                 return arrivals, Difference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
             sample = self._by_tick[peer].get(tick)
             if sample is not None:
-                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
+                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x))
             elif 0 <= tick <= self._ends[peer]:
                 self._lacking[peer].add(tick)
                 lacking = Difference(state.site, state.tick, "", tick, None)
@@ -188,11 +188,11 @@ class Execution:
             sample = self._by_tick[j].get(used)
             if used >= 0 and sample is None:
                 return False
-            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
+            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd, 0, sample.tau_x))
             certain, self._assumed[j] = self._came_before(n, j, used)
             for tick in sorted(certain | self._assumed[j]):
                 if (came := self._by_tick[j].get(tick)) is not None:
-                    waiting.append(Arrival(j, tick, came.q, came.qd))
+                    waiting.append(Arrival(j, tick, came.q, came.qd, 0, came.tau_x))
                 else:
                     self._lacking[j].add(tick)
         for command in self._commands(states[n].tick - 1)[0]:  # given in the gap

@@ -12,9 +12,12 @@ import msgspec
 
 from ..core.arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
+from .actors import HANDS, SURROUNDINGS
 from .connections import resolve_links, resolve_row, resolve_timeline
 from .expectation import Expect
-from .site import LAWS, Arm, Limits, OnStale, Pulse, SiteSpec
+from .laws import LAWS
+from .pushing import resolve_actors
+from .site import Arm, Limits, OnStale, SiteSpec
 from .tables import Table, fields, finite, known, one_of
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -30,7 +33,18 @@ _TABLES = (
     "timeline",
     "expect",
 )
-_SITE = ("role", "rate_hz", "q0_rad", "qd0_rad_s", "arm", "control", "limits", "on_stale", "hands")
+_SITE = (
+    "role",
+    "rate_hz",
+    "q0_rad",
+    "qd0_rad_s",
+    "arm",
+    "control",
+    "limits",
+    "on_stale",
+    "hands",
+    "environment",
+)
 _GROUPS: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
 _VECTORS = {
     "Lambda": JOINTS,
@@ -40,9 +54,11 @@ _VECTORS = {
     "d": JOINTS,
     "q0_rad": JOINTS,
     "qd0_rad_s": JOINTS,
-    "peak_nm": JOINTS,
+    "k_f": JOINTS,
     "Gamma": PARAMETERS,
     "theta_hat0": PARAMETERS,
+    "theta_low": PARAMETERS,
+    "theta_high": PARAMETERS,
 }
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
@@ -132,10 +148,8 @@ def _resolve_sites(tables: Table) -> Table:
         site.setdefault("rate_hz", tables.get("rate_hz", 1000))
         site.setdefault("q0_rad", [0.0] * JOINTS)
         site.setdefault("qd0_rad_s", [0.0] * JOINTS)
-        hands = site.get("hands", [])
-        if not isinstance(hands, list):
-            raise ScenarioError(f"must be a list of tables [[{path}.hands]]", path=f"{path}.hands")
-        site["hands"] = [_vectors(known(h, fields(Pulse), f"{path}.hands[{n}]")) for n, h in enumerate(hands)]
+        for group, kinds in (("hands", HANDS), ("environment", SURROUNDINGS)):
+            site[group] = resolve_actors(site.get(group, []), kinds, site, f"{path}.{group}")
         sites[name] = {key: site[key] for key in fields(SiteSpec)}
     if len(sites) < 2:
         raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")
