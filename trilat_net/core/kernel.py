@@ -30,6 +30,7 @@ SITE = np.dtype(
             ("rate_hz", "i8"),
             ("scheme", "i8"),
             ("law", "i8"),
+            ("external", "i8"),
             ("ramps", "i8"),
             ("on_stale", "i8"),
             ("stale_ns", "i8"),
@@ -212,8 +213,9 @@ def _advance(k: int, site: Row, actors: Actors, table: Table) -> None:
     site.q_kept[:] = site.q
     site.qd_kept[:] = site.qd
     t_s = tick_ns(k, site.rate_hz) * 1e-9
-    s = site
-    advance(t_s, h_s, s.q, s.qd, s.u, s.theta, s.g, s.lengths, actors, table, s.work)
+    if site.external == 0:
+        s = site
+        advance(t_s, h_s, s.q, s.qd, s.u, s.theta, s.g, s.lengths, actors, table, s.work)
     if not _finite(site):
         site.q[:] = site.q_kept
         site.qd[:] = site.qd_kept

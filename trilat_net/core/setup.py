@@ -11,6 +11,7 @@ from typing import NamedTuple
 from .arm import JOINTS, PARAMETERS, Array
 from .delay import Model, Points
 from .exogenous import Actor
+from .own import OwnLawMaker
 from .tick import Ramp
 
 
@@ -139,6 +140,8 @@ class SiteSetup(NamedTuple):
         links: the peers in scenario order.
         ramps: scripted changes of the shares, in the order of their starts.
         on_stale: what to do about a stale peer.
+        external: whether the arm is outside of the program; then it is measured, and nothing is integrated.
+        own: makes the law where it is somebody's own.
     """
 
     name: str
@@ -156,3 +159,5 @@ class SiteSetup(NamedTuple):
     links: tuple[LinkSetup, ...]
     ramps: tuple[Ramp, ...] = ()
     on_stale: StaleRule = StaleRule()
+    external: bool = False
+    own: OwnLawMaker | None = None

@@ -17,8 +17,9 @@ from .channel import LOST
 from .delay import MODEL, Delay, Model, Row
 from .exogenous import rows_of
 from .grid import NS_PER_S
-from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_resume, site_tick
+from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_act, site_look, site_resume, site_tick
 from .link import LINK, SAMPLE, calendar_pages, release_tick
+from .own import Facts, Now, OwnLaw, asked
 from .setup import Law, LinkSetup, SiteSetup
 from .shares import RAMP_COLUMNS
 from .tick import MAX_ARRIVALS, Arrival, Command, LinkCounts, Mode, Output, Ramp, Tick
@@ -49,6 +50,7 @@ class Site:
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
+        self._external = setup.external
         self._site = np.zeros(1, SITE)
         self._actors, self._table = rows_of(setup.actors)
         self._row = np.zeros(ROW_FLOATS)
@@ -56,7 +58,8 @@ class Site:
         self._arrival_bytes = self._arrivals.view(np.uint8).data
         self._forces = np.zeros((MAX_ARRIVALS, JOINTS))
         self._force_bytes = self._forces.view(np.uint8).reshape(-1).data
-        self._reflects = any(setup.gains.k_f)
+        self._own = None if setup.own is None else setup.own(_facts(setup))
+        self._reflects = any(setup.gains.k_f) or self._own is not None
         self._fill(setup)
         self._connect(setup.links)
         self._share(setup)
@@ -65,6 +68,7 @@ class Site:
         s: Row = self._site[0]
         s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, int(setup.scheme), int(setup.gains.law), _RUN
         s.g, s.tau_limit, s.qd_limit = setup.g_m_s2, setup.tau_limit_nm, setup.qd_limit_rad_s
+        s.external = int(setup.external)
         rule = setup.on_stale
         s.on_stale, s.stale_ns, s.return_ns = int(rule.action), rule.age_ns, rule.return_ns
         s.lengths = setup.lengths_m
@@ -149,11 +153,15 @@ class Site:
 
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals, or MAX_COMMANDS commands.
+            LawFailed: a law of somebody's own did.
         """
         taken = self._pack(tick.arrivals)
         for command in tick.commands:
             self.order(command)
-        site_tick(
+        if tick.measured is not None and self._external:
+            s: Row = self._site[0]
+            s.q, s.qd = tick.measured
+        looked = (
             tick.k,
             len(tick.arrivals),
             self._site,
@@ -165,10 +173,14 @@ class Site:
             self._ramps,
             self._arrivals,
             self._forces,
-            self._actors,
-            self._table,
-            self._row,
         )
+        own: list[float] = []
+        if self._own is None:
+            site_tick(*looked, self._actors, self._table, self._row)
+        else:
+            site_look(*looked)
+            own = self._ask(self._own, tick.k)
+            site_act(tick.k, self._site, self._actors, self._table, self._row)
         row = self._row.tolist()
         n = JOINTS
         mode = self._site["mode"].item()
@@ -186,8 +198,19 @@ class Site:
             self._links["used"].tolist(),
             self._crc(taken, len(tick.arrivals)),
             [command.text for command in tick.commands],
-            [] if mode in (_RUN, _DIVERGED) else self._memory(),
+            [] if mode in (_RUN, _DIVERGED) and self._own is None else self._memory() + own,
         )
+
+    def _ask(self, law: OwnLaw, k: int) -> list[float]:
+        """Stage 6 of a law of somebody's own: takes its torque and estimate in, and returns its memory."""
+        s: Row = self._site[0]
+        vectors = (s.q, s.qd, s.q_des, s.qd_des, s.felt)
+        now = Now(k, k / self.rate_hz, 1.0 / self.rate_hz, *(vector.tolist() for vector in vectors))
+        torque, estimate, memory = asked(law, self.name, now)
+        limit = float(s.tau_limit)
+        s.tau = [min(max(value, -limit), limit) for value in torque]
+        s.theta_hat = estimate
+        return memory
 
     def _crc(self, taken: int, arrivals: int) -> int:
         """Returns `Output.rx_crc`."""
@@ -236,6 +259,8 @@ class Site:
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:JOINTS], int(last.mem[JOINTS])
+        if self._own is not None:
+            self._own.recall(last.mem[JOINTS + 1 :])
         site_resume(last.tick, self._site, self._actors, self._table)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
@@ -286,3 +311,9 @@ class Site:
             for n, arrival in enumerate(arrivals):
                 self._forces[n] = arrival.tau_x
         return offset
+
+
+def _facts(setup: SiteSetup) -> Facts:
+    """Returns what a law may know of its site."""
+    theta = tuple(float(value) for value in setup.theta)
+    return Facts(setup.name, setup.rate_hz, setup.g_m_s2, setup.lengths_m, theta, setup.tau_limit_nm)

@@ -82,12 +82,27 @@ class Command(NamedTuple):
     ramp: Ramp | None = None
 
 
+class Measured(NamedTuple):
+    """What an arm outside of the program was measured to do: q, rad, and qd, rad/s."""
+
+    q: Sequence[float]
+    qd: Sequence[float]
+
+
 class Tick(NamedTuple):
-    """One call of `Site.step`: its number, what came in since the one before, in order, and commands."""
+    """One call of `Site.step`.
+
+    Attributes:
+        k: its number.
+        arrivals: what came in since the one before, in order.
+        commands: what was ordered.
+        measured: of a site whose plant is external, its arm now; None: as it was.
+    """
 
     k: int
     arrivals: Sequence[Arrival] = ()
     commands: Sequence[Command] = ()
+    measured: Measured | None = None
 
 
 class Output(NamedTuple):
@@ -110,7 +125,8 @@ class Output(NamedTuple):
             tau_x; shows a changed input at its own tick.
         cmd: texts of the commands that it took in.
         mem: what the site remembers besides: empty in RUN and DIVERGED, else the pose that it holds, rad,
-            and when it began to return, ns since the epoch (0 where it does not yet).
+            and when it began to return, ns since the epoch (0 where it does not yet). A site with a law of
+            somebody's own has these always, and the law's memory behind them.
     """
 
     tick: int

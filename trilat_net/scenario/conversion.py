@@ -24,6 +24,7 @@ _CHOICES = {
     for kind, key in (
         (Scenario, "scheme"),
         (SiteSpec, "role"),
+        (SiteSpec, "plant"),
         (LinkBase, "order"),
         (Trace, "at_end"),
         (OnStale, "action"),

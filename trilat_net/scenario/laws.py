@@ -7,6 +7,7 @@ Symbols are the paper's; gains are diagonal, one number per joint or parameter.
 from ..core.arm import Array
 from ..core.setup import Gains, Law
 from .frozen import Frozen
+from .own_law import Own
 from .quantities import (
     LARGEST,
     NotNegative,
@@ -150,12 +151,13 @@ class ForceReflecting(Frozen, frozen=True, tag_field="law", tag="p_f"):
         return Gains(Law.KNOWN, known=(theta * self.gravity).tolist(), K=self.K, d=self.d, k_f=self.k_f)
 
 
-Control = Adaptive | AdaptiveBox | ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting
+Control = Adaptive | AdaptiveBox | ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting | Own
 LAWS: dict[str, type[Frozen]] = {
     "adaptive": Adaptive,
     "adaptive_box": AdaptiveBox,
     "p_d": ProportionalDamped,
     "pd_d": ProportionalDerivativeDamped,
     "p_f": ForceReflecting,
+    "own": Own,
 }
 """The laws by their names."""

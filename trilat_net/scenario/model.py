@@ -23,6 +23,7 @@ from .expectation import Expect
 from .frozen import Frozen
 from .link import LinkBase
 from .links import Link
+from .own_law import Own
 from .site import SiteSpec
 from .timeline import Change, later_links
 
@@ -149,6 +150,8 @@ class Scenario(Frozen, frozen=True, dict=True):
                 if change.dominance == site
             ),
             on_stale=spec.on_stale.rule,
+            external=spec.plant == "external",
+            own=spec.control.maker if isinstance(spec.control, Own) else None,
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:

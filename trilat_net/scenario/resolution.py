@@ -16,6 +16,7 @@ from .actors import HANDS, SURROUNDINGS
 from .connections import resolve_links, resolve_row, resolve_timeline
 from .expectation import Expect
 from .laws import LAWS
+from .own_law import CODE, source_sha256
 from .pushing import resolve_actors
 from .site import Arm, Limits, OnStale, SiteSpec
 from .tables import Table, fields, finite, known, one_of
@@ -44,6 +45,7 @@ _SITE = (
     "on_stale",
     "hands",
     "environment",
+    "plant",
 )
 _GROUPS: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
 _VECTORS = {
@@ -112,10 +114,26 @@ def _resolve_control(written: Any, default: Table, path: str) -> Table:
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
     law = str(written.get("law", default.get("law", "adaptive")))
-    one_of(law, list(LAWS), f"{path}.law")
+    if ":" in law:
+        return _resolve_own_law(law, written, default, path)
+    one_of(law, [*LAWS, "package.module:Law"], f"{path}.law")
     own = known(written, ("law", *fields(LAWS[law])), path)
     inherited = default if default.get("law", "adaptive") == law else {}
     return _vectors({**inherited, **own, "law": law})
+
+
+def _resolve_own_law(code: str, written: Table, default: Table, path: str) -> Table:
+    """Returns a law from outside, the hash of its file, and what it is made with."""
+    inherited = default if default.get("law") == code else {}
+    settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
+    if not re.fullmatch(CODE, code):
+        raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
+    return {
+        "law": "own",
+        "code": code,
+        "source_sha256": source_sha256(code, f"{path}.law"),
+        "settings": settings,
+    }
 
 
 def _unix_lines(value: Any) -> Any:
@@ -150,7 +168,7 @@ def _resolve_sites(tables: Table) -> Table:
         site.setdefault("qd0_rad_s", [0.0] * JOINTS)
         for group, kinds in (("hands", HANDS), ("environment", SURROUNDINGS)):
             site[group] = resolve_actors(site.get(group, []), kinds, site, f"{path}.{group}")
-        sites[name] = {key: site[key] for key in fields(SiteSpec)}
+        sites[name] = {key: site[key] for key in fields(SiteSpec) if key in site}
     if len(sites) < 2:
         raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")
     return sites

@@ -91,6 +91,7 @@ class SiteSpec(Frozen, frozen=True):
         on_stale: what it does about a peer whose samples are too old.
         hands: what its operator does.
         environment: what it meets.
+        plant: "simulated"; or "external": an arm outside of the program, whose measured state comes in.
     """
 
     role: Literal["master", "slave"]
@@ -103,3 +104,4 @@ class SiteSpec(Frozen, frozen=True):
     on_stale: OnStale = OnStale()
     hands: tuple[Hand, ...] = ()
     environment: tuple[Surrounding, ...] = ()
+    plant: Literal["simulated", "external"] = "simulated"
