@@ -60,7 +60,7 @@ class Own(Frozen, frozen=True, tag_field="law", tag="own"):
             ]
             if missing:
                 raise ScenarioError(
-                    f"{self.code} has no {', '.join(missing)}; docs/own-controller.md says what a law must do",
+                    f"{self.code} has no {', '.join(missing)}; see docs/own-controller.md",
                     path=f"sites.{facts.site}.control.law",
                 )
             return law
