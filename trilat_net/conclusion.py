@@ -61,19 +61,22 @@ def conclude(log: Log, folder: Path) -> Conclusion:
     Raises:
         LogError: a record cannot be read.
     """
-    from .analysis.report import write_report  # Matplotlib takes a second, and `verify` needs none of it
+    # Matplotlib takes a second, and `verify` needs none of it
+    from .analysis.report import write_report
+    from .certificate.section import section
 
     lines: list[VerdictLine] = []
     with _worker() as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(_check_file, log.source)
         twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
-        notes = run_lines(log)
+        certified = section(log)
+        notes = [*run_lines(log), f"certificate: {certified.facts['text']}"]
 
         def verdicts() -> Iterator[VerdictLine]:
             lines.extend(checking.result())
             yield from lines
 
-        made = write_report(log, folder, twin=twin, verdicts=verdicts())
+        made = write_report(log, folder, twin=twin, verdicts=verdicts(), sections=[certified])
     rows = [_row(log, site) for site in log.sites]
     return Conclusion(_COLUMNS, rows, notes, lines, [Path(log.source), *made])
 

@@ -16,6 +16,7 @@ COMMANDS = [
     ["test"],
     ["verify"],
     ["report"],
+    ["certify"],
     ["set", "link"],
     ["set", "dominance"],
     ["scenario", "list"],

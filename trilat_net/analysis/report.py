@@ -14,6 +14,7 @@ from typing import Any
 from ..log.reader import Log
 from . import charts, link_tables, motion, strip, style, tables, timing
 from .figures import write_figures
+from .section import Section, sections_html, write_sections
 from .summary import Facts, summarise
 from .tables import VerdictLine
 
@@ -52,7 +53,12 @@ _CLOCKS = "The sender's clock against the receiver's, as it was estimated while 
 
 
 def write_report(
-    log: Log, folder: Path, *, twin: Log | None = None, verdicts: Iterable[VerdictLine] = ()
+    log: Log,
+    folder: Path,
+    *,
+    twin: Log | None = None,
+    verdicts: Iterable[VerdictLine] = (),
+    sections: Sequence[Section] = (),
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
 
@@ -63,19 +69,27 @@ def write_report(
         folder: where to; made if it does not exist.
         twin: the same experiment with nobody at the arms, or None.
         verdicts: what was checked and how it came out.
+        sections: what is shown besides, from elsewhere.
     """
     folder.mkdir(parents=True, exist_ok=True)
     facts = summarise(log, twin)
-    figures = write_figures(log, folder, twin)
+    figures = [*write_figures(log, folder, twin), *write_sections(sections, folder)]
     lines = list(verdicts)
     checks = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    page.write_text(report_html(log, twin, lines, facts), encoding="utf-8")
-    numbers.write_text(_json({**facts, "checks": checks}, indent=2) + "\n", encoding="utf-8")
+    page.write_text(report_html(log, twin, lines, facts, sections), encoding="utf-8")
+    more = {section.key: section.facts for section in sections}
+    numbers.write_text(_json({**facts, **more, "checks": checks}, indent=2) + "\n", encoding="utf-8")
     return [page, numbers, *figures]
 
 
-def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], facts: Facts) -> str:
+def report_html(
+    log: Log,
+    twin: Log | None,
+    verdicts: Sequence[VerdictLine],
+    facts: Facts,
+    sections: Sequence[Section] = (),
+) -> str:
     """Returns the page of a log.
 
     Args:
@@ -83,6 +97,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         twin: the same experiment with nobody at the arms, or None.
         verdicts: what was checked and how it came out.
         facts: as from `summarise`.
+        sections: what is shown besides, from elsewhere.
     """
     scenario = log.scenario
     bounds = charts.bounds_m(log)
@@ -97,7 +112,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         loops=tables.loops_html(log, facts),
         links=_links(log, facts),
         strip=strip.arms_svg(log, bounds),
-        sections=_sections(log, data["charts"]),
+        sections=sections_html(sections) + _sections(log, data["charts"]),
         assumed=tables.assumed_html(scenario),
         again=tables.again_html(log),
         versions=tables.versions_html(log),
