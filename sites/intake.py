@@ -76,4 +76,4 @@ class Intake:
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._meters[index].take(sample, arrived_ns)
-        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000)
+        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x)

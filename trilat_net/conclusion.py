@@ -103,19 +103,24 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
     Raises:
         LogError: a record cannot be read.
     """
-    from .analysis.report import write_report  # Matplotlib takes a second, and `verify` needs none of it
+    # Matplotlib takes a second, and `verify` needs none of it
+    from .analysis.report import write_report
+    from .certificate.section import section
 
     lines: list[VerdictLine] = []
     with _worker() as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(_check_files, log.sources)
         twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
-        notes = run_lines(log)
+        certified = section(log)
+        notes = [*run_lines(log), f"certificate: {certified.facts['text']}"]
 
         def verdicts() -> Iterator[VerdictLine]:
             lines.extend(checking.result())
             yield from lines
 
-        made = write_report(log, folder, twin=twin, verdicts=verdicts(), progress=progress)
+        made = write_report(
+            log, folder, twin=twin, verdicts=verdicts(), progress=progress, sections=[certified]
+        )
     rows = [_row(log, site) for site in log.sites]
     return Conclusion(_COLUMNS, rows, notes, lines, [*map(Path, log.sources), *made])
 

@@ -71,5 +71,9 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
     """A run or a comparison that ended badly: diverged, a site died, records that differ."""
 
 
+class LawFailed(RunFailed):
+    """A control law of somebody's own that raised, or returned what is no torque."""
+
+
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
     """Ours: a state that the program itself must never reach."""

@@ -23,6 +23,7 @@ COMMANDS = [
     ["log", "recover"],
     ["log", "export"],
     ["log", "view"],
+    ["certify"],
     ["set", "link"],
     ["set", "dominance"],
     ["scenario", "list"],

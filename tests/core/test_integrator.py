@@ -8,18 +8,20 @@ from scipy.integrate import solve_ivp
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, speeds
 from trilat_net.core.arm import Links, parameters
-from trilat_net.core.exogenous import torque_on_arm
+from trilat_net.core.exogenous import Actor, Acts, rows_of
 from trilat_net.core.integrator import STAGE_ROWS, advance
 
 ARM = Links(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
-NOBODY = np.zeros((0, 4))
+LENGTHS = np.array([1.0, 0.9])
 G = 9.81
 
 
-def carried(q0: Array, qd0: Array, h_s: float, periods: int, u: Array, pulses: Array) -> tuple[Array, Array]:
+def carried(
+    q0: Array, qd0: Array, h_s: float, periods: int, u: Array, actors: tuple[Actor, ...] = ()
+) -> tuple[Array, Array]:
     q, qd, work = q0.copy(), qd0.copy(), np.zeros((STAGE_ROWS, 2))
     for k in range(periods):
-        advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, pulses, work)
+        advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, LENGTHS, *rows_of(actors), work)
     return q, qd
 
 
@@ -30,10 +32,11 @@ def energy(q: Array, qd: Array) -> float:
 @settings(max_examples=30)
 @given(q=angles, qd=physics.vectors(physics.st.floats(-3, 3)))
 def test_an_arm_that_is_left_alone_keeps_its_energy(q: Array, qd: Array) -> None:
-    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2), NOBODY)) == pytest.approx(energy(q, qd), abs=1e-5)
+    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(energy(q, qd), abs=1e-5)
 
 
 PULSES = np.array([[-0.1, 0.35, 12.0, -5.0], [0.0, 0.3, 1.0, 2.0]])
+HANDS = tuple(Actor(Acts.PULSE, start, end, a=tuple(peak)) for start, end, *peak in PULSES.tolist())
 SPAN_S = 0.1
 
 
@@ -47,7 +50,7 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 
     start = np.concatenate([q, qd])
     exact = solve_ivp(rate, (0.0, SPAN_S), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    made = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, PULSES)) for n in periods]
+    made = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
     return [float(np.abs(one - exact).max() / (1 + np.abs(exact).max())) for one in made]
 
 
@@ -67,25 +70,3 @@ def test_its_order_is_four() -> None:
         )
         orders.append(np.log2(coarse / fine))
     assert 3.8 < np.median(orders) < 4.2
-
-
-def test_a_pulse_is_zero_at_its_ends_full_in_the_middle_and_symmetric() -> None:
-    pulses = np.array([[1.0, 6.0, 10.0, -4.0]])
-    torque = np.empty(2)
-
-    def at(t_s: float) -> list[float]:
-        torque_on_arm(t_s, pulses, torque)
-        return torque.tolist()
-
-    assert at(0.5) == at(1.0) == at(6.0) == at(7.0) == [0.0, 0.0]
-    assert at(3.5) == pytest.approx([10.0, -4.0])
-    assert at(2.25) == pytest.approx([5.0, -2.0])
-    assert at(1.7) == pytest.approx(at(5.3))
-
-
-def test_pulses_add_up() -> None:
-    one, two = np.array([[1.0, 6.0, 10.0, -4.0]]), np.array([[2.0, 3.0, 5.0, 5.0]])
-    torques = np.empty((3, 2))
-    for row, pulses in zip(torques, (one, two, np.vstack([one, two])), strict=True):
-        torque_on_arm(2.4, pulses, row)
-    assert torques[2] == pytest.approx(torques[0] + torques[1])

@@ -73,13 +73,15 @@ def first(opcode: int) -> Frame:
     return frames(DATA, opcode)[0]
 
 
+ZSTD = bytes.fromhex("28b52ffd")
+"""How what Zstandard has packed begins."""
 STATISTICS, FOOTER = first(Opcode.STATISTICS), first(Opcode.FOOTER)
 CHUNK, CHUNK_INDEX = first(Opcode.CHUNK), first(Opcode.CHUNK_INDEX)
 WRONG: dict[str, tuple[bytes, set[str]]] = {
     "cut off": (DATA[:-3000], {"whole"}),
     "without its last mark": (DATA[:-8], {"whole"}),
     "more behind the end": (DATA + b"more", {"whole"}),
-    "a byte of a chunk": (poked(DATA, CHUNK.end - 20), {"records", "sequence"}),
+    "a byte of a chunk": (poked(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records", "sequence"}),
     "the checksum of a chunk": (poked(DATA, CHUNK.offset + HEAD + 24), {"checksums", "sequence"}),
     "a byte of the scenario": (poked(DATA, first(Opcode.ATTACHMENT).end - 99), {"checksums", "index"}),
     "a number in the statistics": (poked(DATA, STATISTICS.offset + HEAD), {"index", "checksums"}),

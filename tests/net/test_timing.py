@@ -24,7 +24,15 @@ NAMES = ("a", "b")
 
 def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> Sample:
     return Sample(
-        v=VERSION, site="x", boot=1, tick=tick, q=[0, 0], qd=[0, 0], sent_ns=sent_ns, echo=echo or []
+        v=VERSION,
+        site="x",
+        boot=1,
+        tick=tick,
+        q=[0, 0],
+        qd=[0, 0],
+        tau_x=[0, 0],
+        sent_ns=sent_ns,
+        echo=echo or [],
     )
 
 

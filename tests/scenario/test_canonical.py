@@ -83,7 +83,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
         one, other = scenario.setup(name), again.setup(name)
         assert [link.models for link in one.links] == [link.models for link in other.links]
         assert [link.key for link in one.links] == [link.key for link in other.links]
-        assert (one.ramps, one.on_stale, one.law) == (other.ramps, other.on_stale, other.law)
+        assert (one.ramps, one.on_stale, one.gains) == (other.ramps, other.on_stale, other.gains)
 
 
 @pytest.mark.parametrize("name", shipped())

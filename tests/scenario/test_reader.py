@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.core.delay import Model
-from trilat_net.core.setup import Law, Scheme, Stale, StaleRule
+from trilat_net.core.exogenous import Actor, Acts
+from trilat_net.core.setup import Gains, Law, Scheme, Stale, StaleRule
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load, override, parse, shipped, shipped_text, template_text
 
@@ -26,8 +27,10 @@ def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
 
 
 def test_what_is_shipped() -> None:
-    adaptive = ["asymmetric", "free", "paper", "paper_rods", "two_sites"]
-    assert shipped() == sorted([*adaptive, "4g", "handover", "jitter", "outage"])
+    adaptive = ["asymmetric", "free", "paper", "paper_rods", "two_sites", "lyapunov"]
+    links = ["4g", "handover", "jitter", "outage"]
+    laws = ["box", "contact", "p_d_margin", "training", "windup"]
+    assert shipped() == sorted([*adaptive, *links, *laws])
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -47,9 +50,8 @@ def test_paper_is_section_iv() -> None:
     assert scenario.alpha.tolist() == [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]
     m1 = scenario.setup("m1")
     assert m1.theta.tolist() == [3.0, 1.0, 1.0, 2.0, 1.0]
-    assert m1.pulses.tolist() == [[1.0, 6.0, 10.0, 10.0]]
-    assert (m1.Lambda.tolist(), m1.Kp.tolist(), m1.Kd.tolist()) == ([1, 1], [1, 1], [3, 3])
-    assert (m1.Gamma.tolist(), m1.theta_hat0.tolist()) == ([1] * 5, [0] * 5)
+    assert m1.actors == (Actor(Acts.PULSE, 1.0, 6.0, a=(10.0, 10.0)),)
+    assert m1.gains == Gains(Law.ADAPTIVE, (1, 1), (1, 1), (3, 3), (1,) * 5, (0,) * 5)
     assert [link.peer for link in m1.links] == ["m2", "s"]
     assert m1.links[0].models == (Model(location=200_000.0),)
 
@@ -137,12 +139,11 @@ def test_an_override_that_names_a_kind_replaces_what_the_file_says_of_another() 
 
 def test_an_override_of_the_law_takes_that_laws_gains() -> None:
     scenario = load("paper", ["control.law=p_d", "control.d=7"])
-    setup = scenario.setup("m1")
-    assert setup.law is Law.P_D
-    assert (setup.K.tolist(), setup.d.tolist()) == ([10.0, 10.0], [7.0, 7.0])
+    gains = scenario.setup("m1").gains
+    assert (gains.law, gains.K, gains.d) == (Law.KNOWN, (10.0, 10.0), (7.0, 7.0))
     assert refused(["control.law=p_d", "control.Kp=2"]).path == "control.Kp"
     mixed = load("paper", {"sites.s.control": {"law": "p_d"}})
-    assert [mixed.setup(name).law for name in mixed.names] == [Law.ADAPTIVE, Law.ADAPTIVE, Law.P_D]
+    assert [mixed.setup(name).gains.law for name in mixed.names] == [Law.ADAPTIVE, Law.ADAPTIVE, Law.KNOWN]
 
 
 def test_what_to_do_about_a_stale_peer() -> None:
@@ -196,7 +197,7 @@ def test_each_scheme_has_its_name() -> None:
 def test_without_hands_is_the_same_experiment_with_nobody_at_the_arms() -> None:
     scenario = load("paper").without_hands()
     assert all(spec.hands == () for spec in scenario.sites.values())
-    assert scenario.setup("m1").pulses.shape == (0, 4)
+    assert scenario.setup("m1").actors == ()
     assert scenario.sites["m1"].control == load("paper").sites["m1"].control
 
 

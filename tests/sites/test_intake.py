@@ -32,6 +32,7 @@ def payload(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
         "tick": tick,
         "q": [0.1 * tick, 0.2],
         "qd": [0.3, 0.4],
+        "tau_x": [0.5, 0.6],
         "sent_ns": tick * 1_000_000,
     }
     return msgpack.packb({**message, **changed})
@@ -141,7 +142,7 @@ def test_no_bytes_raise(sent: list[bytes]) -> None:
 
 @given(
     st.dictionaries(
-        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "sent_ns", "echo", "more"]),
+        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "tau_x", "sent_ns", "echo", "more"]),
         st.recursive(
             st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
             lambda inner: (

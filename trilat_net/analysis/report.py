@@ -15,6 +15,7 @@ from ..log.chunks import Progress
 from ..log.reader import Log
 from . import charts, link_tables, motion, strip, style, tables, timing
 from .figures import write_figures
+from .section import Section, sections_html, write_sections
 from .summary import Facts, summarise
 from .tables import VerdictLine
 
@@ -59,6 +60,7 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[VerdictLine] = (),
     progress: Progress | None = None,
+    sections: Sequence[Section] = (),
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
 
@@ -70,19 +72,27 @@ def write_report(
         twin: the same experiment with nobody at the arms, or None.
         verdicts: what was checked and how it came out.
         progress: told how many figures are drawn, and how many there are.
+        sections: what is shown besides, from elsewhere.
     """
     folder.mkdir(parents=True, exist_ok=True)
     facts = summarise(log, twin)
-    figures = write_figures(log, folder, twin, progress)
+    figures = [*write_figures(log, folder, twin, progress), *write_sections(sections, folder)]
     lines = list(verdicts)
     checks = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    page.write_text(report_html(log, twin, lines, facts), encoding="utf-8")
-    numbers.write_text(_json({**facts, "checks": checks}, indent=2) + "\n", encoding="utf-8")
+    page.write_text(report_html(log, twin, lines, facts, sections), encoding="utf-8")
+    more = {section.key: section.facts for section in sections}
+    numbers.write_text(_json({**facts, **more, "checks": checks}, indent=2) + "\n", encoding="utf-8")
     return [page, numbers, *figures]
 
 
-def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], facts: Facts) -> str:
+def report_html(
+    log: Log,
+    twin: Log | None,
+    verdicts: Sequence[VerdictLine],
+    facts: Facts,
+    sections: Sequence[Section] = (),
+) -> str:
     """Returns the page of a log.
 
     Args:
@@ -90,6 +100,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         twin: the same experiment with nobody at the arms, or None.
         verdicts: what was checked and how it came out.
         facts: as from `summarise`.
+        sections: what is shown besides, from elsewhere.
     """
     scenario = log.scenario
     bounds = charts.bounds_m(log)
@@ -104,7 +115,7 @@ def report_html(log: Log, twin: Log | None, verdicts: Sequence[VerdictLine], fac
         loops=tables.loops_html(log, facts),
         links=_links(log, facts),
         strip=strip.arms_svg(log, bounds),
-        sections=_sections(log, data["charts"]),
+        sections=sections_html(sections) + _sections(log, data["charts"]),
         assumed=tables.assumed_html(scenario),
         again=tables.again_html(log),
         versions=tables.versions_html(log),

@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 from ..errors import TrilatError
 from ..interrupt import Interrupt
-from . import changes, log, logs, pings, replays, reruns, routers, scenarios, sessions, trials
+from . import certificates, changes, log, logs, pings, replays, reruns, routers, scenarios, sessions, trials
 from .options import err
 
 
@@ -50,6 +50,7 @@ app.add_typer(sessions.app)
 app.add_typer(routers.app)
 app.add_typer(pings.app)
 app.add_typer(logs.app)
+app.add_typer(certificates.app)
 app.add_typer(replays.app)
 app.add_typer(reruns.app)
 app.add_typer(log.app, name="log")

@@ -190,3 +190,33 @@ def forward_kinematics(l1_m: float, l2_m: float, q: Array, xy: Array) -> None:
     xy[0, 1] = l1_m * math.sin(q[0])
     xy[1, 0] = xy[0, 0] + l2_m * math.cos(q[0] + q[1])
     xy[1, 1] = xy[0, 1] + l2_m * math.sin(q[0] + q[1])
+
+
+@leaf
+def tip(lengths: Array, q: Array, xy: Array) -> None:
+    """Writes where the tip is, shape (2,), m, base at the origin.
+
+    Args:
+        lengths: of the two links, shape (2,), m.
+        q: joint angles, shape (2,), rad.
+        xy: where the result goes, shape (2,).
+    """
+    xy[0] = lengths[0] * math.cos(q[0]) + lengths[1] * math.cos(q[0] + q[1])
+    xy[1] = lengths[0] * math.sin(q[0]) + lengths[1] * math.sin(q[0] + q[1])
+
+
+@leaf
+def tip_jacobian(lengths: Array, q: Array, J: Array) -> None:
+    """Writes how the tip moves with the joints, shape (2, 2), m/rad: rows x and y, columns the joints.
+
+    Args:
+        lengths: of the two links, shape (2,), m.
+        q: joint angles, shape (2,), rad.
+        J: where the result goes, shape (2, 2).
+    """
+    outer_x = lengths[1] * math.cos(q[0] + q[1])
+    outer_y = lengths[1] * math.sin(q[0] + q[1])
+    J[0, 0] = -lengths[0] * math.sin(q[0]) - outer_y
+    J[0, 1] = -outer_y
+    J[1, 0] = lengths[0] * math.cos(q[0]) + outer_x
+    J[1, 1] = outer_x

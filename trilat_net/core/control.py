@@ -1,11 +1,12 @@
-"""The control laws: the paper's adaptive one, split where its equations are, and P+d.
+"""The control laws: the paper's adaptive one, split where its equations are, and the classics beside it.
 
 Law: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-order
 update explicit.
 
-Source: Eq. (9)-(13), (15) of the paper; P+d after Nuno, Basanez, Ortega and Spong, "Position Tracking for
-Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009). Gains are diagonal
-and stand as vectors.
+Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
+Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009); direct
+force reflection after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE Trans. Robotics
+and Automation 9 (1993). Gains are diagonal and stand as vectors.
 """
 
 from .arm import Array, gravity
@@ -83,26 +84,61 @@ def torque(
 
 
 @leaf
-def p_d_torque(
-    theta: Array, g: float, K: Array, d: Array, q: Array, qd: Array, e: Array, limit: float, tau: Array
-) -> None:
-    """Writes tau = G(q) - K e - d qd, held within +-limit: P+d with known gravity.
+def project(theta_hat: Array, low: Array, high: Array) -> None:
+    """Holds every parameter within its box, shape (p,) each, in place.
 
-    For N sites with equal K and d per joint and one constant delay T, the linearised loop is stable from
-    d = abs(lambda_min(alpha)) K T on.
+    For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)' Gamma^-1 (theta_hat -
+    theta) rise, so that V' <= 0 stands.
+    """
+    for p in range(theta_hat.shape[0]):
+        if theta_hat[p] < low[p]:
+            theta_hat[p] = low[p]
+        elif theta_hat[p] > high[p]:
+            theta_hat[p] = high[p]
+
+
+@leaf
+def damped_torque(
+    theta: Array,
+    g: float,
+    K: Array,
+    d: Array,
+    Kd: Array,
+    k_f: Array,
+    q: Array,
+    qd: Array,
+    e: Array,
+    ed: Array,
+    felt: Array,
+    limit: float,
+    tau: Array,
+) -> None:
+    """Writes tau = G(q) - K e - d qd - Kd ed + k_f felt, held within +-limit: the laws that know gravity.
+
+    P+d has Kd = k_f = 0. For N sites with equal K and d per joint and one constant delay T its linearised
+    loop is stable from d = abs(lambda_min(alpha)) K T on, for two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1
+    K_2. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the slave, d and k_f at the master.
 
     Args:
-        theta: true parameters, shape (5,).
+        theta: the parameters that the law takes the arm to have, shape (5,).
         g: gravitational acceleration, m/s^2.
         K: stiffness, shape (n,), N m/rad.
-        d: damping, shape (n,), N m s/rad.
+        d: damping of the arm's own velocity, shape (n,), N m s/rad.
+        Kd: damping of the error's velocity, shape (n,), N m s/rad.
+        k_f: share of what the peers feel, shape (n,).
         q: joint angles, shape (n,), rad.
         qd: joint velocities, shape (n,), rad/s.
         e: position error, shape (n,), rad.
+        ed: its derivative, shape (n,), rad/s.
+        felt: the torque on the peers' arms as it came, weighted by dominance, shape (n,), N m.
         limit: largest torque of a joint, N m.
         tau: control torque, shape (n,), N m; written.
     """
     gravity(theta, g, q, tau)
     for i in range(tau.shape[0]):
         total = tau[i] - K[i] * e[i] - d[i] * qd[i]
+        if Kd[i] != 0.0:
+            total -= Kd[i] * ed[i]
+        if k_f[i] != 0.0:
+            total += k_f[i] * felt[i]
         tau[i] = min(max(total, -limit), limit)

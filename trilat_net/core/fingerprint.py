@@ -10,10 +10,11 @@ from functools import cache
 
 import numpy as np
 
-from .arm import Array, Links, parameters
+from .arm import PARAMETERS, Array, Links, parameters
 from .delay import Delay, Model
+from .exogenous import Actor, Acts
 from .jit import leaf
-from .setup import Law, LinkSetup, Scheme, SiteSetup
+from .setup import Gains, Law, LinkSetup, Scheme, SiteSetup
 from .site import Site
 from .tick import Arrival, Tick
 
@@ -34,21 +35,22 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         name=name,
         rate_hz=1000,
         scheme=Scheme.SECOND_ORDER,
-        law=Law.ADAPTIVE,
+        gains=Gains(
+            Law.ADAPTIVE,
+            Lambda=(1.0, 1.3),
+            Kp=(1.0, 0.7),
+            Kd=(3.0, 2.1),
+            Gamma=(1.0,) * PARAMETERS,
+            theta_hat0=(0.3 * theta).tolist(),
+        ),
         theta=theta,
         g_m_s2=9.81,
-        Lambda=np.array([1.0, 1.3]),
-        Kp=np.array([1.0, 0.7]),
-        Kd=np.array([3.0, 2.1]),
-        Gamma=np.ones(5),
-        theta_hat0=0.3 * theta,
-        K=np.zeros(2),
-        d=np.zeros(2),
+        lengths_m=(1.0, 0.9),
         tau_limit_nm=200.0,
         qd_limit_rad_s=100.0,
         q0=q0,
         qd0=(0.1, -0.2),
-        pulses=np.array([[0.01, 0.15, 3.0, 2.0]]),
+        actors=(Actor(Acts.PULSE, 0.01, 0.15, a=(3.0, 2.0)),),
         links=(LinkSetup(peer, 1.0, 1000, (0.0, 0.0), 7, (_LINK,)),),
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from . import control
 from .arm import JOINTS, PARAMETERS, Array, regressor
 from .delay import Points, Row
-from .exogenous import torque_on_arm
+from .exogenous import Actors, Table, torque_on_arm
 from .grid import tick_ns
 from .integrator import STAGE_ROWS, advance
 from .jit import leaf
@@ -30,6 +30,7 @@ SITE = np.dtype(
             ("rate_hz", "i8"),
             ("scheme", "i8"),
             ("law", "i8"),
+            ("external", "i8"),
             ("ramps", "i8"),
             ("on_stale", "i8"),
             ("stale_ns", "i8"),
@@ -42,8 +43,13 @@ SITE = np.dtype(
             ("Kp", "f8", _VECTOR),
             ("Kd", "f8", _VECTOR),
             ("Gamma", "f8", (PARAMETERS,)),
+            ("low", "f8", (PARAMETERS,)),
+            ("high", "f8", (PARAMETERS,)),
+            ("known", "f8", (PARAMETERS,)),
             ("K", "f8", _VECTOR),
             ("d", "f8", _VECTOR),
+            ("k_f", "f8", _VECTOR),
+            ("lengths", "f8", (2,)),
             # the state
             ("mode", "i8"),
             ("q", "f8", _VECTOR),
@@ -59,7 +65,9 @@ SITE = np.dtype(
             ("q_des", "f8", _VECTOR),
             ("qd_des", "f8", _VECTOR),
             ("q_followed", "f8", _VECTOR),
+            ("felt", "f8", _VECTOR),
             ("on_arm", "f8", _VECTOR),
+            ("held", "f8", _VECTOR),
             ("e", "f8", _VECTOR),
             ("ed", "f8", _VECTOR),
             ("r", "f8", _VECTOR),
@@ -81,7 +89,7 @@ ROW_FLOATS = 6 * JOINTS + PARAMETERS
 
 _DIVERGED = int(Mode.DIVERGED)
 _DIGITAL = int(Scheme.DIGITAL)
-_P_D = int(Law.P_D)
+_ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
 
 
 @leaf
@@ -95,11 +103,13 @@ def _reference(t_ns: int, site: Row, links: Rows, ramps: Array) -> None:
     site.q_followed[:] = site.q_des
     site.q_des[:] = 0.0
     site.qd_des[:] = 0.0
+    site.felt[:] = 0.0
     for j in range(links.shape[0]):
         link: Row = links[j]
         for i in range(site.q_des.shape[0]):
             site.q_des[i] += link.alpha * link.q[i]
             site.qd_des[i] += link.alpha * link.qd[i]
+            site.felt[i] -= link.alpha * link.tau_x[i]
             if link.alpha_rate != 0.0:
                 site.qd_des[i] += link.alpha_rate * link.q[i]
     mind_stale_peers(t_ns, site, links)
@@ -108,22 +118,24 @@ def _reference(t_ns: int, site: Row, links: Rows, ramps: Array) -> None:
 @leaf
 def _estimate(k: int, site: Row) -> None:
     """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
-    if site.scheme == _DIGITAL or k == 0 or site.mode == _DIVERGED or site.law == _P_D:
+    if site.scheme == _DIGITAL or k == 0 or site.mode == _DIVERGED or site.law != _ADAPTIVE:
         return
     half_s = 0.5 / site.rate_hz
     for p in range(site.Yr.shape[0]):
         site.theta_hat[p] -= half_s * site.Gamma[p] * (site.Yr_before[p] + site.Yr[p])
+    control.project(site.theta_hat, site.low, site.high)
 
 
 @leaf
 def _torque(site: Row) -> None:
     """Stage 6: the torque of the site's law."""
-    if site.law == _P_D:
-        control.p_d_torque(
-            site.theta, site.g, site.K, site.d, site.q, site.qd, site.e, site.tau_limit, site.tau
+    s = site
+    if s.law == _ADAPTIVE:
+        control.torque(s.Y, s.theta_hat, s.Kp, s.Kd, s.r, s.ed, s.tau_limit, s.tau)
+    elif s.law != _OWN:
+        control.damped_torque(
+            s.known, s.g, s.K, s.d, s.Kd, s.k_f, s.q, s.qd, s.e, s.ed, s.felt, s.tau_limit, s.tau
         )
-    else:
-        control.torque(site.Y, site.theta_hat, site.Kp, site.Kd, site.r, site.ed, site.tau_limit, site.tau)
 
 
 @leaf
@@ -178,7 +190,17 @@ def _emit(site: Row, row: Array) -> None:
 
 
 @leaf
-def _advance(k: int, site: Row, pulses: Array) -> None:
+def _feel(t_ns: int, site: Row, actors: Actors, table: Table) -> None:
+    """Writes what acts on the arm now, and what of it is held over the tick."""
+    s, t_s, work = site, t_ns * 1e-9, site.work[8:14]
+    torque_on_arm(t_s, s.q, s.qd, s.lengths, actors, table, 1, work, s.held)
+    torque_on_arm(t_s, s.q, s.qd, s.lengths, actors, table, 0, work, s.on_arm)
+    for i in range(s.on_arm.shape[0]):
+        s.on_arm[i] += s.held[i]
+
+
+@leaf
+def _advance(k: int, site: Row, actors: Actors, table: Table) -> None:
     """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
     h_s = 1.0 / site.rate_hz
     for i in range(site.u.shape[0]):
@@ -187,16 +209,20 @@ def _advance(k: int, site: Row, pulses: Array) -> None:
         else:
             ahead = 1.5 * site.tau[i] - 0.5 * site.tau_before[i]
             site.u[i] = min(max(ahead, -site.tau_limit), site.tau_limit)
+        site.u[i] += site.held[i]
     site.q_kept[:] = site.q
     site.qd_kept[:] = site.qd
     t_s = tick_ns(k, site.rate_hz) * 1e-9
-    advance(t_s, h_s, site.q, site.qd, site.u, site.theta, site.g, pulses, site.work)
+    if site.external == 0:
+        s = site
+        advance(t_s, h_s, s.q, s.qd, s.u, s.theta, s.g, s.lengths, actors, table, s.work)
     if not _finite(site):
         site.q[:] = site.q_kept
         site.qd[:] = site.qd_kept
         site.mode = _DIVERGED
-    if site.scheme == _DIGITAL and site.law != _P_D:
+    if site.scheme == _DIGITAL and site.law == _ADAPTIVE:
         control.estimate(site.theta_hat, h_s, site.Gamma, site.Yr)
+        control.project(site.theta_hat, site.low, site.high)
     site.tau_before[:] = site.tau
     site.Yr_before[:] = site.Yr
 
@@ -212,6 +238,7 @@ def site_accept(
     calendars: Ticks,
     points: Points,
     arrivals: Rows,
+    forces: Array,
 ) -> None:
     """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
     rate_hz = site[0].rate_hz
@@ -219,7 +246,44 @@ def site_accept(
         arrival: Row = arrivals[n]
         j = arrival.peer
         tick, q, qd = arrival.tick, arrival.q, arrival.qd
-        accept(k, rate_hz, tick, q, qd, links[j], models[j], samples[j], calendars[j], points)
+        accept(k, rate_hz, tick, q, qd, forces[n], links[j], models[j], samples[j], calendars[j], points)
+
+
+@leaf
+def site_look(
+    k: int,
+    count: int,
+    site: Rows,
+    links: Rows,
+    models: Rows,
+    samples: Rows,
+    calendars: Ticks,
+    points: Points,
+    ramps: Array,
+    arrivals: Rows,
+    forces: Array,
+) -> None:
+    """Stages 1 to 5 of a tick: what came in, the reference, the errors, the estimate; see `site_tick`."""
+    s: Row = site[0]
+    t_ns = tick_ns(k, s.rate_hz)
+    site_accept(k, count, site, links, models, samples, calendars, points, arrivals, forces)  # 1 accept
+    for j in range(links.shape[0]):  # 2 recall
+        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
+    _reference(t_ns, s, links, ramps)  # 3 reference
+    _errors_and_regressor(s)  # 4 errors
+    _estimate(k, s)  # 5 estimate
+
+
+@leaf
+def site_act(k: int, site: Rows, actors: Actors, table: Table, row: Array) -> None:
+    """Stages 7 and 8 of a tick, with the torque in place: the record, and the way to the next tick."""
+    s: Row = site[0]
+    _feel(tick_ns(k, s.rate_hz), s, actors, table)
+    if not _within_limits(s):
+        s.mode = _DIVERGED
+    _emit(s, row)  # 7 emit
+    if s.mode != _DIVERGED:  # 8 advance
+        _advance(k, s, actors, table)
 
 
 @leaf
@@ -234,7 +298,9 @@ def site_tick(
     points: Points,
     ramps: Array,
     arrivals: Rows,
-    pulses: Array,
+    forces: Array,
+    actors: Actors,
+    table: Table,
     row: Array,
 ) -> None:
     """Computes one tick of one site; what `Site.step` and the virtual-time kernel both call.
@@ -250,30 +316,21 @@ def site_tick(
         points: traces and outages, shape (n, 2).
         ramps: how shares change, shape (R, 2 + P), see `shares`.
         arrivals: what came in, shape (MAX_ARRIVALS,), dtype ARRIVAL.
-        pulses: the operator's torque, see `exogenous`.
+        forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, n), N m.
+        actors: operators and environments, shape (A,), dtype ACTOR.
+        table: their recorded torques.
         row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
     """
-    s: Row = site[0]
-    t_ns = tick_ns(k, s.rate_hz)
-    site_accept(k, count, site, links, models, samples, calendars, points, arrivals)  # 1 accept
-    for j in range(links.shape[0]):  # 2 recall
-        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
-    _reference(t_ns, s, links, ramps)  # 3 reference
-    _errors_and_regressor(s)  # 4 errors
-    _estimate(k, s)  # 5 estimate
-    _torque(s)  # 6 torque
-    torque_on_arm(t_ns * 1e-9, pulses, s.on_arm)
-    if not _within_limits(s):
-        s.mode = _DIVERGED
-    _emit(s, row)  # 7 emit
-    if s.mode != _DIVERGED:  # 8 advance
-        _advance(k, s, pulses)
+    site_look(k, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
+    _torque(site[0])  # 6 torque
+    site_act(k, site, actors, table, row)
 
 
 @leaf
-def site_resume(k: int, site: Rows, pulses: Array) -> None:
+def site_resume(k: int, site: Rows, actors: Actors, table: Table) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
     s: Row = site[0]
     _errors_and_regressor(s)
+    _feel(tick_ns(k, s.rate_hz), s, actors, table)
     if s.mode != _DIVERGED:
-        _advance(k, s, pulses)
+        _advance(k, s, actors, table)

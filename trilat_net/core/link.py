@@ -31,6 +31,7 @@ LINK = np.dtype(
             ("used", "i8"),
             ("q", "f8", (JOINTS,)),
             ("qd", "f8", (JOINTS,)),
+            ("tau_x", "f8", (JOINTS,)),
             # its channel
             ("key", "u8"),
             ("models", "i8"),
@@ -55,7 +56,16 @@ LINK = np.dtype(
 # One page per sample: when the sample of that index is due, and the sample that waits there with its own
 # tick (-1: none) and the peer's joint state.
 SAMPLE = np.dtype(
-    (np.record, [("due_ns", "i8"), ("tick", "i8"), ("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,))])
+    (
+        np.record,
+        [
+            ("due_ns", "i8"),
+            ("tick", "i8"),
+            ("q", "f8", (JOINTS,)),
+            ("qd", "f8", (JOINTS,)),
+            ("tau_x", "f8", (JOINTS,)),
+        ],
+    )
 )
 
 AHEAD_LIMIT_S = 10
@@ -95,6 +105,7 @@ def accept(
     tick: int,
     q: Array,
     qd: Array,
+    tau_x: Array,
     link: Row,
     models: Rows,
     samples: Rows,
@@ -109,6 +120,7 @@ def accept(
         tick: the sample's own tick, at the peer's rate.
         q: the peer's joint angles, shape (n,), rad.
         qd: the peer's joint velocities, shape (n,), rad/s.
+        tau_x: the exogenous torque of its record, shape (n,), N m.
         link: the link's row, dtype LINK.
         models: what its channel does, shape (M,), dtype MODEL.
         samples: where samples wait, shape (pages,), dtype SAMPLE.
@@ -140,6 +152,7 @@ def accept(
     slot.tick = tick
     slot.q[:] = q
     slot.qd[:] = qd
+    slot.tau_x[:] = tau_x
     if tick <= link.used:  # filed all the same: so that it is known when it comes again
         link.superseded += 1
         return
@@ -177,5 +190,6 @@ def recall(
         link.used = newest
         link.q[:] = slot.q
         link.qd[:] = slot.qd
+        link.tau_x[:] = slot.tau_x
     else:
         link.superseded += 1

@@ -3,11 +3,15 @@
 Law: nothing else influences a site's numbers.
 """
 
+import math
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from .arm import Array
+from .arm import JOINTS, PARAMETERS, Array
 from .delay import Model, Points
+from .exogenous import Actor
+from .own import OwnLawMaker
 from .tick import Ramp
 
 
@@ -25,11 +29,14 @@ class Scheme(IntEnum):
 class Law(IntEnum):
     """The control law of a site.
 
-    ADAPTIVE is the paper's, Eq. (13) and (15). P_D knows gravity: tau = G(q) - K e - d qd.
+    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate held in a box where one is given. KNOWN
+    knows gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force reflection.
+    OWN is somebody's own, in Python.
     """
 
     ADAPTIVE = 0
-    P_D = 1
+    KNOWN = 1
+    OWN = 2
 
 
 class Stale(IntEnum):
@@ -82,6 +89,38 @@ class LinkSetup(NamedTuple):
     outages: tuple[tuple[int, int], ...] = ()
 
 
+class Gains(NamedTuple):
+    """A law and its numbers, diagonal gains as vectors; those of other laws are without effect.
+
+    Attributes:
+        law: which law.
+        Lambda: shape (n,), 1/s.
+        Kp: shape (n,), N m s/rad.
+        Kd: shape (n,), N m s/rad.
+        Gamma: adaptation gain per parameter, shape (5,).
+        theta_hat0: the first estimate, shape (5,).
+        low: least that each estimate may be, shape (5,).
+        high: most that it may be, shape (5,).
+        known: the parameters that KNOWN takes the arm to have, shape (5,).
+        K: stiffness of KNOWN, shape (n,), N m/rad.
+        d: damping of KNOWN, shape (n,), N m s/rad.
+        k_f: share of what the peers feel, of KNOWN, shape (n,).
+    """
+
+    law: Law
+    Lambda: Sequence[float] = (1.0,) * JOINTS
+    Kp: Sequence[float] = (0.0,) * JOINTS
+    Kd: Sequence[float] = (0.0,) * JOINTS
+    Gamma: Sequence[float] = (0.0,) * PARAMETERS
+    theta_hat0: Sequence[float] = (0.0,) * PARAMETERS
+    low: Sequence[float] = (-math.inf,) * PARAMETERS
+    high: Sequence[float] = (math.inf,) * PARAMETERS
+    known: Sequence[float] = (0.0,) * PARAMETERS
+    K: Sequence[float] = (0.0,) * JOINTS
+    d: Sequence[float] = (0.0,) * JOINTS
+    k_f: Sequence[float] = (0.0,) * JOINTS
+
+
 class SiteSetup(NamedTuple):
     """All that a site is built from; nothing else influences its numbers.
 
@@ -89,44 +128,36 @@ class SiteSetup(NamedTuple):
         name: the site's name.
         rate_hz: tick rate, Hz.
         scheme: how the law is sampled.
-        law: which law; the gains of the others are without effect.
+        gains: the law and its numbers.
         theta: true parameters of the arm, shape (5,).
         g_m_s2: gravitational acceleration, m/s^2.
-        Lambda: shape (n,), 1/s.
-        Kp: shape (n,), N m s/rad.
-        Kd: shape (n,), N m s/rad.
-        Gamma: adaptation gain per parameter, shape (5,).
-        theta_hat0: the first estimate, shape (5,).
-        K: stiffness of P_D, shape (n,), N m/rad.
-        d: damping of P_D, shape (n,), N m s/rad.
+        lengths_m: of the two links.
         tau_limit_nm: largest control torque of a joint, N m.
         qd_limit_rad_s: joint speed beyond which the run has left the physics, rad/s.
         q0: start pose, rad.
         qd0: start velocity, rad/s.
-        pulses: the operator's torque pulses, shape (P, 2 + n), see `exogenous`.
+        actors: operators and environments.
         links: the peers in scenario order.
         ramps: scripted changes of the shares, in the order of their starts.
         on_stale: what to do about a stale peer.
+        external: whether the arm is outside of the program; then it is measured, and nothing is integrated.
+        own: makes the law where it is somebody's own.
     """
 
     name: str
     rate_hz: int
     scheme: Scheme
-    law: Law
+    gains: Gains
     theta: Array
     g_m_s2: float
-    Lambda: Array
-    Kp: Array
-    Kd: Array
-    Gamma: Array
-    theta_hat0: Array
-    K: Array
-    d: Array
+    lengths_m: tuple[float, float]
     tau_limit_nm: float
     qd_limit_rad_s: float
     q0: tuple[float, ...]
     qd0: tuple[float, ...]
-    pulses: Array
+    actors: tuple[Actor, ...]
     links: tuple[LinkSetup, ...]
     ramps: tuple[Ramp, ...] = ()
     on_stale: StaleRule = StaleRule()
+    external: bool = False
+    own: OwnLawMaker | None = None

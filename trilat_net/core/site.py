@@ -15,9 +15,11 @@ import numpy as np
 from .arm import JOINTS
 from .channel import LOST
 from .delay import MODEL, Delay, Model, Row
+from .exogenous import rows_of
 from .grid import NS_PER_S
-from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_resume, site_tick
+from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_act, site_look, site_resume, site_tick
 from .link import LINK, SAMPLE, calendar_pages, release_tick
+from .own import Facts, Now, OwnLaw, asked, recalled
 from .setup import Law, LinkSetup, SiteSetup
 from .shares import RAMP_COLUMNS
 from .tick import MAX_ARRIVALS, Arrival, Command, LinkCounts, Mode, Output, Ramp, Tick
@@ -48,26 +50,35 @@ class Site:
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
+        self._external = setup.external
         self._site = np.zeros(1, SITE)
-        self._pulses = np.ascontiguousarray(setup.pulses, dtype=np.float64)
+        self._actors, self._table = rows_of(setup.actors)
         self._row = np.zeros(ROW_FLOATS)
         self._arrivals = np.zeros(MAX_ARRIVALS, ARRIVAL)
         self._arrival_bytes = self._arrivals.view(np.uint8).data
+        self._forces = np.zeros((MAX_ARRIVALS, JOINTS))
+        self._force_bytes = self._forces.view(np.uint8).reshape(-1).data
+        self._own = None if setup.own is None else setup.own(_facts(setup))
+        self._reflects = any(setup.gains.k_f) or self._own is not None
         self._fill(setup)
         self._connect(setup.links)
         self._share(setup)
 
     def _fill(self, setup: SiteSetup) -> None:
         s: Row = self._site[0]
-        s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, int(setup.scheme), int(setup.law), _RUN
+        s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, int(setup.scheme), int(setup.gains.law), _RUN
         s.g, s.tau_limit, s.qd_limit = setup.g_m_s2, setup.tau_limit_nm, setup.qd_limit_rad_s
+        s.external = int(setup.external)
         rule = setup.on_stale
         s.on_stale, s.stale_ns, s.return_ns = int(rule.action), rule.age_ns, rule.return_ns
-        for name in ("theta", "Lambda", "Kp", "Kd", "Gamma", "K", "d"):
-            s[name] = getattr(setup, name)
-        s.q, s.qd, s.theta_hat = setup.q0, setup.qd0, setup.theta_hat0
-        if setup.law is Law.P_D:
-            s.theta_hat = setup.theta  # it knows them
+        s.lengths = setup.lengths_m
+        s.theta = setup.theta
+        gains = setup.gains
+        for name in gains._fields[1:]:
+            if name != "theta_hat0":
+                s[name] = getattr(gains, name)
+        s.q, s.qd = setup.q0, setup.qd0
+        s.theta_hat = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
 
     def _connect(self, links: Sequence[LinkSetup]) -> None:
         peers = len(links)
@@ -142,11 +153,15 @@ class Site:
 
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals, or MAX_COMMANDS commands.
+            LawFailed: a law of somebody's own did.
         """
         taken = self._pack(tick.arrivals)
         for command in tick.commands:
             self.order(command)
-        site_tick(
+        if tick.measured is not None and self._external:
+            s: Row = self._site[0]
+            s.q, s.qd = tick.measured
+        looked = (
             tick.k,
             len(tick.arrivals),
             self._site,
@@ -157,9 +172,15 @@ class Site:
             self._points,
             self._ramps,
             self._arrivals,
-            self._pulses,
-            self._row,
+            self._forces,
         )
+        own: list[float] = []
+        if self._own is None:
+            site_tick(*looked, self._actors, self._table, self._row)
+        else:
+            site_look(*looked)
+            own = self._ask(self._own, tick.k)
+            site_act(tick.k, self._site, self._actors, self._table, self._row)
         row = self._row.tolist()
         n = JOINTS
         mode = self._site["mode"].item()
@@ -175,10 +196,26 @@ class Site:
             row[5 * n : 6 * n],
             row[6 * n :],
             self._links["used"].tolist(),
-            zlib.crc32(self._arrival_bytes[:taken]),
+            self._crc(taken, len(tick.arrivals)),
             [command.text for command in tick.commands],
-            [] if mode in (_RUN, _DIVERGED) else self._memory(),
+            [] if mode in (_RUN, _DIVERGED) and self._own is None else self._memory() + own,
         )
+
+    def _ask(self, law: OwnLaw, k: int) -> list[float]:
+        """Stage 6 of a law of somebody's own: takes its torque and estimate in, and returns its memory."""
+        s: Row = self._site[0]
+        vectors = (s.q, s.qd, s.q_des, s.qd_des, s.felt)
+        now = Now(k, k / self.rate_hz, 1.0 / self.rate_hz, *(vector.tolist() for vector in vectors))
+        torque, estimate, memory = asked(law, self.name, now)
+        limit = float(s.tau_limit)
+        s.tau = [min(max(value, -limit), limit) for value in torque]
+        s.theta_hat = estimate
+        return memory
+
+    def _crc(self, taken: int, arrivals: int) -> int:
+        """Returns `Output.rx_crc`."""
+        crc = zlib.crc32(self._arrival_bytes[:taken])
+        return zlib.crc32(self._force_bytes[: arrivals * 8 * JOINTS], crc) if self._reflects else crc
 
     def _memory(self) -> list[float]:
         """Returns `Output.mem` of a site that holds, brakes or returns."""
@@ -222,7 +259,9 @@ class Site:
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:JOINTS], int(last.mem[JOINTS])
-        site_resume(last.tick, self._site, self._pulses)
+        if self._own is not None:
+            recalled(self._own, self.name, last.mem[JOINTS + 1 :])
+        site_resume(last.tick, self._site, self._actors, self._table)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
         """Puts the links where they were before tick k: what is in use, and what waits to be.
@@ -242,9 +281,10 @@ class Site:
             # the channel's memory is a function of what went before
             link.foreseen, link.model, link.due_before = -1, 0, 0
             if sample is None:
-                link.used, link.q, link.qd = -1, start, 0.0
+                link.used, link.q, link.qd, link.tau_x = -1, start, 0.0, 0.0
             else:
                 link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
+                link.tau_x = sample.tau_x
         self._pack(waiting)
         site_accept(
             k,
@@ -256,6 +296,7 @@ class Site:
             self._calendars,
             self._points,
             self._arrivals,
+            self._forces,
         )
 
     def _pack(self, arrivals: Sequence[Arrival]) -> int:
@@ -263,7 +304,16 @@ class Site:
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
         offset = 0
-        for peer, tick, q, qd, _ in arrivals:
+        for peer, tick, q, qd, _, _ in arrivals:
             _PACK_ARRIVAL(self._arrival_bytes, offset, peer, tick, *q, *qd)
             offset += _PACK_ARRIVAL_SIZE
+        if self._reflects:
+            for n, arrival in enumerate(arrivals):
+                self._forces[n] = arrival.tau_x
         return offset
+
+
+def _facts(setup: SiteSetup) -> Facts:
+    """Returns what a law may know of its site."""
+    theta = tuple(float(value) for value in setup.theta)
+    return Facts(setup.name, setup.rate_hz, setup.g_m_s2, setup.lengths_m, theta, setup.tau_limit_nm)

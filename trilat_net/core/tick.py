@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+from .arm import JOINTS
 from .delay import Model
 
 MAX_ARRIVALS = 4096
 """Most arrivals that one tick takes in; a driver leaves the rest for the next one."""
+
+
+_NOTHING = (0.0,) * JOINTS
 
 
 class Mode(IntEnum):
@@ -37,6 +41,7 @@ class Arrival(NamedTuple):
         q: the peer's joint angles, rad.
         qd: its joint velocities, rad/s.
         latency_us: how long it was under way, microseconds; telemetry, enters no formula.
+        tau_x: the exogenous torque of the peer's record, N m; laws that reflect force use it.
     """
 
     peer: int
@@ -44,6 +49,7 @@ class Arrival(NamedTuple):
     q: Sequence[float]
     qd: Sequence[float]
     latency_us: int = 0
+    tau_x: Sequence[float] = _NOTHING
 
 
 class Ramp(NamedTuple):
@@ -76,12 +82,27 @@ class Command(NamedTuple):
     ramp: Ramp | None = None
 
 
+class Measured(NamedTuple):
+    """What an arm outside of the program was measured to do: q, rad, and qd, rad/s."""
+
+    q: Sequence[float]
+    qd: Sequence[float]
+
+
 class Tick(NamedTuple):
-    """One call of `Site.step`: its number, what came in since the one before, in order, and commands."""
+    """One call of `Site.step`.
+
+    Attributes:
+        k: its number.
+        arrivals: what came in since the one before, in order.
+        commands: what was ordered.
+        measured: of a site whose plant is external, its arm now; None: as it was.
+    """
 
     k: int
     arrivals: Sequence[Arrival] = ()
     commands: Sequence[Command] = ()
+    measured: Measured | None = None
 
 
 class Output(NamedTuple):
@@ -100,10 +121,12 @@ class Output(NamedTuple):
         theta_hat: estimate of the parameters.
         used: tick of the sample in use, per peer in scenario order; -1 before the first.
         rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian
-            (peer i64, tick i64, q f64s, qd f64s) each; shows a changed input at its own tick.
+            (peer i64, tick i64, q f64s, qd f64s) each, and behind them, where the law reflects force, their
+            tau_x; shows a changed input at its own tick.
         cmd: texts of the commands that it took in.
         mem: what the site remembers besides: empty in RUN and DIVERGED, else the pose that it holds, rad,
-            and when it began to return, ns since the epoch (0 where it does not yet).
+            and when it began to return, ns since the epoch (0 where it does not yet). A site with a law of
+            somebody's own has these always, and the law's memory behind them.
     """
 
     tick: int

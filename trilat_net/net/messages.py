@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from ..core.arm import JOINTS, PARAMETERS
+from ..core.own import MAX_MEMORY
 
 VERSION = 3
 """What is sent, and all that is accepted from others."""
@@ -81,7 +82,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rx: list[Stamp]
     rx_crc: U64
     cmd: list[str]
-    mem: Annotated[list[float], Meta(max_length=JOINTS + 1)]
+    mem: Annotated[list[float], Meta(max_length=JOINTS + 1 + MAX_MEMORY)]
     late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
     sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
@@ -97,6 +98,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     tick: TickNumber
     q: list[float]
     qd: list[float]
+    tau_x: list[float]
     sent_ns: Instant = 0
     echo: list[Stamp] = []
 
@@ -294,9 +296,10 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     boots: dict[str, int] = {}
 
 
-SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS}
+SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS, "tau_x": JOINTS}
 STATE_VECTORS = {
-    **SAMPLE_VECTORS,
+    "q": JOINTS,
+    "qd": JOINTS,
     "q_des": JOINTS,
     "qd_des": JOINTS,
     "tau": JOINTS,

@@ -140,7 +140,7 @@ class Execution:
                 return arrivals, Difference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
             sample = self._by_tick[peer].get(tick)
             if sample is not None:
-                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us))
+                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x))
             elif 0 <= tick <= self._ends[peer]:
                 self._resumption.lacking[peer].add(tick)
                 lacking = Difference(state.site, state.tick, "", tick, None)

@@ -32,11 +32,15 @@ class Pose(Protocol):
     def qd(self) -> Sequence[float]:
         """Joint velocities, rad/s."""
 
+    @property
+    def tau_x(self) -> Sequence[float]:
+        """The torque of hands and surroundings, N m."""
+
 
 def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
     """Returns a record as `Site.step` returned it."""
     modes = {mode.name.lower(): mode for mode in Mode}
-    mem = state.mem if len(state.mem) == JOINTS + 1 else []
+    mem = state.mem if len(state.mem) > JOINTS else []
     used = [state.used.get(peer, -1) for peer in peers]
     return Output(
         state.tick,
@@ -90,13 +94,13 @@ class Resumption:
         waiting: list[Arrival] = []
         for j, used in enumerate(last.used):
             sample = self._samples[j].get(used)
-            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd))
+            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd, 0, sample.tau_x))
             # one that is older than the sample in use comes into use no more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
             certain, self.assumed[j] = self._came_before(n, j, used, site.peer_rate_hz(j))
             for tick in sorted(certain | self.assumed[j]):
                 if (came := self._samples[j].get(tick)) is not None:
-                    waiting.append(Arrival(j, tick, came.q, came.qd))
+                    waiting.append(Arrival(j, tick, came.q, came.qd, 0, came.tau_x))
                 else:
                     self.lacking[j].add(tick)
         site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])

@@ -1,6 +1,9 @@
 """From resolved tables to types; what does not fit becomes an error with the key's path."""
 
+import math
 import re
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, get_args
 
 import msgspec
@@ -8,10 +11,11 @@ import msgspec
 from ..core.arm import positive_definite
 from ..errors import ScenarioError
 from . import expectation
+from .actors import Hand, Recorded, Spring, Surrounding, TipSpring, Wall
 from .link import LinkBase
 from .links import Constant, Link, Trace
 from .model import Scenario
-from .site import OnStale, Pulse, SiteSpec
+from .site import OnStale, SiteSpec
 from .tables import Table
 from .timeline import Change
 
@@ -20,7 +24,7 @@ _CHOICES = {
     for kind, key in (
         (Scenario, "scheme"),
         (SiteSpec, "role"),
-        (Pulse, "kind"),
+        (SiteSpec, "plant"),
         (LinkBase, "order"),
         (Trace, "at_end"),
         (OnStale, "action"),
@@ -42,12 +46,8 @@ def convert(resolved: Table) -> Scenario:
                 "its inertia matrix is singular in some pose: give the links mass away from their joints",
                 path=f"sites.{name}.arm",
             )
-        for n, pulse in enumerate(site.hands):
-            if pulse.end_s <= pulse.start_s:
-                raise ScenarioError(
-                    f"must be later than start_s = {pulse.start_s:g}, is {pulse.end_s:g}",
-                    path=f"sites.{name}.hands[{n}].end_s",
-                )
+        _check_actors(site.hands, f"sites.{name}.hands")
+        _check_actors(site.environment, f"sites.{name}.environment")
     for name, link in scenario.links.items():
         if found := link.fault():
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
@@ -59,6 +59,27 @@ def convert(resolved: Table) -> Scenario:
         key, problem = expected
         raise ScenarioError(problem, path=f"expect.{key}")
     return scenario
+
+
+def _check_actors(actors: Sequence[Hand | Surrounding], path: str) -> None:
+    """Refuses what ends before it begins, a wall without a side, and recorded torque out of order."""
+    for n, actor in enumerate(actors):
+        if isinstance(actor, Recorded):
+            if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
+                raise ScenarioError("must be in the order of their times", path=f"{path}[{n}].points")
+            continue
+        if actor.end_s <= actor.start_s:
+            raise ScenarioError(
+                f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}",
+                path=f"{path}[{n}].end_s",
+            )
+        if isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
+            raise ScenarioError("must point somewhere, is zero", path=f"{path}[{n}].normal")
+        if isinstance(actor, Spring | TipSpring) and actor.move_end_s < actor.move_start_s:
+            raise ScenarioError(
+                f"must not be before move_start_s = {actor.move_start_s:g}, is {actor.move_end_s:g}",
+                path=f"{path}[{n}].move_end_s",
+            )
 
 
 def _spelt(change: Change) -> Change:

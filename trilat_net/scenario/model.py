@@ -17,15 +17,24 @@ from msgspec import Meta
 from ..core import dominance
 from ..core.arm import Array
 from ..core.draw import link_key
-from ..core.setup import Law, LinkSetup, Scheme, SiteSetup
+from ..core.setup import LinkSetup, Scheme, SiteSetup
 from ..core.tick import Ramp
 from .expectation import Expect
 from .frozen import Frozen
 from .link import LinkBase
 from .links import Link
-from .site import Adaptive, ProportionalDamped, SiteSpec
+from .own_law import Own
+from .site import SiteSpec
 from .timeline import Change, later_links
 
+_UNASKED: dict[str, tuple[Any, ...]] = {
+    "timeline": ((), []),
+    "expect": ({},),
+    "on_stale": ({},),
+    "environment": ((), []),
+    "plant": ("simulated",),
+}
+"""Keys that older scenarios do not have, and the values that say nothing."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 
 
@@ -87,8 +96,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         words = {key: value for key, value in words.items() if value}
         for table in (tables, *tables["sites"].values()):
-            for key in ("timeline", "expect", "on_stale"):  # what nobody asked for is not there
-                if not table.get(key, True):
+            for key, unasked in _UNASKED.items():  # what nobody asked for is not there
+                if table.get(key) in unasked:
                     del table[key]
         numbers = _NUMBERS.sub(_one_line, tomli_w.dumps(tables))
         return tomli_w.dumps(words, multiline_strings=True) + numbers
@@ -124,28 +133,19 @@ class Scenario(Frozen, frozen=True, dict=True):
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
         spec = self.sites[site]
-        c = spec.control
-        adaptive = c if isinstance(c, Adaptive) else Adaptive()
-        p_d = c if isinstance(c, ProportionalDamped) else ProportionalDamped()
         return SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
             scheme=Scheme[self.scheme.upper()],
-            law=Law.ADAPTIVE if c is adaptive else Law.P_D,
+            gains=spec.control.gains(spec.arm.theta),
             theta=spec.arm.theta,
             g_m_s2=spec.arm.g_m_s2,
-            Lambda=np.array(adaptive.Lambda),
-            Kp=np.array(adaptive.Kp),
-            Kd=np.array(adaptive.Kd),
-            Gamma=np.array(adaptive.Gamma),
-            theta_hat0=np.array(adaptive.theta_hat0),
-            K=np.array(p_d.K),
-            d=np.array(p_d.d),
+            lengths_m=(spec.arm.l1_m, spec.arm.l2_m),
             tau_limit_nm=spec.limits.tau_limit_nm,
             qd_limit_rad_s=spec.limits.qd_limit_rad_s,
             q0=spec.q0_rad,
             qd0=spec.qd0_rad_s,
-            pulses=np.array([[p.start_s, p.end_s, *p.peak_nm] for p in spec.hands]).reshape(-1, 4),
+            actors=tuple(one.actor for one in (*spec.hands, *spec.environment)),
             links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
             ramps=tuple(
                 self.ramp(site, change.shares, change.start_ns, change.ramp_s)
@@ -153,6 +153,8 @@ class Scenario(Frozen, frozen=True, dict=True):
                 if change.dominance == site
             ),
             on_stale=spec.on_stale.rule,
+            external=spec.plant == "external",
+            own=spec.control.maker if isinstance(spec.control, Own) else None,
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:

@@ -12,9 +12,13 @@ import msgspec
 
 from ..core.arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
+from .actors import HANDS, SURROUNDINGS
 from .connections import resolve_links, resolve_row, resolve_timeline
 from .expectation import Expect
-from .site import LAWS, Arm, Limits, OnStale, Pulse, SiteSpec
+from .laws import LAWS
+from .own_law import CODE, source_sha256
+from .pushing import resolve_actors
+from .site import Arm, Limits, OnStale, SiteSpec
 from .tables import Table, fields, finite, known, one_of
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -30,7 +34,19 @@ _TABLES = (
     "timeline",
     "expect",
 )
-_SITE = ("role", "rate_hz", "q0_rad", "qd0_rad_s", "arm", "control", "limits", "on_stale", "hands")
+_SITE = (
+    "role",
+    "rate_hz",
+    "q0_rad",
+    "qd0_rad_s",
+    "arm",
+    "control",
+    "limits",
+    "on_stale",
+    "hands",
+    "environment",
+    "plant",
+)
 _GROUPS: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
 _VECTORS = {
     "Lambda": JOINTS,
@@ -40,9 +56,11 @@ _VECTORS = {
     "d": JOINTS,
     "q0_rad": JOINTS,
     "qd0_rad_s": JOINTS,
-    "peak_nm": JOINTS,
+    "k_f": JOINTS,
     "Gamma": PARAMETERS,
     "theta_hat0": PARAMETERS,
+    "theta_low": PARAMETERS,
+    "theta_high": PARAMETERS,
 }
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
@@ -98,10 +116,26 @@ def _resolve_control(written: Any, default: Table, path: str) -> Table:
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
     law = str(written.get("law", default.get("law", "adaptive")))
-    one_of(law, list(LAWS), f"{path}.law")
+    if ":" in law:
+        return _resolve_own_law(law, written, default, path)
+    one_of(law, [*LAWS, "package.module:Law"], f"{path}.law")
     own = known(written, ("law", *fields(LAWS[law])), path)
     inherited = default if default.get("law", "adaptive") == law else {}
     return _vectors({**inherited, **own, "law": law})
+
+
+def _resolve_own_law(code: str, written: Table, default: Table, path: str) -> Table:
+    """Returns a law from outside, the hash of its file, and what it is made with."""
+    inherited = default if default.get("law") == code else {}
+    settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
+    if not re.fullmatch(CODE, code):
+        raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
+    return {
+        "law": "own",
+        "code": code,
+        "source_sha256": source_sha256(code, f"{path}.law"),
+        "settings": settings,
+    }
 
 
 def _unix_lines(value: Any) -> Any:
@@ -134,11 +168,9 @@ def _resolve_sites(tables: Table) -> Table:
         site.setdefault("rate_hz", tables.get("rate_hz", 1000))
         site.setdefault("q0_rad", [0.0] * JOINTS)
         site.setdefault("qd0_rad_s", [0.0] * JOINTS)
-        hands = site.get("hands", [])
-        if not isinstance(hands, list):
-            raise ScenarioError(f"must be a list of tables [[{path}.hands]]", path=f"{path}.hands")
-        site["hands"] = [_vectors(known(h, fields(Pulse), f"{path}.hands[{n}]")) for n, h in enumerate(hands)]
-        sites[name] = {key: site[key] for key in fields(SiteSpec)}
+        for group, kinds in (("hands", HANDS), ("environment", SURROUNDINGS)):
+            site[group] = resolve_actors(site.get(group, []), kinds, site, f"{path}.{group}")
+        sites[name] = {key: site[key] for key in fields(SiteSpec) if key in site}
     if len(sites) > MAX_SITES:
         raise ScenarioError(f"has {len(sites)} sites, at most {MAX_SITES} are taken", path="sites")
     if len(sites) < 2:

@@ -1,4 +1,4 @@
-"""What an author says of one manipulator: arm, law, limits, operator, and what to do about a silent peer.
+"""What an author says of one manipulator: arm, law, limits, who pushes it, what to do about a silent peer.
 
 Law: keys end in their unit; symbols are the paper's.
 """
@@ -9,20 +9,10 @@ from msgspec import Meta
 
 from ..core.arm import Array, Links, parameters
 from ..core.setup import Stale, StaleRule
+from .actors import Hand, Surrounding
 from .frozen import Frozen
-
-LARGEST = 1e9
-"""Beyond this no quantity of an arm, a gain or a torque is meant; arithmetic stays far from its limits."""
-
-Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
-NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
-Real = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-Joints = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
-PositiveJoints = Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)]
-NotNegativeJoints = Annotated[tuple[NotNegative, ...], Meta(min_length=2, max_length=2)]
-Parameters = Annotated[tuple[Real, ...], Meta(min_length=5, max_length=5)]
-NotNegativeParameters = Annotated[tuple[NotNegative, ...], Meta(min_length=5, max_length=5)]
-Rate = Annotated[int, Meta(ge=1, le=20_000)]
+from .laws import Control
+from .quantities import Joints, NotNegative, Positive, Rate
 
 
 class Arm(Frozen, frozen=True):
@@ -56,41 +46,6 @@ class Arm(Frozen, frozen=True):
         return parameters(Links(**{name: getattr(self, name) for name in Links._fields}))
 
 
-class Adaptive(Frozen, frozen=True, tag_field="law", tag="adaptive"):
-    """The paper's adaptive law, Eq. (13) and (15), and its gains, all diagonal.
-
-    Attributes:
-        Lambda: per joint, 1/s.
-        Kp: per joint, N m s/rad.
-        Kd: per joint, N m s/rad.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
-    """
-
-    Lambda: PositiveJoints = (1.0, 1.0)
-    Kp: PositiveJoints = (1.0, 1.0)
-    Kd: NotNegativeJoints = (3.0, 3.0)
-    Gamma: NotNegativeParameters = (1.0,) * 5
-    theta_hat0: Parameters = (0.0,) * 5
-
-
-class ProportionalDamped(Frozen, frozen=True, tag_field="law", tag="p_d"):
-    """P+d with known gravity: tau = G(q) - K e - d qd.
-
-    Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping per joint, N m s/rad.
-    """
-
-    K: PositiveJoints = (10.0, 10.0)
-    d: NotNegativeJoints = (3.0, 3.0)
-
-
-Control = Adaptive | ProportionalDamped
-LAWS: dict[str, type[Frozen]] = {"adaptive": Adaptive, "p_d": ProportionalDamped}
-"""The laws by their names."""
-
-
 class OnStale(Frozen, frozen=True, omit_defaults=True):
     """What a site does about a peer whose sample in use is too old.
 
@@ -122,22 +77,6 @@ class Limits(Frozen, frozen=True):
     qd_limit_rad_s: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 100.0
 
 
-class Pulse(Frozen, frozen=True):
-    """A smooth push of an operator: peak * sin^2(pi (t - start) / (end - start)), ON the arm.
-
-    Attributes:
-        kind: "pulse".
-        start_s: when it begins, s after the epoch.
-        end_s: when it ends, s after the epoch.
-        peak_nm: its peak on each joint, N m.
-    """
-
-    kind: Literal["pulse"]
-    start_s: NotNegative
-    end_s: Positive
-    peak_nm: Joints
-
-
 class SiteSpec(Frozen, frozen=True):
     """One manipulator.
 
@@ -151,6 +90,8 @@ class SiteSpec(Frozen, frozen=True):
         limits: where it stops.
         on_stale: what it does about a peer whose samples are too old.
         hands: what its operator does.
+        environment: what it meets.
+        plant: "simulated"; or "external": an arm outside of the program, whose measured state comes in.
     """
 
     role: Literal["master", "slave"]
@@ -161,4 +102,6 @@ class SiteSpec(Frozen, frozen=True):
     control: Control
     limits: Limits
     on_stale: OnStale = OnStale()
-    hands: tuple[Pulse, ...] = ()
+    hands: tuple[Hand, ...] = ()
+    environment: tuple[Surrounding, ...] = ()
+    plant: Literal["simulated", "external"] = "simulated"

@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 
 from ..errors import ScenarioError
+from .laws import LAWS
 from .links import LINKS
 from .model import Scenario
 from .presets import PRESETS
-from .site import LAWS, Arm, Limits, OnStale
+from .site import Arm, Limits, OnStale
 from .tables import fields, known, nearest
 
 _PLAIN: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}

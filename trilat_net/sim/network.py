@@ -59,7 +59,7 @@ class PromptNetwork:
             while queue and queue[0].t_ns < now_ns:
                 sample = queue.popleft()
                 latency_us = (now_ns - sample.t_ns) // 1000
-                arrivals.append(Arrival(index, sample.tick, sample.q, sample.qd, latency_us))
+                arrivals.append(Arrival(index, sample.tick, sample.q, sample.qd, latency_us, sample.tau_x))
         return arrivals
 
 
@@ -98,5 +98,5 @@ class RecordedNetwork:
         for index, tick, latency_us in self._listed(receiver, k):
             sample = self._sent.get((self._peers[receiver][index], tick))
             if sample is not None:
-                arrivals.append(Arrival(index, tick, sample.q, sample.qd, latency_us))
+                arrivals.append(Arrival(index, tick, sample.q, sample.qd, latency_us, sample.tau_x))
         return arrivals

@@ -176,7 +176,7 @@ class Actor:
         for peer, tick, delay_us in self.listed:
             sample = self._samples[peer].get(tick)
             if sample is not None:
-                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, delay_us))
+                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, delay_us, sample.tau_x))
                 continue
             whole = False
             self.lacking += 1

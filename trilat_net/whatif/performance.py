@@ -29,6 +29,7 @@ class Sample(NamedTuple):
 
     q: list[float]
     qd: list[float]
+    tau_x: list[float]
 
 
 class Recent:
@@ -47,7 +48,7 @@ class Recent:
 
     def take(self, output: Output) -> None:
         """Remembers a sample."""
-        self.samples[output.tick] = Sample(output.q, output.qd)
+        self.samples[output.tick] = Sample(output.q, output.qd, output.tau_x)
         if len(self.samples) > self._most:
             del self.samples[next(iter(self.samples))]
 

@@ -1,0 +1,129 @@
+"""Certificates of logs of every kind: other laws, gaps, old versions, torn and empty files."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.analysis import logs
+from trilat_net.certificate.certificate import NO_COMMON_TIME, certify
+from trilat_net.certificate.growth import Motion
+from trilat_net.certificate.premises import unjudged_spans
+from trilat_net.certificate.verdict import Finding
+from trilat_net.errors import LogError
+from trilat_net.scenario import load
+
+from . import runs
+
+GOLDEN = sorted((Path(__file__).parent.parent / "golden").glob("v*.mcap"))
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+def test_every_released_version_is_certified(path: Path) -> None:
+    found = certify(trilat_net.open_log(path))
+    assert found.balance is not None
+    assert found.verdict.finding in (Finding.COVERED, Finding.ROSE)
+    assert np.abs(found.balance.unexplained).max() <= 1e-3 * found.balance.scale
+
+
+@pytest.mark.parametrize(
+    ("d", "motion", "passed"), [(0.2, Motion.DIVERGED, False), (2.5, Motion.CONVERGED, True)]
+)
+def test_a_law_without_a_functional_is_judged_by_growth_alone(d: float, motion: Motion, passed: bool) -> None:
+    law = {"control.law": "p_d", "control.K": 10.0, "control.d": d, "duration_s": 15.0, "rate_hz": 200}
+    found = certify(trilat_net.simulate(load("free", law)))
+    assert found.verdict.finding is Finding.NOT_JUDGED
+    assert "there is no such functional" in found.verdict.text
+    assert found.growth.motion is motion
+    assert found.passed is passed
+
+
+def test_an_arm_outside_of_the_program_has_no_theta() -> None:
+    log = runs.log("free", {"duration_s": 1.0, "rate_hz": 200, "sites.s.plant": "external"})
+    found = certify(log)
+    assert found.verdict.finding is Finding.NOT_JUDGED
+    assert "s: an arm outside of the program: theta is unknown" in found.verdict.text
+
+
+def test_gaps_are_left_out_and_told_of() -> None:
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0})
+    log = logs.rewritten(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
+    found = certify(log)
+    assert found.balance is not None
+    assert found.verdict.finding is Finding.COVERED
+    assert "not judged: 0.995 to 1.35 s" in found.verdict.text
+    assert found.balance.relative <= 1e-3
+    assert unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]  # s looks back by 150 ms
+
+
+def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
+    """Whatever was lost, nobody is accused for what lies in the gap."""
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    for site in whole.sites:
+        found = certify(
+            logs.rewritten(whole, lambda s, site=site: not (s.site == site and 50 <= s.tick < 450))
+        )
+        assert found.verdict.finding is not Finding.BROKEN
+
+
+def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes() -> None:
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
+    assert found.balance is not None
+    assert found.verdict.finding is Finding.COVERED
+    assert found.balance.t_s[0] == pytest.approx(
+        1.205
+    )  # what is under way then was sent since the first record
+    assert found.balance.relative <= 1e-3
+
+
+@pytest.mark.parametrize("ticks", [0, 1])
+def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
+    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
+    assert found.verdict.text == NO_COMMON_TIME
+    assert found.growth.motion is Motion.UNDECIDED
+    assert not found.passed
+
+
+def test_two_records_are_a_period() -> None:
+    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < 2))
+    assert found.balance is not None
+    assert len(found.balance.t_s) == 2
+
+
+def test_nobody_moves_and_there_is_no_energy() -> None:
+    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by it."""
+    rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
+    found = runs.certified("paper", rest)
+    assert found.balance is not None
+    assert found.balance.V[0] == 0.0
+    assert found.balance.relative <= 1e-3
+    assert found.verdict.finding is Finding.COVERED
+
+
+def test_sites_of_different_rates_are_booked_together() -> None:
+    rates = {"sites.m2.rate_hz": 250, "sites.s.rate_hz": 350, "rate_hz": 500, "duration_s": 4.0}
+    found = runs.certified("asymmetric", rates)
+    assert found.balance is not None
+    assert len(found.balance.t_s) == pytest.approx(2000, abs=5)
+    assert found.balance.relative <= 2e-4
+    assert found.verdict.finding in (Finding.DID_NOT_RISE, Finding.ROSE)
+
+
+def test_a_command_is_a_change_like_a_scripted_one() -> None:
+    found = certify(logs.busy().log)
+    assert found.balance is not None
+    assert found.balance.relative <= 5e-3
+    assert found.verdict.finding is not Finding.BROKEN
+
+
+def test_a_change_that_is_none_is_the_files_fault() -> None:
+    with pytest.raises(LogError, match="a command that is none"):
+        certify(
+            logs.rewritten(
+                logs.simulated("paper"),
+                change=lambda s: msgspec.structs.replace(s, cmd=["{}"] if s.tick == 5 else []),
+            )
+        )

@@ -1,0 +1,55 @@
+"""`trilat certify`: words, numbers, and an exit code for CI."""
+
+import json
+from pathlib import Path
+
+from .running import trilat
+
+
+def recorded(folder: Path, *settings: str, scenario: str = "free", seconds: str = "2") -> str:
+    options = [word for setting in settings for word in ("--set", setting)]
+    trilat("sim", scenario, "--duration", seconds, "-o", "run.mcap", *options, cwd=folder)
+    return "run.mcap"
+
+
+def test_a_covered_run_ends_with_0(tmp_path: Path) -> None:
+    printed = trilat("certify", recorded(tmp_path, "rate_hz=200"), cwd=tmp_path).succeeds()
+    assert "certificate: covered by the theorem: V did not rise" in printed
+    assert "constant on every link: 200 ms" in printed
+    assert "energy balance: off by at most" in printed
+    assert "taken: disagreement" in printed
+
+
+def test_json_is_for_programs(tmp_path: Path) -> None:
+    printed = trilat("certify", "--json", recorded(tmp_path, "rate_hz=200"), cwd=tmp_path).succeeds()
+    facts = json.loads(printed)
+    assert facts["verdict"] == "covered"
+    assert facts["passed"] is True
+
+
+def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
+    file = recorded(tmp_path, "rate_hz=200", "limits.qd_limit_rad_s=0.5")
+    done = trilat("certify", file, cwd=tmp_path)
+    assert done.code == 1
+    assert done.err == ""
+    assert "e and qd: diverged at" in done.out
+
+
+def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
+    done = trilat("certify", recorded(tmp_path, "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
+    assert done.code == 1
+    assert "undecided (record longer)" in done.out
+    assert "there is no such functional" in done.out
+
+
+def test_what_is_no_log_ends_with_2(tmp_path: Path) -> None:
+    (tmp_path / "no.mcap").write_bytes(b"no log")
+    trilat("certify", "no.mcap", cwd=tmp_path).refuses("no.mcap")
+    trilat("certify", "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
+
+
+def test_report_tells_of_it(tmp_path: Path) -> None:
+    file = recorded(tmp_path, "rate_hz=200", scenario="two_sites", seconds="1")
+    printed = trilat("report", file, cwd=tmp_path).succeeds()
+    assert "certificate: covered by the theorem" in printed
+    assert (tmp_path / "run" / "certificate.png").is_file()

@@ -1,0 +1,44 @@
+"""Laws from outside, for tests: the paper's once more, in Python, and some that fail."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from trilat_net.core import control
+from trilat_net.core.arm import regressor
+from trilat_net.core.own import Facts, Now
+
+
+class Adaptive:
+    """Eq. (13) and (15) with the trapezoid rule, by the same leaves as the built-in law."""
+
+    def __init__(self, facts: Facts, Lambda: float = 1.0, Kp: float = 1.0, Kd: float = 3.0) -> None:
+        self._facts = facts
+        self._Lambda, self._Kp, self._Kd = (np.full(2, gain) for gain in (Lambda, Kp, Kd))
+        self._Yr = np.zeros(5)
+        self.theta_hat = np.zeros(5)
+
+    def torque(self, now: Now) -> Sequence[float]:
+        q, qd, q_des, qd_des = map(np.array, (now.q, now.qd, now.q_des, now.qd_des))
+        e, ed, r, Yr, tau, Y = (
+            np.zeros(2),
+            np.zeros(2),
+            np.zeros(2),
+            np.zeros(5),
+            np.zeros(2),
+            np.zeros((2, 5)),
+        )
+        control.errors(q, qd, q_des, qd_des, self._Lambda, e, ed, r)
+        regressor(self._facts.g_m_s2, q, qd, -self._Lambda * e, -self._Lambda * ed, Y)
+        control.regressor_transpose_times(Y, r, Yr)
+        if now.k:
+            self.theta_hat = self.theta_hat - 0.5 / self._facts.rate_hz * (self._Yr + Yr)
+        self._Yr = Yr
+        control.torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm, tau)
+        return tau.tolist()
+
+    def memory(self) -> Sequence[float]:
+        return [*self._Yr, *self.theta_hat]
+
+    def recall(self, memory: Sequence[float]) -> None:
+        self._Yr, self.theta_hat = np.array(memory[:5]), np.array(memory[5:])

@@ -1,0 +1,116 @@
+"""The figure of a certificate: V, what it is made of, who changed it, and how well that adds up.
+
+Law: energies in J over the time of the whole run; what was not judged is shaded, the largest rise is marked.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..analysis import style
+from ..analysis.marks import Marks
+from ..core.arm import Array
+from ..log.reader import Log
+from .balance import Balance
+from .certificate import Certificate
+from .premises import unjudged_spans
+
+_PARTS = {
+    "kinetic": "r'Mr / 2",
+    "parameter": "parameter error",
+    "position": "e'ΛKd e / 2",
+    "delay": "under way",
+}
+_TAKEN = {"damping": "taken: r'Kp r", "disagreement": "taken: disagreement"}
+_COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
+_TOTAL: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.6}
+_RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
+_UNJUDGED: dict[str, Any] = {"color": style.FAINT, "alpha": 0.3, "linewidth": 0.0, "zorder": 0.3}
+_HEIGHTS = (1.5, 1.2, 1.3, 1.0)
+
+
+def functional_over_time(log: Log, certificate: Certificate) -> Figure:
+    """Returns V with its sites, its parts, dissipation and work, and the residual of the balance, J.
+
+    Args:
+        log: the log.
+        certificate: its certificate.
+    """
+    balance = certificate.balance
+    if balance is None:
+        return style.says(certificate.verdict.text)
+    marks = Marks(log)
+    with style.paper():
+        figure = style.new_figure(6.4)
+        rows = style.panels(figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
+        _functional(log, balance, rows[0])
+        _parts(balance, rows[1])
+        _work(balance, rows[2])
+        _residual(balance, rows[3])
+        for axes in rows:
+            marks.draw(axes, log.sites)
+            for from_s, to_s in unjudged_spans(balance):
+                axes.axvspan(from_s, to_s, **_UNJUDGED)
+        rise = certificate.verdict.rise
+        if rise is not None:
+            rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
+            rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
+        style.time_axis(log, [rows[-1]])
+        style.legend(figure, [*style.site_entries(log, log.sites), ("V", _TOTAL)])
+        marks.explain(figure)
+    return figure
+
+
+def _draw(balance: Balance, axes: Axes, values: Array, **options: Any) -> None:
+    style.draw(axes, np.arange(len(balance.t_s)), balance.t_s, values, **options)
+
+
+def _functional(log: Log, balance: Balance, axes: Axes) -> None:
+    _draw(balance, axes, balance.V, **_TOTAL)
+    for site, values in balance.sites.items():
+        _draw(balance, axes, values, **style.line(log, site, 1.0))
+    axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
+
+
+def _parts(balance: Balance, axes: Axes) -> None:
+    for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
+        _draw(balance, axes, values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
+    axes.set_ylabel("parts of V (J)")
+    _entries(axes)
+
+
+def _entries(axes: Axes) -> None:
+    """Puts a legend above the lines."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.35 * (high - low))
+    axes.legend(loc="upper left", ncols=4, fontsize=6.5)
+
+
+def _work(balance: Balance, axes: Axes) -> None:
+    for (name, values), line in zip(balance.taken.items(), style.DASHES, strict=False):
+        _draw(balance, axes, values, label=_TAKEN[name], color=style.REFERENCE, linestyle=line)
+    links = np.sum([x for name, x in balance.given.items() if "->" in name], axis=0)
+    given = {name: x for name, x in balance.given.items() if "->" not in name}
+    shown = {"hands": given.pop("hands"), "walls": given.pop("walls"), "links": links, **given}
+    shown["sampling"] = balance.sampling
+    least = 1e-4 * balance.scale
+    for (name, values), colour in zip(shown.items(), (*_COLOURS, *_COLOURS), strict=False):
+        if np.abs(values).max() > least:
+            _draw(balance, axes, values, label=f"work: {name}", color=colour)
+    _entries(axes)
+    axes.set_ylabel("taken and given (J)")
+
+
+def _residual(balance: Balance, axes: Axes) -> None:
+    floor = 1e-12 * balance.scale or 1e-12
+    for label, values, line in (
+        ("V - V(0) + taken - given", balance.residual, "-"),
+        ("without sampling", balance.unexplained, (0, (1, 1))),
+    ):
+        positive = np.maximum(np.abs(values), floor)
+        _draw(balance, axes, positive, label=label, color=style.REFERENCE, linestyle=line)
+    axes.axhline(balance.scale, color=style.FAINT, linewidth=0.7)
+    axes.legend(loc="lower right", ncols=2, fontsize=6.5)
+    axes.set(yscale="log", ylabel="residual (J)")

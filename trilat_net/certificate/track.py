@@ -1,0 +1,161 @@
+"""One site's records as columns on its whole grid of ticks, and what a link carried of them.
+
+Law: what a gap has taken is filled in, so that sums have all their terms, and is marked.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arm import JOINTS, Array
+from ..log.reader import Ints, Log
+
+Bools = NDArray[np.bool_]
+COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+
+
+class Track(NamedTuple):
+    """A site from its first record to the last time that all sites have records of; rows are ticks.
+
+    Attributes:
+        site: its name.
+        rate_hz: its tick rate, Hz.
+        first: the tick of row 0.
+        known: whether there is a record of that tick, shape (K,).
+        follows: whether it followed its peers then: no hold, no brake, no return, shape (K,).
+        q: joint angles, shape (K, 2), rad.
+        qd: joint velocities, shape (K, 2), rad/s.
+        q_des: reference, shape (K, 2), rad.
+        qd_des: its derivative, shape (K, 2), rad/s.
+        tau: control torque, shape (K, 2), N m.
+        tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
+        theta_hat: estimate, shape (K, 5).
+        used: per peer the tick of the sample in use, shape (K,); -1 before the first.
+    """
+
+    site: str
+    rate_hz: int
+    first: int
+    known: Bools
+    follows: Bools
+    q: Array
+    qd: Array
+    q_des: Array
+    qd_des: Array
+    tau: Array
+    tau_x: Array
+    theta_hat: Array
+    used: dict[str, Ints]
+
+    @property
+    def h_s(self) -> float:
+        """The period, s."""
+        return 1.0 / self.rate_hz
+
+    @property
+    def t_s(self) -> Array:
+        """Nominal time of every row, shape (K,), s."""
+        times: Array = np.arange(self.first, self.first + len(self.known)) / self.rate_hz
+        return times
+
+    @property
+    def e(self) -> Array:
+        """Position error, Eq. (9), shape (K, 2), rad."""
+        return self.q - self.q_des
+
+
+def tracks(log: Log) -> dict[str, Track]:
+    """Returns the sites' tracks to the end of the time that all of them have records of; {} without any.
+
+    The record that says `diverged` is left out: it may hold zeros for what is no number any more.
+    """
+    rows = {site: _healthy(log, site) for site in log.sites}
+    if min(map(len, rows.values())) < 2:
+        return {}
+    begin_s = max(log[site].t_s[row[0]] for site, row in rows.items())
+    end_s = min(log[site].t_s[row[-1]] for site, row in rows.items())
+    found = {site: _track(log, site, row, end_s) for site, row in rows.items() if end_s > begin_s}
+    return found if min((len(track.known) for track in found.values()), default=0) > 1 else {}
+
+
+def _healthy(log: Log, site: str) -> Ints:
+    part = log[site]
+    first = np.unique(part.tick, return_index=True)[1]
+    return np.array([n for n in first.tolist() if part.states[n].mode != "diverged"], dtype=np.int64)
+
+
+def _track(log: Log, site: str, rows: Ints, end_s: float) -> Track:
+    part = log[site]
+    tick = part.tick[rows]
+    first = int(tick[0])
+    last = min(int(np.floor(end_s * part.rate_hz + 1e-6)), int(tick[-1]))
+    grid = np.arange(first, max(last, first) + 1)
+    before = np.clip(np.searchsorted(tick, grid, side="right") - 1, 0, None)
+    known = tick[before] == grid
+    modes = np.array([part.states[n].mode == "run" for n in rows.tolist()], dtype=np.bool_)
+    columns = {name: _filled(getattr(part, name)[rows], tick, grid, known) for name in COLUMNS}
+    used = {peer: part.used[peer][rows][before] for peer in part.peers}
+    return Track(site, part.rate_hz, first, known, modes[before], used=used, **columns)
+
+
+def _filled(values: Array, tick: Ints, grid: Ints, known: Bools) -> Array:
+    """Returns values on the grid; what is missing is interpolated."""
+    if known.all():
+        return values[: len(grid)]
+    return np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
+
+
+class Moment(NamedTuple):
+    """A peer at given times: what its link would carry of it.
+
+    Attributes:
+        q: shape (K, 2), rad.
+        qd: shape (K, 2), rad/s.
+        squares: integral of qd squared since row 0, per joint, shape (K, 2), rad^2/s.
+        known: whether it rests on records, shape (K,).
+    """
+
+    q: Array
+    qd: Array
+    squares: Array
+    known: Bools
+
+
+class Past:
+    """A site's motion as a function of time: its records, between them polynomials, before them rest (L7).
+
+    Args:
+        track: the site's records.
+    """
+
+    def __init__(self, track: Track) -> None:
+        self._track = track
+        squares = track.qd**2
+        steps = 0.5 * track.h_s * (squares[1:] + squares[:-1])
+        self._squares: Array = np.vstack([np.zeros(JOINTS), np.cumsum(steps, axis=0)])
+
+    def at(self, t_s: Array) -> Moment:
+        """Returns the site at times, s since the epoch; on its ticks these are its records.
+
+        q is the cubic through angles and velocities, qd runs straight from record to record, and the
+        integral is the exact one of the trapezoid rule.
+        """
+        track, h = self._track, self._track.h_s
+        place = t_s * track.rate_hz - track.first
+        nearest = np.round(place)
+        place = np.where(np.abs(place - nearest) < 1e-5, nearest, place)
+        low = np.clip(np.floor(place), 0, len(track.known) - 2).astype(np.int64)
+        x = np.clip(place - low, 0.0, 1.0)[:, np.newaxis]
+        qa, qb, va, vb = track.q[low], track.q[low + 1], track.qd[low], track.qd[low + 1]
+        q = qa + x * (h * va + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb))))
+        qd = va + x * (vb - va)
+        sa, sb = va**2, vb**2
+        squares = self._squares[low] + h * x * (sa + 0.5 * x * (sb - sa))
+        x0 = x[:, 0]
+        known = (track.known[low] | (x0 == 1.0)) & (track.known[low + 1] | (x0 == 0.0))
+        known &= (place >= 0.0) | (track.first == 0)
+        rest = place < 0.0
+        q = np.where((x == 1.0), qb, q)
+        qd[rest], squares[rest] = 0.0, 0.0
+        return Moment(q, qd, squares, known)

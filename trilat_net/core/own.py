@@ -1,0 +1,114 @@
+"""A control law of somebody's own, in plain Python.
+
+Law: it is part of the site's step: a function of what it is told and of what it remembers, and what it
+remembers is in the record, so that a log resumes in the middle of it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+from ..errors import LawFailed
+from .arm import JOINTS, PARAMETERS
+
+MAX_MEMORY = 1024
+"""Most numbers that a law remembers: they are in the record of every tick."""
+
+
+class Facts(NamedTuple):
+    """What a law may know before it begins.
+
+    Attributes:
+        site: the site's name.
+        rate_hz: its tick rate, Hz.
+        g_m_s2: gravitational acceleration, m/s^2.
+        lengths_m: of the two links.
+        theta: the arm's true parameters, shape (5,); whether a law knows them is its author's claim.
+        tau_limit_nm: largest torque of a joint, N m.
+    """
+
+    site: str
+    rate_hz: int
+    g_m_s2: float
+    lengths_m: tuple[float, float]
+    theta: tuple[float, ...]
+    tau_limit_nm: float
+
+
+class Now(NamedTuple):
+    """What a law is told at a tick; every vector has one number per joint.
+
+    Attributes:
+        k: the tick.
+        t_s: nominal time since the epoch, s.
+        h_s: the period, s.
+        q: joint angles, rad.
+        qd: joint velocities, rad/s.
+        q_des: reference of Eq. (6), rad.
+        qd_des: its derivative, rad/s.
+        felt: the torque on the peers' arms as it came, weighted by dominance, N m.
+    """
+
+    k: int
+    t_s: float
+    h_s: float
+    q: list[float]
+    qd: list[float]
+    q_des: list[float]
+    qd_des: list[float]
+    felt: list[float]
+
+
+class OwnLaw(Protocol):
+    """What a law must do; called with `Facts` and the keys of its `[control]` table, by name, to make one.
+
+    It may have an attribute `theta_hat`, five numbers, which is recorded.
+    """
+
+    def torque(self, now: Now) -> Sequence[float]:
+        """Returns the torque of each joint, N m; more than the limit is cut off."""
+
+    def memory(self) -> Sequence[float]:
+        """Returns all that `torque` will need of the ticks so far, as numbers."""
+
+    def recall(self, memory: Sequence[float]) -> None:
+        """Puts the law where `memory` said that it was."""
+
+
+OwnLawMaker = Callable[[Facts], OwnLaw]
+
+
+def asked(law: OwnLaw, site: str, now: Now) -> tuple[list[float], list[float], list[float]]:
+    """Returns torque, estimate and memory of a law at a tick.
+
+    Raises:
+        LawFailed: it raised, or returned what is none.
+    """
+    where = f"the law of {site}, tick {now.k}"
+    try:
+        torque = [float(value) for value in law.torque(now)]
+        estimate = [float(value) for value in getattr(law, "theta_hat", (0.0,) * PARAMETERS)]
+        memory = [float(value) for value in law.memory()]
+    except Exception as error:  # whatever somebody's code does is theirs, and told in a sentence
+        raise LawFailed(f"{where}: {type(error).__name__}: {error}") from error
+    for name, values, length in (("torque", torque, JOINTS), ("theta_hat", estimate, PARAMETERS)):
+        if len(values) != length:
+            raise LawFailed(f"{where}: {name} has {len(values)} numbers, not {length}")
+    if len(memory) > MAX_MEMORY:
+        raise LawFailed(f"{where}: memory has {len(memory)} numbers, at most {MAX_MEMORY} are kept")
+    for name, values in (("torque", torque), ("theta_hat", estimate), ("memory", memory)):
+        if not all(map(math.isfinite, values)):
+            raise LawFailed(f"{where}: {name} is not finite: {values}")
+    return torque, estimate, memory
+
+
+def recalled(law: OwnLaw, site: str, memory: Sequence[float]) -> None:
+    """Puts a law where a record says that it was.
+
+    Raises:
+        LawFailed: it raised.
+    """
+    try:
+        law.recall(memory)
+    except Exception as error:  # as above
+        raise LawFailed(f"the law of {site}, resumed: {type(error).__name__}: {error}") from error
