@@ -45,7 +45,8 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
         (
             ["control.law=p_d", "control.K=20"],
             [
-                "control of s: adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0) -> p_d (K 20, d 3, gravity 1)"
+                "control of s: adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0) -> "
+                "p_d (K 20, d 3, gravity 1)"
             ],
         ),
     ],
