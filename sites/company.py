@@ -68,7 +68,7 @@ class Company:
             for event in said(inbox):
                 if event.boot != self._boots.get(peer):
                     continue
-                if event.kind == "diverged":
+                if event.kind in ("diverged", "failed"):
                     self.ended_by = event.text
                 elif event.kind == "end":
                     self._ended.add(peer)

@@ -107,6 +107,9 @@ def run_demo(scenario: Scenario, folder: Path, display: Display) -> Outcome:
         session = session_name(scenario)
         endpoints = session_endpoints(session, scenario.names)
         children, recorder = _start(scenario, folder, session, endpoints)
+        for name in scenario.external:
+            place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
+            display.say(f"{name} waits for its arm on {place}; see docs/external-arm.md")
         clock = SystemClock()
         try:
             with closing(ZenohBus([], endpoints)) as bus:

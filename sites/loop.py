@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from trilat_net.core.grid import NS_PER_S
 from trilat_net.core.site import Site
-from trilat_net.core.tick import Command, Mode, Output, Tick
+from trilat_net.core.tick import Command, Measured, Mode, Output, Tick
+from trilat_net.errors import LawFailed
 from trilat_net.net.clock import Clock
 from trilat_net.net.stats import LoopStats
 from trilat_net.net.timing import Timing
@@ -33,6 +34,9 @@ class Ports:
         commands: what the site is ordered at a tick.
         news: called after a tick that took a command in, or at which the mode changed.
         spare: called after a tick that left a quarter of its period.
+        measured: what an arm outside of the program was measured to do, at this instant.
+        step: steps the site; by default the site's own.
+        failed: is told of a law from outside that failed; the loop ends then.
     """
 
     clock: Clock
@@ -45,6 +49,9 @@ class Ports:
     commands: Callable[[int], Sequence[Command]] = lambda _: ()
     news: Callable[[Output], None] = lambda _: None
     spare: Callable[[], object] = lambda: None
+    measured: Callable[[], Measured | None] = lambda: None
+    step: Callable[[Tick], Output] | None = None
+    failed: Callable[[LawFailed], None] | None = None
 
 
 def run_loop(site: Site, boot: int, ticks: int, stats: LoopStats, ports: Ports) -> Output | None:
@@ -59,8 +66,12 @@ def run_loop(site: Site, boot: int, ticks: int, stats: LoopStats, ports: Ports) 
 
     Returns:
         The last record: its mode says whether the run stayed within its limits. None if it made no tick.
+
+    Raises:
+        LawFailed: a law from outside did, and nobody wants to be told.
     """
     clock, intake, timing = ports.clock, ports.intake, ports.timing
+    step = ports.step or site.step
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
     busy_us = 0
     mode = Mode.RUN
@@ -73,7 +84,13 @@ def run_loop(site: Site, boot: int, ticks: int, stats: LoopStats, ports: Ports) 
         woke_ns = clock.monotonic_ns()
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
         arrivals = intake.drain(k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns)
-        output = site.step(Tick(k, arrivals, ports.commands(k)))
+        try:
+            output = step(Tick(k, arrivals, ports.commands(k), ports.measured()))
+        except LawFailed as failed:  # of this tick there is no record
+            if ports.failed is None:
+                raise
+            ports.failed(failed)
+            break
         sent_ns, echo = timing.sent(k, clock.monotonic_ns()), timing.echo()
         ports.publish_state(
             encode_state(site.name, boot, site.peers, output, arrivals, late_us, busy_us, sent_ns, echo)

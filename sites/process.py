@@ -1,12 +1,12 @@
 """One site as one process: from its scenario to its exit code.
 
 Law: a site declares itself alive only when its subscriptions stand and its step is compiled. Until the
-epoch its arm is braked; at the end it stays until the recorder has every record, or `LINGER_S`.
+epoch its arm is braked; at the end it stays until the recorder has every record, or some seconds (`parting`).
 """
 
 import platform
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import nullcontext
 
 import msgspec
 
@@ -18,7 +18,7 @@ from trilat_net.interrupt import Interrupt
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, system_clock
-from trilat_net.net.connection import Connection, open_bus
+from trilat_net.net.connection import open_bus
 from trilat_net.net.messages import Info
 from trilat_net.net.pinging import clock_texts
 from trilat_net.net.session import Epoch, Joining
@@ -26,47 +26,22 @@ from trilat_net.net.stats import LoopStats
 from trilat_net.net.timing import News, Timing
 from trilat_net.net.voice import Voice, new_boot
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.own_law import Own
 
 from . import realtime
+from .arm import CAPACITY, OutsideArm
 from .changes import Changes
 from .clocks import peers_of
 from .company import Company
 from .history import History
 from .intake import Intake
 from .loop import Ports, run_loop
+from .options import Options
+from .overtime import Overtime
+from .parting import await_recorders
 from .warming import warm_up
 
-LINGER_S = 5
 POLL_NS = 5_000_000
-LAST_WORD_NS = 100_000_000
-PARTING_NS = 2_000_000_000
-ASKED_NS = 1_000_000_000
-"""A recorder that has asked within this time is there, whatever its token says."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How a site takes part.
-
-    Attributes:
-        session: the session's name.
-        connection: how it takes part in the network.
-        join_timeout_s: how long to wait for the others, s.
-        needs_recorder: whether a recorder must be there.
-        cpu: the processor to stay on, or None.
-        stay_s: how long to stay afterwards, until the recorder has left, s at most.
-        clock_offset_s: injected: how far the clock is ahead of the machine's, s.
-        clock_drift_ppm: injected: by how much it runs faster, ppm.
-    """
-
-    session: str
-    connection: Connection
-    join_timeout_s: float = 60.0
-    needs_recorder: bool = False
-    cpu: int | None = None
-    stay_s: float = 0.0
-    clock_offset_s: float = 0.0
-    clock_drift_ppm: float = 0.0
 
 
 def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str], None]) -> int:
@@ -84,8 +59,12 @@ def run_site(scenario: Scenario, name: str, options: Options, say: Callable[[str
     Raises:
         SessionError: the session could not begin.
         UsageError: an endpoint cannot be used.
-        RunFailed: the run diverged.
+        ScenarioError: its law from outside cannot be made, or is not the one that the scenario names.
+        RunFailed: the run diverged, its law from outside failed, or its arm fell silent.
     """
+    law = scenario.sites[name].control
+    if isinstance(law, Own):
+        law.check_unchanged(name)
     with Interrupt() as interrupt:
         clock = system_clock(options.clock_offset_s, options.clock_drift_ppm)
         bus = open_bus(
@@ -119,6 +98,9 @@ class Member:
         self._scenario, self._name, self._options = scenario, name, options
         self._bus, self._clock, self._interrupt, self._say = bus, clock, interrupt, say
         self._site = Site(scenario.setup(name))
+        self._failure: RunFailed | None = None
+        law = scenario.sites[name].control
+        self._overtime = Overtime(self._site, law.code, clock) if isinstance(law, Own) else None
         self._boot = new_boot()
         rates = [scenario.sites[peer].rate_hz for peer in self._site.peers]
         self._stats = LoopStats(self._site, self._boot, rates)
@@ -128,6 +110,12 @@ class Member:
             for peer in self._site.peers
         ]
         self._intake = Intake(self._site.peers, rings, rates, self._stats.dropped)
+        self._arm: OutsideArm | None = None
+        if name in scenario.external:
+            key = topics.key(session, name, topics.MEASURED)
+            ring = bus.stamped(key, clock.monotonic_ns, CAPACITY)
+            where = " at ".join([key, *map(str, options.connection.places[:1])])
+            self._arm = OutsideArm(name, ring, clock, self._stats.dropped, where)
         questions = bus.questions(topics.key(session, name, topics.PAST))
         self._history = History(name, self._boot, self._site.rate_hz, questions)
         self._publish_state = self._kept(topics.STATE)
@@ -135,23 +123,24 @@ class Member:
         self._company = Company(bus, session, name, self._site.peers)
         self._changes = Changes(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
         self._mode = Mode.RUN
-        warm_up(scenario, name)
-        self._voice = Voice(
-            bus,
-            session,
-            Info(
-                member=name,
-                boot=self._boot,
-                scenario_sha256=scenario.sha256,
-                scenario=scenario.text,
-                host=platform.node(),
-                clock=clock.identity(),
-                fingerprint=fingerprint(),
-                needs_recorder=options.needs_recorder,
-            ),
-            self._history.rings[topics.EVENT].keep,
+        warm_up(scenario, name, clock)
+
+    def _declare(self) -> None:
+        """Says that this site is there."""
+        scenario, options = self._scenario, self._options
+        info = Info(
+            member=self._name,
+            boot=self._boot,
+            scenario_sha256=scenario.sha256,
+            scenario=scenario.text,
+            host=platform.node(),
+            clock=self._clock.identity(),
+            fingerprint=fingerprint(),
+            needs_recorder=options.needs_recorder,
         )
-        self._joining = Joining(bus, clock, session, self._voice, scenario.names)
+        keep = self._history.rings[topics.EVENT].keep
+        self._voice = Voice(self._bus, options.session, info, keep)
+        self._joining = Joining(self._bus, self._clock, options.session, self._voice, scenario.names)
 
     def _kept(self, channel: str) -> Callable[[bytes], None]:
         """Returns what publishes on a channel of this site and keeps it for a while."""
@@ -166,7 +155,11 @@ class Member:
 
     def live(self) -> int:
         """Joins, runs, leaves."""
-        epoch = self._join()
+        give_up_ns = self._clock.monotonic_ns() + int(self._options.join_timeout_s * 1e9)
+        if self._arm is not None and not self._arm.speaks(self._interrupt.requested, give_up_ns, self._say):
+            return self._interrupt.exit_code
+        self._declare()
+        epoch = self._join(give_up_ns)
         if epoch is None:
             return self._interrupt.exit_code
         self._epoch = epoch
@@ -191,6 +184,9 @@ class Member:
         )
         self._say(f"{self._name}: the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
         self._report(self._timing.opening(), 0)
+        if self._arm is not None and (text := self._arm.bind(self._scenario.sites[self._name].q0_rad)):
+            self._voice.say("arm", f"{self._name}: {text}")
+            clocks.append(text)
         for sentence in clocks:
             self._say(f"{self._name}: {sentence}")
         ports = Ports(
@@ -200,19 +196,33 @@ class Member:
             self._publish_state,
             self._publish_link,
             self._slack,
-            lambda: self._interrupt.requested() or bool(self._company.ended_by),
+            self._ended,
             self._changes.take,
             self._tell,
             self._history.answer,
+            lambda: None if self._arm is None else self._arm.newest,
+            None if self._overtime is None else self._overtime.step,
+            self._fail,
         )
         ticks = self._scenario.ticks(self._name)
-        output = run_loop(self._site, self._boot, ticks, self._stats, ports)
+        with self._overtime or nullcontext():
+            output = run_loop(self._site, self._boot, ticks, self._stats, ports)
         return self._leave(output)
 
-    def _join(self) -> Epoch | None:
+    def _ended(self) -> bool:
+        """True where the run ends before its last tick."""
+        if self._arm is not None:
+            self._arm.look()
+            self._failure = self._failure or self._arm.failure
+        return bool(self._failure or self._company.ended_by) or self._interrupt.requested()
+
+    def _fail(self, failure: RunFailed) -> None:
+        """Remembers why this site ends the run for all."""
+        self._failure = failure
+
+    def _join(self, give_up_ns: int) -> Epoch | None:
         """Waits for the others; None where a signal came first."""
         clock = self._clock
-        give_up_ns = clock.monotonic_ns() + int(self._options.join_timeout_s * 1e9)
         meeting = self._joining.meeting
         self._say(f"{self._name}: waiting for {', '.join(meeting.missing()) or 'the epoch'}")
         while not self._interrupt.requested():
@@ -257,9 +267,14 @@ class Member:
         """Says how the run ended, and stays until the recorder has all of it."""
         ticks = 0 if output is None else output.tick + 1
         t_ns = -1 if output is None else output.t_ns
-        diverged = output is not None and output.mode is Mode.DIVERGED
-        if output is not None and diverged:
-            self._voice.say("diverged", diverged_text(self._name, output), t_ns=t_ns, ticks=ticks)
+        if output is not None and output.mode is Mode.DIVERGED:
+            self._failure = RunFailed(diverged_text(self._name, output))
+            self._voice.say("diverged", str(self._failure), t_ns=t_ns, ticks=ticks)
+        elif self._failure is not None:
+            self._voice.say("failed", str(self._failure), t_ns=t_ns, ticks=ticks)
+        if self._overtime is not None and (told := self._overtime.told()):
+            self._voice.say("law", told, t_ns=t_ns, ticks=ticks)
+            self._say(f"{self._name}: {told}")
         self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
         code = self._interrupt.exit_code if self._interrupt.requested() else 0  # later signals end the wait
         self._company.watch(self._voice, t_ns)
@@ -270,30 +285,18 @@ class Member:
             f"{self._name}: {ticks} ticks, {self._stats.overruns} of them late by a period or more"
             + (f"; dropped: {dropped}" if dropped else "")
         )
-        if output is not None and diverged:
-            raise RunFailed(diverged_text(self._name, output))
+        if self._failure is not None:
+            raise self._failure
         if self._company.ended_by:
             raise RunFailed(f"{self._name} ended because {self._company.ended_by}")
         return code
 
     def _await_recorders(self, ticks: int, t_ns: int) -> None:
-        """Waits for the word of every recorder that is there that it has all that it can have.
+        """Waits for the recorders; meanwhile answers them."""
 
-        At most `LINGER_S` after the last question of one of them, and `stay_s` after their word.
-        """
-        clock, company = self._clock, self._company
-        give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-        asked_ns = 0
-        while clock.monotonic_ns() < give_up_ns and not (company.stored and self._interrupt.requested()):
+        def attend() -> None:
             self._voice.answer()
-            while self._history.answer():
-                asked_ns = clock.monotonic_ns()
-                give_up_ns = max(give_up_ns, asked_ns + LINGER_S * 1_000_000_000)
-            company.watch(self._voice, t_ns)
-            away = not company.recorders and clock.monotonic_ns() - asked_ns > ASKED_NS
-            if away:  # its last word may still be under way; or its process ends
-                patience_ns = PARTING_NS if company.stored else LAST_WORD_NS
-                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
-            if company.hear_recorders(ticks) and company.recorders <= company.stored:
-                give_up_ns = clock.monotonic_ns() + int(self._options.stay_s * 1e9)
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+            self._company.watch(self._voice, t_ns)
+
+        stopped, stay_ns = self._interrupt.requested, int(self._options.stay_s * 1e9)
+        await_recorders(self._company, self._history.answer, attend, self._clock, stopped, ticks, stay_ns)

@@ -43,7 +43,7 @@ class Watch:
                 event = decode(message[1], Event)
             except WireError:
                 continue
-            if event.kind in ("lost", "diverged", "refused", "clock fault"):
+            if event.kind in ("lost", "diverged", "failed", "refused", "clock fault"):
                 self.news.append(event.text)
 
     def take_news(self) -> Sequence[str]:

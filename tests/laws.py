@@ -1,5 +1,6 @@
 """Laws from outside, for tests: the paper's once more, in Python, and some that fail."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -42,3 +43,58 @@ class Adaptive:
 
     def recall(self, memory: Sequence[float]) -> None:
         self._Yr, self.theta_hat = np.array(memory[:5]), np.array(memory[5:])
+
+
+class Failing(Adaptive):
+    """Does something wrong at a tick."""
+
+    def __init__(self, facts: Facts, how: str = "nan", at: int = 3) -> None:
+        super().__init__(facts)
+        self._how, self._at = how, at
+
+    def torque(self, now: Now) -> Sequence[float]:
+        wrong = self._how if now.k == self._at else ""
+        if wrong == "raises":
+            raise ValueError("out of\nits depth")
+        if wrong == "leaves":
+            raise SystemExit(0)
+        self._much = wrong == "remembers"
+        tau = list(super().torque(now))
+        return {"nan": [tau[0], math.nan], "short": tau[:1], "none": None}.get(wrong, tau)  # type: ignore[return-value]
+
+    def memory(self) -> Sequence[float]:
+        return [0.0] * 1025 if self._much else super().memory()
+
+
+class Forgetful(Adaptive):
+    """Does not say all that it remembers."""
+
+    def memory(self) -> Sequence[float]:
+        return [*self._Yr]
+
+    def recall(self, memory: Sequence[float]) -> None:
+        self._Yr, self.theta_hat = np.array(memory), np.zeros(5)
+
+
+class Pair(Adaptive):
+    sites = 2
+
+
+class Few(Adaptive):
+    sites = (2, 3)
+
+
+class Odd(Adaptive):
+    sites = "many"
+
+
+class Knowing(Adaptive):
+    needs_theta = True
+
+
+class NoLaw:
+    """Has nothing that a law has."""
+
+
+def no_class(_facts: Facts) -> NoLaw:
+    return NoLaw()

@@ -72,7 +72,27 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
 
 
 class LawFailed(RunFailed):
-    """A control law of somebody's own that raised, or returned what is no torque."""
+    """A control law of somebody's own that raised, was too slow, or returned what is no torque.
+
+    Args:
+        problem: what it did.
+        site: whose law it is.
+        law: the law, as in "package.module:Law".
+        tick: at which tick; None where it was resumed.
+    """
+
+    def __init__(self, problem: str, *, site: str, law: str, tick: int | None) -> None:
+        when = "as it was resumed" if tick is None else f"at tick {tick}"
+        super().__init__(f"the law {law} of {site} failed {when}: {problem}")
+        self.problem, self.site, self.law, self.tick = problem, site, law, tick
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Makes it again where another process raised it."""
+        return _law_failed, (self.problem, self.site, self.law, self.tick)
+
+
+def _law_failed(problem: str, site: str, law: str, tick: int | None) -> LawFailed:
+    return LawFailed(problem, site=site, law=law, tick=tick)
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md

@@ -17,8 +17,8 @@ from .log.logfile import new_log
 from .log.reader import Log, open_log
 from .log.views import VIEWS_HZ
 from .log.writer import new_file
-from .replay.comparison import Comparison, LateSample, compare, late_samples, schedule
-from .replay.verify import Verdict, verify
+from .replay.comparison import Comparison, LateSample, compare, late_samples, measurements, schedule
+from .replay.verify import Verdict, last_ticks, verify
 from .scenario import Scenario, load
 from .sim import virtual
 from .sim.network import Network, RecordedNetwork
@@ -75,6 +75,8 @@ def record_virtual(
     Raises:
         UsageError: the file exists, or cannot be made.
         LogRefused: the disk refused; says what is kept.
+        ScenarioError: virtual time cannot run it; then there is no file.
+        LawFailed: a law from outside did; the file is finished, with what was before.
     """
     with new_log(path, force=force) as stream:
         return virtual.record(scenario, stream, stopped=stopped, views_hz=views_hz)
@@ -85,7 +87,8 @@ class Twins(NamedTuple):
 
     Attributes:
         fed: against virtual time fed with the log's arrivals; equal always.
-        plain: against plain virtual time; equal until the first late sample.
+        plain: against plain virtual time; equal until the first late sample. Of nothing where an arm is
+            outside of the program: there is no such run.
         late: the samples that came after they were due.
     """
 
@@ -104,14 +107,18 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> Twins:
     scenario = _as_long_as(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
+    arms = measurements(log)
+    ends = last_ticks(log)
     with collector.paused():
-        recorded = RecordedNetwork(schedule(log), peers)
         ordered = {name: log.commands(name) for name in scenario.names}
+
+        def outputs(network: Network | None, before: int) -> Iterator[tuple[str, Output]]:
+            ran = virtual.run(scenario, network, ordered, arms, ends)
+            return _told(((site.name, output) for site, _, output in ran), progress, before, total)
+
         return Twins(
-            compare(log, _told(_outputs(scenario, recorded, ordered), progress, 0, total), arrivals=True),
-            compare(
-                log, _told(_outputs(scenario, None, ordered), progress, total // 2, total), arrivals=False
-            ),
+            compare(log, outputs(RecordedNetwork(schedule(log), peers), 0), arrivals=True),
+            Comparison(0, 0, None) if arms else compare(log, outputs(None, total // 2), arrivals=False),
             late_samples(log),
         )
 
@@ -121,12 +128,6 @@ def _as_long_as(log: Log) -> Scenario:
     ends_s = [(int(log[name].tick[-1]) + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
     duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
     return msgspec.structs.replace(log.scenario, duration_s=duration_s)
-
-
-def _outputs(
-    scenario: Scenario, network: Network | None, commands: virtual.Commands
-) -> Iterator[tuple[str, Output]]:
-    return ((site.name, output) for site, _, output in virtual.run(scenario, network, commands))
 
 
 def _told(
@@ -141,4 +142,7 @@ def _told(
 
 def twin_without_hands(log: Log) -> Log:
     """Returns the log's experiment in virtual time with nobody at the arms."""
-    return simulate(_as_long_as(log).without_hands())
+    stream = io.BytesIO()
+    virtual.record(_as_long_as(log).without_hands(), stream, as_named=False)
+    stream.seek(0)
+    return open_log(stream)

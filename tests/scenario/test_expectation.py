@@ -7,6 +7,7 @@ import pytest
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Expect, load, parse, template_text
 from trilat_net.scenario.expectation import fault
+from trilat_net.scenario.window import QUANTITIES, Window
 
 
 def with_expect(**keys: Any) -> Expect:
@@ -26,6 +27,7 @@ def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
         {"synchronised_by_s": 0.0},
         {"late_samples_max": 0},
         {"no_gaps": True},
+        {"windows": (Window(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0)),)},
     ],
     ids=str,
 )
@@ -66,10 +68,48 @@ def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
     assert scenario.sha256 != load("free").sha256
 
 
+WINDOW = {"from_s": 1.0, "to_s": 2.0, "site": "s", "wall_mean_n": [7, 9]}
+
+
+def test_a_window_is_part_of_the_scenarios_text() -> None:
+    scenario = load("free", {"expect.windows": [WINDOW]})
+    assert parse(scenario.text).expect == scenario.expect
+    assert scenario.expect.windows[0].wall_mean_n == (7.0, 9.0)
+    assert "[[expect.windows]]" in scenario.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"wall_meen_n": [0, 1]}, ["expect.windows[0].wall_meen_n", "did you mean 'wall_mean_n'"]),
+        ({"to_s": 1.0}, ["expect.windows[0].to_s", "from_s = 1"]),
+        ({"site": "m3"}, ["expect.windows[0].site", "m1, m2, s"]),
+        ({"site": ""}, ["expect.windows[0].site", "wall_mean_n is of one site"]),
+        ({"wall_mean_n": [9, 7]}, ["expect.windows[0].wall_mean_n", "[9, 7]"]),
+        ({"wall_mean_n": 8}, ["expect.windows[0].wall_mean_n"]),
+        ({"from_s": -1.0}, ["expect.windows[0].from_s"]),
+    ],
+    ids=str,
+)
+def test_a_window_that_cannot_be_right_is_refused_with_its_key(
+    changes: dict[str, Any], facts: list[str]
+) -> None:
+    with pytest.raises(ScenarioError) as error:
+        with_expect(windows=[{**WINDOW, **changes}])
+    for fact in facts:
+        assert fact in str(error.value)
+
+
+def test_a_window_that_asks_nothing_is_refused_and_told_what_it_may_ask() -> None:
+    with pytest.raises(ScenarioError, match=r"expect.windows\[0\]: asks nothing; it may ask error_peak_rad"):
+        with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
+
+
 def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
     commented = template_text().partition("# [expect]")[2].splitlines()[1:]
     text = template_text() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
     written = parse(text).expect
-    named = {line.removeprefix("# ").split(" = ")[0] for line in commented if line.startswith("# ")}
-    assert named == set(Expect.__struct_fields__)
-    assert written.asks
+    named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
+    assert set(named[: -len(Window.__struct_fields__)]) | {"windows"} == set(Expect.__struct_fields__)
+    assert named[-len(Window.__struct_fields__) :] == list(Window.__struct_fields__)
+    assert {key for key, _ in written.windows[0].asked} == set(QUANTITIES)

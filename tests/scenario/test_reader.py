@@ -29,7 +29,7 @@ def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
 def test_what_is_shipped() -> None:
     adaptive = ["asymmetric", "free", "paper", "paper_rods", "two_sites", "lyapunov"]
     links = ["4g", "handover", "jitter", "outage"]
-    laws = ["box", "contact", "p_d_margin", "training", "windup"]
+    laws = ["box", "contact", "force_sharing", "p_d_margin", "p_d_margin_two", "training", "windup"]
     assert shipped() == sorted([*adaptive, *links, *laws])
 
 

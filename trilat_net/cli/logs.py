@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from ..interrupt import Interrupt
-from .opening import opened
+from .opening import opened, tell_outside_laws
 from .options import (
     DurationOption,
     ForceOption,
@@ -70,6 +70,7 @@ def verify(
     from ..conclusion import checked
 
     log = opened(*files)
+    tell_outside_laws(log)
     with bar(f"executing {files[0]}") as progress:
         result = checked(log, virtual=virtual, progress=progress)
     if as_json:
@@ -98,6 +99,7 @@ def report(
     from ..conclusion import conclude, results_folder
 
     log = opened(*files)  # before a folder is made for it
+    tell_outside_laws(log, needed=False)
     results = results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
     with bar("drawing") as progress:
         conclusion = conclude(log, results, progress)

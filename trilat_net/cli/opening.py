@@ -40,6 +40,29 @@ def opened(first: Path, *more: Path) -> "Log":
     return log
 
 
+def tell_outside_laws(log: "Log", *, needed: bool = True) -> None:
+    """Says which code a log names that it does not hold, and that executing the log runs it.
+
+    Args:
+        log: the log.
+        needed: whether nothing can be done without that code.
+
+    Raises:
+        ScenarioError: the file of a law is not there, and needed.
+    """
+    from ..errors import ScenarioError
+    from ..replay.outside import outside_laws
+
+    try:
+        laws = outside_laws(log.scenario, log.source)
+    except ScenarioError:
+        if needed:
+            raise
+        return
+    for law in laws:
+        err.print(f"note: executing this log runs code from outside: {escape(shown(law))}", soft_wrap=True)
+
+
 def warn_if_torn(path: Path) -> None:
     """Says so where a file was not finished, and what mends it.
 

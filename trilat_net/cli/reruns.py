@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..errors import UsageError
-from .opening import opened
+from .opening import opened, tell_outside_laws
 from .options import ForceOption, JsonOption, LogsArgument, SetOption, out, say
 from .progress import bar
 from .show import shown
@@ -47,6 +47,7 @@ def rerun(
     if output is not None:
         _check_output(output, files, force=force)
     log = opened(*files)
+    tell_outside_laws(log, needed=False)  # another law may take its place
     with bar("executing") as progress:
         again = executed(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
     if output is not None:

@@ -117,7 +117,8 @@ def site(
     Without endpoints, sites of a session find each other on this machine: each listens at a loopback port
     that follows from session and site, and connects to the sites before it in the scenario.
     """
-    from sites.process import Options, run_site
+    from sites.options import Options
+    from sites.process import run_site
 
     from ..net.endpoints import default_endpoints
     from ..scenario import site_named
@@ -241,5 +242,5 @@ def _conclude(parts: list[Path]) -> None:
     show_conclusion(conclusion)
     if not conclusion.passed:
         raise RunFailed(f"{path}: failed a check")
-    if diverged := next((event for event in log.events if event.kind == "diverged"), None):
-        raise RunFailed(f"{path}: {diverged.text}")
+    if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
+        raise RunFailed(f"{path}: {ended.text}")

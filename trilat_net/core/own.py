@@ -23,7 +23,8 @@ class Facts(NamedTuple):
         rate_hz: its tick rate, Hz.
         g_m_s2: gravitational acceleration, m/s^2.
         lengths_m: of the two links.
-        theta: the arm's true parameters, shape (5,); whether a law knows them is its author's claim.
+        theta: the arm's true parameters, shape (5,); whether a law knows them is its author's claim. ()
+            where nobody does, as of a real arm that was not identified.
         tau_limit_nm: largest torque of a joint, N m.
     """
 
@@ -84,21 +85,24 @@ def asked(law: OwnLaw, site: str, now: Now) -> tuple[list[float], list[float], l
     Raises:
         LawFailed: it raised, or returned what is none.
     """
-    where = f"the law of {site}, tick {now.k}"
     try:
         torque = [float(value) for value in law.torque(now)]
         estimate = [float(value) for value in getattr(law, "theta_hat", (0.0,) * PARAMETERS)]
         memory = [float(value) for value in law.memory()]
-    except Exception as error:  # whatever somebody's code does is theirs, and told in a sentence
-        raise LawFailed(f"{where}: {type(error).__name__}: {error}") from error
+    except LawFailed:  # whoever watches it has stopped it
+        raise
+    except (Exception, SystemExit) as error:  # what somebody's code does is told in a sentence
+        raise _failed(law, site, now.k, _told(error)) from error
     for name, values, length in (("torque", torque, JOINTS), ("theta_hat", estimate, PARAMETERS)):
         if len(values) != length:
-            raise LawFailed(f"{where}: {name} has {len(values)} numbers, not {length}")
+            raise _failed(law, site, now.k, f"{name} has {len(values)} numbers, not {length}")
     if len(memory) > MAX_MEMORY:
-        raise LawFailed(f"{where}: memory has {len(memory)} numbers, at most {MAX_MEMORY} are kept")
+        problem = f"memory has {len(memory)} numbers, at most {MAX_MEMORY} are kept"
+        raise _failed(law, site, now.k, problem)
     for name, values in (("torque", torque), ("theta_hat", estimate), ("memory", memory)):
         if not all(map(math.isfinite, values)):
-            raise LawFailed(f"{where}: {name} is not finite: {values}")
+            first = next(n for n, value in enumerate(values) if not math.isfinite(value))
+            raise _failed(law, site, now.k, f"{name}[{first}] is {values[first]}, no finite number")
     return torque, estimate, memory
 
 
@@ -110,5 +114,20 @@ def recalled(law: OwnLaw, site: str, memory: Sequence[float]) -> None:
     """
     try:
         law.recall(memory)
-    except Exception as error:  # as above
-        raise LawFailed(f"the law of {site}, resumed: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:  # as above
+        raise _failed(law, site, None, _told(error)) from error
+
+
+def name_of(law: OwnLaw) -> str:
+    """Returns where a law is from, as a scenario names it."""
+    return f"{type(law).__module__}:{type(law).__qualname__}"
+
+
+def _failed(law: OwnLaw, site: str, tick: int | None, problem: str) -> LawFailed:
+    return LawFailed(problem, site=site, law=name_of(law), tick=tick)
+
+
+def _told(error: BaseException) -> str:
+    """Returns an error of somebody's code in one line."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

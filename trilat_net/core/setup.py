@@ -142,6 +142,7 @@ class SiteSetup(NamedTuple):
         on_stale: what to do about a stale peer.
         external: whether the arm is outside of the program; then it is measured, and nothing is integrated.
         own: makes the law where it is somebody's own.
+        theta_known: whether `theta` is the arm's; of an arm outside of the program nobody may know it.
     """
 
     name: str
@@ -161,3 +162,4 @@ class SiteSetup(NamedTuple):
     on_stale: StaleRule = StaleRule()
     external: bool = False
     own: OwnLawMaker | None = None
+    theta_known: bool = True

@@ -315,5 +315,5 @@ class Site:
 
 def _facts(setup: SiteSetup) -> Facts:
     """Returns what a law may know of its site."""
-    theta = tuple(float(value) for value in setup.theta)
+    theta = tuple(float(value) for value in setup.theta) if setup.theta_known else ()
     return Facts(setup.name, setup.rate_hz, setup.g_m_s2, setup.lengths_m, theta, setup.tau_limit_nm)

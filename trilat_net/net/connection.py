@@ -35,6 +35,11 @@ class Connection:
     mode: Mode = "peer"
     own: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def places(self) -> Sequence[Endpoint]:
+        """Where others reach this member: where it listens, or the routers of a client."""
+        return self.listen or self.connect or ()
+
 
 def member_connection(
     listen: Sequence[str] | None,

@@ -6,6 +6,7 @@ ROOT = "trilat"
 RECORDER = "recorder"
 STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
 PAST, STATS = "past", "stats"
+MEASURED = "measured"
 
 
 class Address(NamedTuple):

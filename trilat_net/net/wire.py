@@ -18,6 +18,7 @@ import msgspec
 from ..core.tick import Arrival, Output
 from ..errors import WireError
 from .answers import Order, Past, Pong, Reply, Wanted
+from .measurement import MEASUREMENT_VECTORS, Measurement
 from .messages import (
     SAMPLE_VECTORS,
     STATE_VECTORS,
@@ -39,13 +40,21 @@ holds messages."""
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind)
-    for kind in (State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past)
+    for kind in (
+        *(State, Sample, LinkStats, Event, Info, RecorderStats),
+        *(Pong, Order, Reply, Wanted, Past, Measurement),
+    )
 }
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Past: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 
 _SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
 _STATE_CHECK = (tuple(STATE_VECTORS), attrgetter(*STATE_VECTORS), tuple(STATE_VECTORS.values()))
+_MEASUREMENT_CHECK = (
+    tuple(MEASUREMENT_VECTORS),
+    attrgetter(*MEASUREMENT_VECTORS),
+    tuple(MEASUREMENT_VECTORS.values()),
+)
 
 
 def encode_state(
@@ -109,13 +118,17 @@ def encode_state(
     return packed
 
 
-def encode(message: LinkStats | Event | Info | RecorderStats | Pong | Order | Reply | Wanted | Past) -> bytes:
+def encode(
+    message: LinkStats | Event | Info | RecorderStats | Pong | Order | Reply | Wanted | Past | Measurement,
+) -> bytes:
     """Returns the payload of any message but a `State`."""
     packed: bytes = _pack(msgspec.structs.asdict(message))
     return packed
 
 
-M = TypeVar("M", State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past)
+M = TypeVar(
+    "M", State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past, Measurement
+)
 
 
 def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:
@@ -138,14 +151,19 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
         raise WireError("malformed", str(error)) from None
     if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    if isinstance(message, Sample | State):
+    if isinstance(message, Sample | State | Measurement):
         _check_numbers(message)
     return message
 
 
-def _check_numbers(message: Sample | State) -> None:
+def _check_numbers(message: Sample | State | Measurement) -> None:
     """Refuses vectors of the wrong length and numbers that are not finite."""
-    fields, vectors_of, lengths = _STATE_CHECK if isinstance(message, State) else _SAMPLE_CHECK
+    if isinstance(message, Measurement):
+        fields, vectors_of, lengths = _MEASUREMENT_CHECK
+        number = message.n
+    else:
+        fields, vectors_of, lengths = _STATE_CHECK if isinstance(message, State) else _SAMPLE_CHECK
+        number = message.tick
     vectors = vectors_of(message)
     # a sum is finite only if its terms are; what follows is for the message that fails, and for finite
     # terms whose sum overflows
@@ -155,4 +173,4 @@ def _check_numbers(message: Sample | State) -> None:
         if len(vector) != length:
             raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
         if not all(map(_isfinite, vector)):
-            raise WireError("not finite", f"{name} of {message.site} at tick {message.tick}")
+            raise WireError("not finite", f"{name} of {message.site} at {number}")

@@ -8,9 +8,11 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from ..core.site import Site
-from ..core.tick import Output
+from ..core.tick import Measured, Output
+from ..errors import LawFailed
 from ..log.reader import Log
-from .difference import Difference, first_difference, identical, same_bits
+from .difference import Difference, first_difference, identical, law_failed, same_bits
+from .resumption import measured
 
 
 class Comparison(NamedTuple):
@@ -62,27 +64,36 @@ def compare(log: Log, executed: Iterable[tuple[str, Output]], *, arrivals: bool)
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = agreeing = 0
     first: Difference | None = None
-    for site, output in executed:
-        state = by_tick[site].get(output.tick)
-        if state is None:
-            continue
-        records += 1
-        computed = output if arrivals else output._replace(rx_crc=state.rx_crc)
-        peers = log[site].peers
-        if identical(state, computed, peers):
-            agreeing += 1
-            continue
-        difference = first_difference(state, computed, peers, same_bits)
-        if first is None or (difference is not None and difference.tick < first.tick):
-            first = difference
+    try:
+        for site, output in executed:
+            state = by_tick[site].get(output.tick)
+            if state is None:
+                continue
+            records += 1
+            computed = output if arrivals else output._replace(rx_crc=state.rx_crc)
+            peers = log[site].peers
+            if identical(state, computed, peers):
+                agreeing += 1
+                continue
+            difference = first_difference(state, computed, peers, same_bits)
+            if first is None or (difference is not None and difference.tick < first.tick):
+                first = difference
+    except LawFailed as failed:  # here, and not when the log was made
+        first = first or law_failed(failed)
     return Comparison(records, agreeing, first)
+
+
+def measurements(log: Log) -> dict[str, dict[int, Measured]]:
+    """Returns what arms outside of the program were measured to do: their sites' records say it."""
+    outside = log.scenario.external
+    return {name: {state.tick: measured(state) for state in log[name].states} for name in outside}
 
 
 def late_samples(log: Log) -> list[LateSample]:
     """Returns every sample that came after it was due, by the tick at which it was due."""
     late = []
     for name in log.sites:
-        site = Site(log.scenario.setup(name))
+        site = Site(log.scenario.setup(name)._replace(own=None))  # looks at links, and runs no law
         ordered = log.commands(name)
         for state in log[name].states:
             for command in ordered.get(state.tick, ()):

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..core.tick import Output
+from ..errors import LawFailed
 from ..net.messages import STATE_VECTORS, State
 
 TOLERANCE = 1e-9
@@ -49,6 +50,11 @@ def same_bits(a: float, b: float) -> bool:
 def close(a: float, b: float) -> bool:
     """True where two numbers agree as well as two platforms can be expected to."""
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
+
+
+def law_failed(failed: LawFailed) -> Difference:
+    """Returns the difference where a law from outside fails that did not when the log was made."""
+    return Difference(failed.site, failed.tick or 0, "record", "is there", failed.problem)
 
 
 def _same(a: Sequence[float], b: Sequence[float], same: Same) -> bool:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 from ..core.site import MAX_COMMANDS, Site
 from ..core.tick import MAX_ARRIVALS, Arrival, Command, Output, Tick
-from ..errors import ScenarioError
+from ..errors import LawFailed, ScenarioError
 from ..log.reader import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, command_from
-from .difference import Difference, close, first_difference, identical, same_bits
-from .resumption import Resumption, recorded_output
+from .difference import Difference, close, first_difference, identical, law_failed, same_bits
+from .resumption import Resumption, measured, recorded_output
 from .verdict import Verdict
 
 TOLD_EVERY = 256
@@ -41,6 +41,8 @@ class Execution:
     ) -> None:
         self._site = Site(scenario.setup(site_log.name))
         self._scenario, self._log = scenario, site_log
+        self._external = site_log.name in scenario.external
+        self._law_failed = False
         self._changes = sorted(changes.items())
         self._peers = site_log.peers
         self._by_tick = [by_tick[peer] for peer in site_log.peers]
@@ -70,10 +72,14 @@ class Execution:
                 verdict.gaps.append((self._log.name, expected, state.tick - 1))
                 self._assured = False
             expected = state.tick + 1
-            if not self._assured and not self._resume(n):
-                verdict.unjudged += 1
-                continue
-            self._judge(n, state)
+            try:
+                if self._law_failed or (not self._assured and not self._resume(n)):
+                    verdict.unjudged += 1
+                    continue
+                self._judge(n, state)
+            except LawFailed as failed:
+                self._law_failed = True
+                verdict.differ(law_failed(failed)._replace(tick=state.tick))
         if expected <= self._own_end:
             verdict.gaps.append((self._log.name, expected, self._own_end))
 
@@ -86,7 +92,7 @@ class Execution:
             self._site.resume(before, last)
         arrivals, missing = self._arrivals(state)
         commands, strange = self._commands(state.tick)
-        tick = Tick(state.tick, arrivals, commands)
+        tick = Tick(state.tick, arrivals, commands, measured(state) if self._external else None)
         if missing is not None and missing.field != "":
             strange = strange or missing
         if strange is not None:

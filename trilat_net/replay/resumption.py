@@ -13,7 +13,7 @@ from ..core.arm import JOINTS
 from ..core.delay import LIMIT_US
 from ..core.grid import NS_PER_S
 from ..core.site import Site
-from ..core.tick import MAX_ARRIVALS, Arrival, Mode, Output
+from ..core.tick import MAX_ARRIVALS, Arrival, Measured, Mode, Output
 from ..log.reader import SiteLog
 from ..net.messages import State
 
@@ -58,6 +58,11 @@ def recorded_output(state: State, peers: tuple[str, ...]) -> Output:
         state.cmd,
         mem,
     )
+
+
+def measured(state: State) -> Measured:
+    """Returns what an arm outside of the program was measured to do at a tick: it stands in the record."""
+    return Measured(state.q, state.qd)
 
 
 class Resumption:

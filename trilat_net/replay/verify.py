@@ -30,6 +30,7 @@ def verify(log: Log, progress: Progress | None = None) -> Verdict:
 
     Raises:
         LogError: a record cannot be read.
+        ScenarioError: a law from outside is not there.
     """
     verdict = Verdict(whole_run=log.session.get("fingerprint") == fingerprint())
     with collector.paused():

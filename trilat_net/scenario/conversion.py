@@ -12,6 +12,7 @@ from ..core.arm import positive_definite
 from ..errors import ScenarioError
 from . import expectation
 from .actors import Hand, Recorded, Spring, Surrounding, TipSpring, Wall
+from .fitness import check_fitness
 from .link import LinkBase
 from .links import Constant, Link, Trace
 from .model import Scenario
@@ -46,6 +47,7 @@ def convert(resolved: Table) -> Scenario:
                 "its inertia matrix is singular in some pose: give the links mass away from their joints",
                 path=f"sites.{name}.arm",
             )
+        check_fitness(name, site, len(scenario.sites))
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     for name, link in scenario.links.items():

@@ -10,6 +10,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from . import window
+from .window import Window
+
 NotNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
 Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
 Pose = Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(min_length=2, max_length=2)]
@@ -49,6 +52,7 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         late_samples_max: samples of all links that came in too late to be used as their link meant them.
         no_gaps: true: there is a record of every tick, from 0 to the last that any site had to make; false
             asks nothing.
+        windows: what stretches of the run must show, see `Window`.
     """
 
     stable: bool | None = None
@@ -69,6 +73,7 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     mean_age_min_ms: NotNegative | None = None
     late_samples_max: Annotated[int, Meta(ge=0)] | None = None
     no_gaps: bool = False
+    windows: tuple[Window, ...] = ()
 
     @property
     def asks(self) -> bool:
@@ -87,6 +92,9 @@ def fault(expect: Expect, sites: Sequence[str]) -> tuple[str, str] | None:
     for name in expect.end_pose_rad:
         if name not in sites:
             return f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}"
+    for n, one in enumerate(expect.windows):
+        if found := window.fault(one, sites):
+            return f"windows[{n}]{'.' * bool(found[0])}{found[0]}", found[1]
     for least, most in (
         ("peak_error_min_rad", "peak_error_max_rad"),
         ("end_error_min_rad", "end_error_max_rad"),

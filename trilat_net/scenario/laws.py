@@ -132,7 +132,8 @@ class ForceReflecting(Frozen, frozen=True, tag_field="law", tag="p_f"):
 
     `felt` is the torque of hands and environments on the peers' arms as it came over the links, weighted by
     dominance. A slave has K and k_f = 0, a master K = 0 and k_f. In free motion it is calm; in contact no
-    damping makes it stable for every stiffness and delay: the classic that contact separates.
+    damping makes it stable for every stiffness and delay: the classic that contact separates. It is for one
+    master and one slave.
 
     Attributes:
         K: stiffness per joint, N m/rad.

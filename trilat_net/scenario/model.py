@@ -95,6 +95,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         tables: dict[str, Any] = msgspec.to_builtins(self)
         words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         words = {key: value for key, value in words.items() if value}
+        for site in tables["sites"].values():
+            if site["arm"]["known"]:
+                del site["arm"]["known"]
         for table in (tables, *tables["sites"].values()):
             for key, unasked in _UNASKED.items():  # what nobody asked for is not there
                 if table.get(key) in unasked:
@@ -130,6 +133,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         """True where a sample of some link is in use as soon as it has come: then the network decides."""
         return any(link.measured for link in self._all_links())
 
+    @property
+    def external(self) -> tuple[str, ...]:
+        """The sites whose arms are outside of the program."""
+        return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
         spec = self.sites[site]
@@ -154,7 +162,8 @@ class Scenario(Frozen, frozen=True, dict=True):
             ),
             on_stale=spec.on_stale.rule,
             external=spec.plant == "external",
-            own=spec.control.maker if isinstance(spec.control, Own) else None,
+            own=spec.control.maker(len(self.sites)) if isinstance(spec.control, Own) else None,
+            theta_known=spec.arm.known,
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:

@@ -1,15 +1,17 @@
 """A control law of somebody's own, as a scenario names it: `law = "package.module:Law"`.
 
-Law: the scenario holds the hash of the file that the law is in, so that a log says whether the law that is
-executed again is the one that ran. Naming a law runs nothing; a site that is built imports it.
+Law: the scenario holds the hash of the file that defines the law, so that a log says whether the law that is
+executed again is the one that ran. Naming a law runs nothing, not even the package that it is in; a site
+that is built imports it, and only where that file defines a class of that name.
 """
 
+import ast
 import hashlib
 import importlib
-import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +23,11 @@ from ..core.setup import Gains, Law
 from ..errors import ScenarioError
 from .frozen import Frozen
 
-CODE = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
+CODE = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
+_METHODS = ("torque", "memory", "recall")
+
+_imported: dict[str, str] = {}
+"""Per module that a law came from the hash that its file had when it was imported."""
 
 
 class Own(Frozen, frozen=True, tag_field="law", tag="own"):
@@ -41,18 +47,22 @@ class Own(Frozen, frozen=True, tag_field="law", tag="own"):
         """Returns the numbers for the core: none but which law."""
         return Gains(Law.OWN)
 
-    @property
-    def maker(self) -> OwnLawMaker:
-        """What makes the law, in a site that is being built."""
+    def maker(self, sites: int) -> OwnLawMaker:
+        """Returns what makes the law, in a site that is being built.
+
+        Args:
+            sites: how many sites the experiment has.
+        """
 
         def make(facts: Facts) -> OwnLaw:
-            kind = _found(self.code)
-            _check_methods(kind, self.code, facts.site)  # before anything of it is called
+            kind = _found(self.code, f"sites.{facts.site}.control.law")
+            _check_kind(kind, self.code, facts, sites)  # before anything of it is called
             try:
                 law: OwnLaw = kind(facts, **self.settings)
-            except Exception as error:  # somebody's code
+            except (Exception, SystemExit) as error:  # somebody's code
+                given = ", ".join(f"{key} = {value!r}" for key, value in self.settings.items())
                 raise ScenarioError(
-                    f"{self.code} cannot be made with {', '.join(self.settings) or 'no settings'}: "
+                    f"{self.code} cannot be made with {given or 'no settings'}: "
                     f"{type(error).__name__}: {error}",
                     path=f"sites.{facts.site}.control",
                 ) from None
@@ -60,13 +70,30 @@ class Own(Frozen, frozen=True, tag_field="law", tag="own"):
 
         return make
 
+    def check_unchanged(self, site: str) -> None:
+        """Refuses to begin with another law than the scenario names.
+
+        Raises:
+            ScenarioError: the law's file is not there, or is another one.
+        """
+        path = f"sites.{site}.control"
+        if source_sha256(self.code, f"{path}.law") != self.source_sha256:
+            raise ScenarioError(
+                f"the file of {self.code} is not the one that the scenario names by this hash; put that one "
+                f"there, or write law = {self.code!r} to take the one that is",
+                path=f"{path}.source_sha256",
+            )
+
     def changed(self) -> str | None:
-        """Says how the law differs from the one that the scenario names; None where it does not."""
-        try:
-            now = source_sha256(self.code, "control.law")
-        except ScenarioError as error:
-            return error.problem
-        return None if now == self.source_sha256 else f"the file of {self.code} was changed"
+        """Says how the law's file differs from the one that the scenario names; None where it does not.
+
+        Raises:
+            ScenarioError: there is no such file.
+        """
+        now = source_sha256(self.code, "control.law")
+        if now == self.source_sha256:
+            return None
+        return f"its sha256 is {now[:16]}, and was {self.source_sha256[:16]}"
 
 
 def source_sha256(code: str, path: str) -> str:
@@ -79,46 +106,104 @@ def source_sha256(code: str, path: str) -> str:
     Raises:
         ScenarioError: there is no such file.
     """
-    return hashlib.sha256(_file(code, path).read_bytes()).hexdigest()
+    file = _file(code, path)
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
 
 
-def _check_methods(kind: Any, code: str, site: str) -> None:
-    """Refuses what is no law; a log that names any other thing of a machine's modules runs nothing of it."""
-    path = f"sites.{site}.control.law"
-    if not isinstance(kind, type):
-        raise ScenarioError(f"{code} is no class; see docs/own-controller.md", path=path)
-    missing = [name for name in ("torque", "memory", "recall") if not callable(getattr(kind, name, None))]
+def _check_kind(kind: Any, code: str, facts: Facts, sites: int) -> None:
+    """Refuses what is no law; a log that names any other thing of a machine's modules runs nothing of it.
+
+    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, and `needs_theta = True`.
+    """
+    path = f"sites.{facts.site}.control.law"
+    missing = [name for name in _METHODS if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(f"{code} has no {', '.join(missing)}; see docs/own-controller.md", path=path)
+    stated = getattr(kind, "sites", None)
+    least, most = (stated, stated) if isinstance(stated, int) else _range(stated, code, path)
+    if not least <= sites <= most:
+        asked = f"{least}" if least == most else f"{least} to {most}"
+        raise ScenarioError(f"{code} is for {asked} sites, and here are {sites}", path=path)
+    if getattr(kind, "needs_theta", False) and not facts.theta:
+        raise ScenarioError(
+            f"{code} needs the arm's parameters, which nobody knows (arm.known = false): identify the arm "
+            "and leave known out, or choose a law that learns them",
+            path=path,
+        )
+
+
+def _range(stated: Any, code: str, path: str) -> tuple[int, int]:
+    """Returns the numbers of sites that a law says it is for."""
+    if stated is None:
+        return 2, sys.maxsize
+    ends = tuple(stated) if isinstance(stated, tuple | list) else ()
+    if len(ends) != 2 or not all(isinstance(end, int) for end in ends):
+        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
+    return ends[0], ends[1]
 
 
 def _file(code: str, path: str) -> Path:
     module = code.partition(":")[0]
     with _here():
-        try:
-            spec = importlib.util.find_spec(module)
-        except (ImportError, ValueError) as error:
-            raise ScenarioError(f"{module} cannot be found: {error}", path=path) from None
+        spec = _spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
-            f"there is no module {module}; it must be installed, or lie in the folder that you are in",
+            f"there is no module {module}, where {code} is; install it, or be in the folder that it lies in "
+            "(PYTHONPATH counts too)",
             path=path,
         )
     return Path(spec.origin)
 
 
-def _found(code: str) -> Any:
+def _spec(module: str) -> ModuleSpec | None:
+    """Finds a module as an import would, without running the packages that it is in."""
+    spec = None
+    folders = None
+    *packages, last = module.split(".")
+    for depth, _ in enumerate([*packages, last], 1):
+        name = ".".join([*packages, last][:depth])
+        try:
+            found = (finder.find_spec(name, folders) for finder in sys.meta_path)
+            spec = next((one for one in found if one is not None), None)
+        except (ImportError, ValueError, AttributeError):
+            return None
+        if spec is None:
+            return None
+        folders = spec.submodule_search_locations
+        if folders is None and name != module:
+            return None
+    return spec
+
+
+def _found(code: str, path: str) -> Any:
+    """Returns the class that a law's name stands for, of the file as it is now."""
     module, _, name = code.partition(":")
-    _file(code, "control.law")
+    _check_defined(name, _file(code, path), path)
+    now = source_sha256(code, path)
     with _here():
         try:
-            return getattr(importlib.import_module(module), name)
-        except AttributeError:
-            raise ScenarioError(f"{module} has no {name}", path="control.law") from None
-        except Exception as error:  # somebody's code
+            found = importlib.import_module(module)
+            if _imported.setdefault(module, now) != now:  # edited while this program runs
+                found = importlib.reload(found)
+                _imported[module] = now
+        except (Exception, SystemExit) as error:  # somebody's code
             raise ScenarioError(
-                f"{module} cannot be imported: {type(error).__name__}: {error}", path="control.law"
+                f"{module} cannot be imported: {type(error).__name__}: {error}", path=path
             ) from None
+    return getattr(found, name)
+
+
+def _check_defined(name: str, file: Path, path: str) -> None:
+    """Refuses a file that defines no class of that name, before anything of it runs."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
+    if not any(isinstance(node, ast.ClassDef) and node.name == name for node in tree.body):
+        raise ScenarioError(f"{file} defines no class {name}; see docs/own-controller.md", path=path)
 
 
 @contextmanager
@@ -129,6 +214,7 @@ def _here() -> Iterator[None]:
         yield
         return
     sys.path.insert(0, here)
+    importlib.invalidate_caches()  # a file that was written a moment ago
     try:
         yield
     finally:

@@ -20,6 +20,7 @@ from .own_law import CODE, source_sha256
 from .pushing import resolve_actors
 from .site import Arm, Limits, OnStale, SiteSpec
 from .tables import Table, fields, finite, known, one_of
+from .window import check_keys as check_windows
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
 _TABLES = (
@@ -93,6 +94,7 @@ def resolve(tables: Table, folder: Path | None) -> Table:
     groups: dict[str, type[msgspec.Struct]] = {**_GROUPS, "expect": Expect}
     for group, kind in groups.items():
         known(tables.get(group, {}), fields(kind), group)
+    check_windows(tables.get("expect", {}).get("windows"))
     _resolve_control(tables.get("control", {}), {}, "control")
     sites = _resolve_sites(tables)
     rows = _resolve_dominance(tables, list(sites))
@@ -130,6 +132,11 @@ def _resolve_own_law(code: str, written: Table, default: Table, path: str) -> Ta
     settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
     if not re.fullmatch(CODE, code):
         raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
+    if "settings" in settings:
+        raise ScenarioError(
+            "what a law from outside is made with stands beside its name, as in control.gain = 5",
+            path=f"{path}.settings",
+        )
     return {
         "law": "own",
         "code": code,

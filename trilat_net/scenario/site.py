@@ -28,6 +28,8 @@ class Arm(Frozen, frozen=True):
         lc2_m: distance of its centre of mass from joint 2, m.
         I2_kg_m2: inertia about its centre of mass, kg m^2.
         g_m_s2: gravitational acceleration, m/s^2.
+        known: false where nobody knows masses and inertias, as of a real arm that was not identified: they
+            are then in no formula. Only for an arm outside of the program.
     """
 
     l1_m: Positive = 1.0
@@ -39,6 +41,7 @@ class Arm(Frozen, frozen=True):
     lc2_m: Positive = 1.0
     I2_kg_m2: NotNegative = 0.0
     g_m_s2: NotNegative = 9.81
+    known: bool = True
 
     @property
     def theta(self) -> Array:

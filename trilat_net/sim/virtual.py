@@ -12,7 +12,8 @@ from typing import NamedTuple
 from .. import collector
 from ..core.grid import NS_PER_S
 from ..core.site import Site
-from ..core.tick import Arrival, Command, Mode, Output, Tick, diverged_text, mode_text
+from ..core.tick import Arrival, Command, Measured, Mode, Output, Tick, diverged_text, mode_text
+from ..errors import LawFailed, ScenarioError
 from ..log.accounting import Account
 from ..log.container import Sink
 from ..log.writer import LogWriter
@@ -21,6 +22,7 @@ from ..net.messages import Event
 from ..net.stats import LoopStats
 from ..net.wire import encode, encode_state
 from ..scenario import Scenario
+from ..scenario.own_law import Own
 from .network import Network, PromptNetwork
 
 
@@ -34,9 +36,45 @@ class Stepped(NamedTuple):
 
 Commands = Mapping[str, Mapping[int, Sequence[Command]]]
 """Per site and tick the commands that come in then."""
+Measurements = Mapping[str, Mapping[int, Measured]]
+"""Per site whose arm is outside of the program, and per tick, what that arm was measured to do."""
 
 
-def run(scenario: Scenario, network: Network | None = None, commands: Commands = {}) -> Iterator[Stepped]:  # noqa: B006
+def check_runs(scenario: Scenario, *, as_named: bool = True) -> None:
+    """Refuses what virtual time cannot run, before anything is written of it.
+
+    Args:
+        scenario: the experiment.
+        as_named: whether laws from outside must be the ones that it names by their hashes.
+
+    Raises:
+        ScenarioError: an arm is outside of the program, or a law from outside cannot be made, or its file is
+            not the one that the scenario names.
+    """
+    for name in scenario.external:
+        raise _refused(name)
+    for name, spec in scenario.sites.items():
+        if isinstance(spec.control, Own):
+            if as_named:
+                spec.control.check_unchanged(name)
+            Site(scenario.setup(name))
+
+
+def _refused(site: str) -> ScenarioError:
+    return ScenarioError(
+        "is external: that arm is outside of the program, and virtual time has none; run it live, or "
+        "simulate it with plant = 'simulated'",
+        path=f"sites.{site}.plant",
+    )
+
+
+def run(
+    scenario: Scenario,
+    network: Network | None = None,
+    commands: Commands = {},  # noqa: B006
+    measured: Measurements = {},  # noqa: B006
+    ends: Mapping[str, int] = {},
+) -> Iterator[Stepped]:
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
     A site whose network is not ready lets the others go first. A run that diverges ends with the ticks of
@@ -46,11 +84,21 @@ def run(scenario: Scenario, network: Network | None = None, commands: Commands =
         scenario: the experiment.
         network: what joins the sites; by default every sample arrives at the next tick.
         commands: what is ordered from outside.
+        measured: what arms outside of the program were measured to do.
+        ends: the last tick of sites that make fewer than the scenario has.
+
+    Raises:
+        ScenarioError: an arm is outside of the program, and nobody measured it.
+        LawFailed: a law from outside did.
     """
+    for name in scenario.external:
+        if name not in measured:
+            raise _refused(name)
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     sites = [Site(scenario.setup(name)) for name in scenario.names]
-    ticks = [scenario.ticks(name) for name in scenario.names]
-    pending = [(0, index, 0) for index in range(len(sites))]  # (t_ns, order, k) of each site's next tick
+    ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
+    # (t_ns, order, k) of each site's next tick
+    pending = [(0, index, 0) for index in range(len(sites)) if ticks[index]]
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
         place = 0
@@ -59,7 +107,8 @@ def run(scenario: Scenario, network: Network | None = None, commands: Commands =
         t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = joined.deliver(site.name, k)
-        output = site.step(Tick(k, arrivals, commands.get(site.name, {}).get(k, ())))
+        ordered, arm = commands.get(site.name, {}), measured.get(site.name, {})
+        output = site.step(Tick(k, arrivals, ordered.get(k, ()), arm.get(k)))
         joined.send(site.name, output)
         yield Stepped(site, arrivals, output)
         if output.mode is Mode.DIVERGED:
@@ -127,8 +176,10 @@ def record(
     network: Network | None = None,
     stopped: Callable[[], bool] = lambda: False,
     views_hz: float = 0.0,
+    *,
+    as_named: bool = True,
 ) -> bool:
-    """Runs a scenario in virtual time and writes its log.
+    """Runs a scenario in virtual time and writes its log, which is finished whatever ends the run.
 
     Args:
         scenario: the experiment.
@@ -136,13 +187,17 @@ def record(
         network: what joins the sites.
         stopped: True once the run was asked to end; then the file is finished with what there is.
         views_hz: messages a second of the standard channels beside the log's own, see `log.views`.
+        as_named: whether laws from outside must be the ones that the scenario names by their hashes.
 
     Returns:
         True where the run stayed within its limits, False where it diverged.
 
     Raises:
         LogError: the disk refused.
+        ScenarioError: virtual time cannot run it; then nothing is written.
+        LawFailed: a law from outside did; the log says so.
     """
+    check_runs(scenario, as_named=as_named)
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
     members: dict[str, _Member] = {}
     within = True
@@ -157,6 +212,12 @@ def record(
                 t_ns = output.t_ns
                 if stopped():
                     break
+    except LawFailed as failed:
+        if failed.site not in members:
+            nobody = Site(scenario.setup(failed.site)._replace(own=None))
+            members[failed.site] = _Member(scenario, nobody, writer)
+        members[failed.site].say("failed", str(failed), t_ns)
+        raise
     finally:  # whatever ends the run leaves a file that is finished
         try:
             for name, member in members.items():

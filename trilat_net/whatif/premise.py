@@ -87,6 +87,7 @@ def premise(log: Log, replace: Sequence[str], overrides: Overrides, *, closed_lo
     for name in replace:
         site_named(original, name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
+    _check_arms(original, replaced)
     recorded = tuple(name for name in names if name not in replaced)
     for key in _keys(overrides):
         _check_key(key, replaced, recorded)
@@ -96,6 +97,18 @@ def premise(log: Log, replace: Sequence[str], overrides: Overrides, *, closed_lo
     changes = _changes(original, scenario)
     without = [changed for changed in _changes(original, wanted) if changed not in changes]
     return Premise(original, scenario, replaced, recorded, changes, without)
+
+
+def _check_arms(original: Scenario, replaced: Sequence[str]) -> None:
+    """Refuses to execute afresh a site whose arm was outside of the program."""
+    for name in original.external:
+        if name in replaced:
+            others = ", ".join(other for other in original.names if other not in original.external)
+            raise ScenarioError(
+                "is external: how that arm would have moved otherwise is not known; execute others afresh"
+                + (f", as in --replace {others.split(', ')[0]}" if others else ""),
+                path=f"sites.{name}.plant",
+            )
 
 
 def _keys(overrides: Overrides) -> list[str]:

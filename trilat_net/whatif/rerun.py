@@ -22,6 +22,7 @@ from ..log.container import Sink
 from ..log.logfile import new_log
 from ..log.reader import Log, open_log
 from ..log.views import VIEWS_HZ
+from ..replay.outside import outside_laws
 from ..replay.verify import executed_sites
 from .actor import Made
 from .effect import LinkEffect, SiteEffect, effects
@@ -199,6 +200,9 @@ def _notes(again: Rerun) -> Iterator[str]:
         yield "the log was made with another platform's arithmetic: equal bits cannot be expected"
     if not log.complete:
         yield "the log was not finished: executed as far as it goes"
+    for law in outside_laws(asked.scenario):
+        if law.changed and any(site in asked.replaced for site in law.sites):
+            yield f"executed as its file is now: {law}"
     yield from _later_changes(again)
     for effect in again.sites.values():
         yield from _unknown(effect)

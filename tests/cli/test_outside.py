@@ -1,0 +1,138 @@
+"""Laws and arms from outside, by commands: what works, and one sentence where it does not."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tests.cli.running import trilat
+from trilat_net.log.reader import open_log
+
+DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
+FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
+SHORT = ("--duration", "0.1")
+
+
+def block(language: str) -> str:
+    """The first block of the page in a language."""
+    found = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_the_page_does_as_it_says(tmp_path: Path) -> None:
+    code = block("python")
+    assert len([line for line in code.splitlines() if line]) <= 30
+    (tmp_path / "mylaws.py").write_text(code)
+    commands = [shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()]
+    sim, verify, demo = commands
+    trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
+    log = open_log(tmp_path / "spring.mcap")
+    assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
+    checked = trilat(*verify, cwd=tmp_path)
+    assert checked.code == 0
+    assert "6000/6000 records identical" in checked.out
+    assert "mylaws:Spring of m1, m2, s; its file is the one that ran" in checked.out
+    assert demo[:2] == ["demo", "paper"]
+    shown = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
+    shown.succeeds()
+    assert open_log(tmp_path / "slave.mcap").scenario.sites["m1"].control.Kd == (3.0, 3.0)
+
+
+def test_what_a_page_says_of_a_law_is_what_a_law_gets() -> None:
+    """Every name in the table is one of `core.own`, and every one of those is in the table."""
+    from trilat_net.core.own import Facts, Now
+
+    page = DOC.read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(Facts|Now)`, [^|]*\| (.*) \|$", page, re.MULTILINE))
+    for kind in (Facts, Now):
+        assert set(re.findall(r"`(\w+)`", rows[kind.__name__])) == set(kind._fields)
+
+
+@pytest.fixture
+def law(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A law in the folder, its module this test's own, and a log of it."""
+    name = "".join(letter for letter in request.node.name if letter.isalnum())
+    file = tmp_path / f"cli_{name}.py"
+    file.write_text("from tests.laws import Adaptive\nclass Law(Adaptive):\n    pass\n")
+    trilat("sim", "two_sites", *SHORT, "--set", f"control.law={file.stem}:Law", cwd=tmp_path).succeeds()
+    return file
+
+
+def test_before_code_from_outside_runs_it_is_said_which(law: Path, tmp_path: Path) -> None:
+    for command in (["verify"], ["verify", "--json"], ["rerun", "--closed-loop"]):
+        done = trilat(command[0], "two_sites.mcap", *command[1:], cwd=tmp_path)
+        assert done.code == 0
+        assert done.err.startswith("note: executing this log runs code from outside: ")
+        assert f"{law.stem}:Law of m, s; its file is the one that ran" in done.err
+
+
+def test_a_law_whose_file_was_changed_is_told_and_judged(law: Path, tmp_path: Path) -> None:
+    law.write_text(law.read_text() + "# a word\n")
+    done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
+    assert done.code == 0
+    assert "its file was changed" in done.out
+    assert "200/200 records identical" in done.out
+    again = trilat("rerun", "two_sites.mcap", "--closed-loop", cwd=tmp_path)
+    assert "executed as its file is now" in again.out
+    law.write_text(law.read_text().replace("pass", "def torque(self, now): return [0.0, 0.0]"))
+    done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
+    assert done.code == 1
+    assert "its file was changed" in done.out
+    assert "differ, the first: m, tick " in done.err
+
+
+@pytest.mark.parametrize("command", [["verify"], ["rerun", "--closed-loop"]])
+def test_a_law_whose_file_is_not_there_is_bad_input(law: Path, command: list[str], tmp_path: Path) -> None:
+    law.unlink()
+    done = trilat(command[0], "two_sites.mcap", *command[1:], cwd=tmp_path)
+    done.refuses(law.stem, "install it, or be in the folder that it lies in")
+
+
+def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path) -> None:
+    law.unlink()
+    assert "200, none missing" in trilat("log", "info", "two_sites.mcap", cwd=tmp_path).succeeds()
+    done = trilat("rerun", "two_sites.mcap", "--closed-loop", "--set", "control.law=adaptive", cwd=tmp_path)
+    assert done.code == 0
+
+
+def test_a_run_whose_law_fails_is_one_sentence_and_a_finished_log(tmp_path: Path) -> None:
+    done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
+    done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
+    assert open_log(tmp_path / "two_sites.mcap").complete
+    checked = trilat("verify", "two_sites.mcap", "--virtual", cwd=tmp_path)
+    assert checked.code == 0
+    assert "81/81 records identical" in checked.out
+
+
+@pytest.mark.parametrize("seeds", ["1", "1..3"])
+def test_a_trial_whose_law_fails_is_a_trial_that_failed(seeds: str, tmp_path: Path) -> None:
+    jitter = ("--set", "link.model=uniform", "--set", "link.delay_ms=9", "--set", "link.half_width_ms=1")
+    done = trilat("test", "two_sites", "--seeds", seeds, *jitter, *FAILING, cwd=tmp_path)
+    assert done.code == 1
+    assert "no result: " in done.out
+    assert "tests.laws:Failing of s failed at tick 40: torque[1] is nan" in done.out
+
+
+def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
+    trilat("sim", "two_sites", *SHORT, cwd=tmp_path).succeeds()
+    trilat("rerun", "two_sites.mcap", "--replace", "s", *FAILING, cwd=tmp_path).refuses(
+        "tests.laws:Failing of s failed at tick 40", code=1
+    )
+
+
+@pytest.mark.parametrize("command", ["sim", "test"])
+def test_virtual_time_has_no_arm_outside(command: str, tmp_path: Path) -> None:
+    done = trilat(command, "two_sites", "--set", "sites.s.plant=external", cwd=tmp_path)
+    done.refuses("sites.s.plant", "virtual time has none; run it live")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
+def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
+    from tests.replay.test_outside import external_log
+
+    (tmp_path / "outside.mcap").write_bytes(external_log())
+    trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses("sites.s.plant", "as in --replace m")
+    assert trilat("rerun", "outside.mcap", "--replace", "m", cwd=tmp_path).code == 0

@@ -1,0 +1,73 @@
+"""What comes from outside, in real processes: a law that cannot keep up, an arm that is no arm of ours."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilat_net.experiment import compare_with_virtual
+from trilat_net.log.reader import open_log
+
+from .processes import PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
+
+ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
+SLOW = """
+import time
+from tests.laws import Adaptive
+
+class Law(Adaptive):
+    def torque(self, now):
+        if now.k > 400:
+            time.sleep(0.02)
+        return super().torque(now)
+"""
+
+
+@pytest.fixture(autouse=True)
+def laws_of_tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLAIN, "PYTHONPATH", str(Path(__file__).parents[2]))
+
+
+def test_a_law_that_is_too_slow_ends_the_session_in_order(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (stage.folder / "slow_law.py").write_text(SLOW)
+    monkeypatch.chdir(stage.folder)
+    law = ("--set", "sites.s.control.law=slow_law:Law")
+    session = Session(stage, "two_sites", ("m", "s"), *law, "--duration", "20")
+    session.all()
+    assert session.codes() == {"recorder": 0, "m": 1, "s": 1}
+    (told,) = (line for line in session.processes["s"].text().splitlines() if line.startswith("error: "))
+    assert "the law slow_law:Law of s failed at tick 4" in told
+    assert "it is too slow" in told
+    assert told.removeprefix("error: ") in session.processes["m"].text()
+    log = open_log(session.log)
+    assert log.complete
+    assert [event.member for event in log.events if event.kind == "failed"] == ["s"]
+    assert 400 < len(log["s"]) < 500
+    executed_again(log)
+
+
+def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -> None:
+    """One of them with a law that is none of ours either."""
+    options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "3")
+    options = (*options, "--set", "sites.m1.control.law=tests.laws:Adaptive")
+    session = Session(stage, "paper", ("m1", "m2", "s"), *options)
+    session.all()
+    session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
+    place = session.endpoints[2]
+    done = subprocess.run(
+        [sys.executable, str(ARM), "s", "--session", "t", "--connect", place],
+        env=PLAIN,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
+    assert done.stdout.startswith("over: the arm is at ")
+    assert session.codes() == dict.fromkeys(("recorder", "m1", "m2", "s"), 0)
+    log = whole(session.log)
+    executed_again(log)
+    assert compare_with_virtual(log).fed.identical == 9000
+    assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations

@@ -1,0 +1,57 @@
+"""What a law needs and a scenario does not give is refused, with the reason."""
+
+from typing import Any
+
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load, parse
+
+OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "path", "fact"),
+    [
+        ("paper", {"sites.s.arm.known": False}, "sites.s.arm.known", "plant = 'external'"),
+        ("paper", {"control.law": "p_f"}, "sites.m1.control.law", "here are 3 sites"),
+        ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_d"}, "sites.s.control.gravity", "p_d takes"),
+        ("two_sites", {**OUTSIDE, "sites.s.control.law": "pd_d"}, "sites.s.control.gravity", "pd_d takes"),
+        ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_f"}, "sites.s.control.gravity", "p_f takes"),
+        ("two_sites", {"sites.m.plant": "external"}, "sites.m.hands", "is pushed outside of it"),
+    ],
+)
+def test_a_law_that_cannot_do_its_work_is_refused(
+    name: str, overrides: dict[str, Any], path: str, fact: str
+) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load(name, overrides)
+    assert caught.value.path == path
+    assert fact in caught.value.problem
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {},
+        {"sites.s.control.law": "adaptive_box"},
+        {"sites.s.control.law": "p_d", "sites.s.control.gravity": 0.0},
+        {"sites.s.control.law": "pd_d", "sites.s.arm.g_m_s2": 0.0},
+        {"sites.s.control.law": "tests.laws:Adaptive"},
+    ],
+    ids=str,
+)
+def test_a_law_that_needs_no_masses_drives_an_arm_that_nobody_knows(overrides: dict[str, Any]) -> None:
+    scenario = load("two_sites", {**OUTSIDE, **overrides})
+    assert not scenario.setup("s").theta_known
+    assert parse(scenario.text) == scenario
+
+
+def test_a_known_arm_is_not_mentioned_so_that_older_scenarios_keep_their_hashes() -> None:
+    assert "known" not in load("two_sites").text
+    assert load("two_sites", {"arm.known": True}).sha256 == load("two_sites").sha256
+    assert load("two_sites", OUTSIDE).text.count("known = false") == 1
+
+
+def test_direct_force_reflection_is_for_a_pair() -> None:
+    assert load("two_sites", {"control.law": "p_f"}).setup("s")

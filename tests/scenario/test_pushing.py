@@ -1,0 +1,96 @@
+"""What authors get wrong of hands and environments: one sentence, at the key, with what would be right."""
+
+import re
+from typing import Any
+
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load
+from trilat_net.scenario.actors import HANDS, SURROUNDINGS
+
+PULSE = {"kind": "pulse", "start_s": 1.0, "end_s": 2.0, "peak_nm": [1.0, 1.0]}
+SPRING = {"kind": "spring", "stiffness_nm_rad": 100.0}
+TIP = {"kind": "tip_spring", "stiffness_n_m": 100.0}
+RECORDED = {"kind": "recorded", "points": [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]]}
+VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 1.0}
+WALL = {"kind": "wall", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m": 2000.0}
+GROUPS = {"hands": [PULSE, SPRING, TIP, RECORDED], "environment": [VISCOUS, WALL]}
+
+
+def refused(group: str, entry: Any) -> str:
+    """What is said of one table of the last site; the sites before it have none."""
+    with pytest.raises(ScenarioError) as error:
+        load("free", {f"sites.s.{group}": [entry]})
+    path, _, problem = str(error.value).removeprefix("free: ").partition(": ")
+    return path.removeprefix(f"sites.s.{group}[0]") + ": " + problem
+
+
+def test_every_kind_has_an_example_here_that_is_valid() -> None:
+    for group, kinds in (("hands", HANDS), ("environment", SURROUNDINGS)):
+        assert [entry["kind"] for entry in GROUPS[group]] == list(kinds)
+        assert len(getattr(load("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group)) == len(kinds)
+
+
+@pytest.mark.parametrize(
+    ("group", "entry", "key"),
+    [
+        (group, {k: v for k, v in entry.items() if k != key}, key)
+        for group, entries in GROUPS.items()
+        for entry in entries
+        for key in entry
+    ],
+    ids=str,
+)
+def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key: str) -> None:
+    said = refused(group, entry)
+    assert said.startswith(f".{key}: is missing: ")
+    assert len(said) > len(f".{key}: is missing: ") + 10
+
+
+@pytest.mark.parametrize(
+    ("group", "entry", "key"),
+    [
+        (group, {**entry, key: "x"}, key)
+        for group, entries in GROUPS.items()
+        for entry in entries
+        for key in {**HANDS, **SURROUNDINGS}[entry["kind"]].__struct_fields__
+    ],
+    ids=str,
+)
+def test_a_value_of_the_wrong_kind_is_told_what_its_key_wants(group: str, entry: Any, key: str) -> None:
+    said = refused(group, entry)
+    assert said.startswith(f".{key}: must be ")
+    assert key == "points" or said.endswith("is 'x'")
+
+
+@pytest.mark.parametrize(
+    ("group", "entry", "said"),
+    [
+        ("hands", {"kind": "pluse"}, ".kind: is 'pluse', must be one of 'pulse', .*; did you mean 'pulse'"),
+        ("hands", WALL, ".kind: is 'wall', which belongs in environment"),
+        ("environment", PULSE, ".kind: is 'pulse', which belongs in hands"),
+        ("hands", {**PULSE, "peak": 1.0}, ".peak: unknown key; did you mean 'peak_nm'"),
+        ("hands", {**SPRING, "stiffness_n_m": 1.0}, ".*; did you mean 'stiffness_nm_rad'"),
+        ("hands", {**PULSE, "end_s": 0.5}, ".end_s: must be later than start_s = 1, is 0.5"),
+        ("hands", {**SPRING, "move_start_s": 4.0}, ".move_end_s: must not be before move_start_s = 4, is 0"),
+        ("hands", {**PULSE, "peak_nm": [1.0]}, ".peak_nm: must be one torque for both joints or two, ON"),
+        ("hands", {**SPRING, "stiffness_nm_rad": -5.0}, ".*at least 0, N m/rad, is -5.0"),
+        ("hands", {**SPRING, "sampled": 1}, ".sampled: must be true or false, is 1"),
+        ("hands", {**RECORDED, "points": [[0.0, 1.0]]}, r".points\[0\]: must be a row \[time in s, torque"),
+        ("hands", {**RECORDED, "points": [[1.0, 0.0, 0.0]] * 2}, ".points: must be in the order of"),
+        ("environment", {**WALL, "normal": [0.0, 0.0]}, ".normal: must point somewhere, is zero"),
+        ("environment", {**WALL, "normal": "left"}, ".normal: .*to which side the wall is free, is 'left'"),
+        ("environment", {**WALL, "stiffness_n_m": [1.0, 2.0]}, ".stiffness_n_m: must be a number of"),
+        ("environment", {**WALL, "end_s": -1.0}, ".end_s: must be a time of at least 0 s, is -1.0"),
+        ("environment", [WALL], ": must be a table"),
+    ],
+    ids=str,
+)
+def test_what_authors_get_wrong(group: str, entry: Any, said: str) -> None:
+    assert re.match(said, refused(group, entry))
+
+
+def test_a_start_pose_that_is_none_is_refused_at_its_own_key() -> None:
+    with pytest.raises(ScenarioError, match=r"sites.m1.q0_rad"):
+        load("free", {"sites.m1.q0_rad": ["x", 0.0], "sites.m1.hands": [SPRING, TIP]})

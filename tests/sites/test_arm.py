@@ -1,0 +1,321 @@
+"""An arm outside of the program: its measurements are the record, and without them nothing goes on."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sites.arm import CAPACITY, SILENT_NS, OutsideArm
+from trilat_net.errors import RunFailed, SessionError
+from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.log.reader import Log
+from trilat_net.net import topics
+from trilat_net.net.arm_port import FRESH_NS, ArmPort
+from trilat_net.net.bus import Bus, LocalNetwork, StampingRing
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.measurement import Measurement
+from trilat_net.net.messages import VERSION, Event
+from trilat_net.net.wire import encode
+from trilat_net.scenario import load
+
+from .relay import RelayClock
+from .sessions import SESSION, Session
+
+OUTSIDE = {"duration_s": 1.0, "sites.s.plant": "external", "sites.s.arm.known": False}
+PERIOD_NS = 1_000_000
+A_SECOND = 1_000_000_000
+
+
+class Pendulum:
+    """Two joints that do not feel each other, with friction: no arm of ours."""
+
+    def __init__(self) -> None:
+        self.q, self.qd = [0.3, -0.1], [0.0, 0.0]
+
+    def move(self, tau: tuple[float, ...] | None) -> None:
+        for i in range(2):
+            push = 0.0 if tau is None else tau[i] - 3.0 * math.sin(self.q[i])
+            self.qd[i] += 1e-3 * (push - 2.0 * self.qd[i] - 0.5 * math.tanh(50.0 * self.qd[i]))
+            self.q[i] += 1e-3 * self.qd[i]
+
+
+Act = Callable[[Bus, RelayClock], None]
+
+
+def driving(sent: list[list[float]], torques: list[tuple[float, ...]], until_ns: int = 2**62) -> Act:
+    """The program of an arm, every millisecond, a quarter of one before the site's tick."""
+
+    def drive(bus: Bus, clock: RelayClock) -> None:
+        arm = Pendulum()
+        with ArmPort(bus, clock, SESSION, "s") as port:
+            next_ns = clock.monotonic_ns()
+            while not port.over and next_ns < until_ns:
+                port.send(arm.q, arm.qd)
+                sent.append([*arm.q, *arm.qd])
+                tau = port.torque()
+                torques.extend([] if tau is None else [tau])
+                arm.move(tau)
+                next_ns += PERIOD_NS
+                clock.sleep_until(next_ns)
+
+    return drive
+
+
+def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
+    """A session with that arm, and what became of its sites once it has run."""
+    session = Session(load("two_sites", {**OUTSIDE, **overrides}), folder / "run.mcap")
+    ends: dict[str, object] = {}
+    live = session.live
+
+    def told(site: str, *arguments: object, **options: object) -> int:
+        try:
+            ends[site] = live(site, *arguments, **options)
+        except (RunFailed, SessionError) as failed:
+            ends[site] = failed
+        return 0
+
+    session.live = told
+    session.recorder()
+    for site in session.scenario.names:
+        session.site(site)
+    if act is not None:
+        session.stranger(act, at_ns=A_SECOND + 200_250_000)
+    return session, ends
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_what_the_arm_measures_is_the_record_and_the_record_is_what_drives_it(tmp_path: Path) -> None:
+    sent: list[list[float]] = []
+    torques: list[tuple[float, ...]] = []
+    session, ends = session_of(tmp_path, driving(sent, torques))
+    log = session.run()
+    assert ends == {"m": 0, "s": 0}
+    records = [[*state.q, *state.qd] for state in log["s"].states]
+    # every measurement, in order, to the bit
+    assert records in [sent[n : n + 1000] for n, one in enumerate(sent) if one == records[0]]
+    taus = [tuple(state.tau) for state in log["s"].states]
+    assert [tau for tau in torques if tau in taus] == torques
+    assert set(taus[:-1]) <= set(torques)
+    moved = abs(log["s"].q[-1] - log["s"].q[0]).max()
+    assert moved > 0.05
+    whole(log)
+    assert any("waiting for its arm on trilat/t/s/measured" in line for line in session.said)
+    assert any("0.3 rad off q0_rad" in line for line in session.said)
+    assert [event.member for event in log.events if event.kind == "arm"] == ["s"]
+
+
+def whole(log: Log) -> None:
+    """Executed again, and virtual time fed with it, bit for bit."""
+    assert log.complete
+    verdict = verify(log)
+    assert verdict.whole_run
+    assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
+    assert compare_with_virtual(log).fed.identical == verdict.records
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_an_arm_that_falls_silent_ends_the_session_in_order_and_is_named(tmp_path: Path) -> None:
+    session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_000_000_000))
+    log = session.run()
+    assert str(ends["s"]) == "the arm of s was silent for 0.5 s"
+    assert str(ends["m"]) == f"m ended because {ends['s']}"
+    assert [event.text for event in log.events if event.kind == "failed"] == [str(ends["s"])]
+    assert 0 < len(log["s"]) < 1000
+    whole(log)
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
+    session = Session(load("two_sites", OUTSIDE), tmp_path / "run.mcap")
+
+    def alone(clock: RelayClock) -> None:
+        with pytest.raises(SessionError, match=r"s waited in vain for its arm: .* trilat/t/s/measured"):
+            session.live("s", clock)
+
+    session.relay.add("s", alone)
+    session.relay.run()
+
+
+@pytest.mark.usefixtures("unprepared")
+def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: Path) -> None:
+    session, ends = session_of(tmp_path, driving([], []))
+
+    def shout(bus: Bus, clock: RelayClock) -> None:
+        other = ArmPort(bus, clock, SESSION, "s")
+        publish = bus.publisher(topics.key(SESSION, "s", topics.MEASURED))
+        for _ in range(50):
+            other.send([9.0, 9.0], [0.0, 0.0])
+            publish(b"garbage")
+            clock.sleep_until(clock.monotonic_ns() + 3_000_000)
+
+    session.stranger(shout, at_ns=A_SECOND + 1_200_000_000)
+    log = session.run()
+    assert ends == {"m": 0, "s": 0}
+    assert abs(log["s"].q).max() < 2.0
+    dropped = log.link_stats("s")[-1].dropped
+    assert (dropped["stranger"], dropped["malformed"]) == (50, 50)
+    whole(log)
+
+
+def measurement(**changed: object) -> bytes:
+    fields = {"v": VERSION, "site": "s", "boot": 7, "n": 0, "q": [0.5, 0.25], "qd": [1.0, 2.0], "sent_ns": 5}
+    return msgpack.packb({**fields, **changed})
+
+
+class Heard:
+    """An arm's measurements, by hand."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock()
+        self.ring = StampingRing(self.clock.monotonic_ns, CAPACITY)
+        self.dropped: Counter[str] = Counter()
+        self.arm = OutsideArm("s", self.ring, self.clock, self.dropped, "here")
+
+    def hear(self, *payloads: bytes) -> None:
+        for payload in payloads:
+            self.ring.take(payload)
+        self.arm.look()
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "malformed"),
+        (b"\xc1", "malformed"),
+        (bytes(70_000), "oversized"),
+        (measurement(v=VERSION + 1), "version"),
+        (measurement(q=[1.0]), "malformed"),
+        (measurement(q=[1.0, math.nan]), "not finite"),
+        (measurement(qd=[math.inf, 0.0]), "not finite"),
+        (measurement(n=-1), "malformed"),
+        (measurement(more=1), "malformed"),
+        (measurement(site="m"), "stranger"),
+    ],
+)
+def test_what_is_no_measurement_is_counted_and_dropped(payload: bytes, reason: str) -> None:
+    heard = Heard()
+    heard.hear(payload)
+    assert heard.arm.newest is None
+    assert heard.dropped == {reason: 1}
+
+
+@given(order=st.permutations(range(8)), bound=st.booleans())
+def test_the_newest_counts_in_whatever_order_they_come(order: list[int], bound: bool) -> None:
+    heard = Heard()
+    heard.hear(measurement(n=0, q=[-1.0, 0.0]))
+    if bound:
+        heard.arm.bind((-1.0, 0.0))
+    for n in order:
+        heard.hear(measurement(n=n + 1, q=[float(n), 0.0]))
+        assert heard.arm.newest.q[0] == max(order[: order.index(n) + 1])
+    records = sum(n > max(order[:i], default=-1) for i, n in enumerate(order))
+    assert heard.arm.taken == 1 + records
+    assert heard.dropped["old measurement"] == 8 - records
+
+
+def test_a_flood_is_bounded_and_what_is_lost_of_it_is_counted() -> None:
+    heard = Heard()
+    heard.hear(measurement(n=0))
+    heard.arm.bind((0.5, 0.25))
+    heard.hear(measurement(n=1), *(measurement(n=n) for n in range(2, 502)))
+    assert heard.arm.taken == 1 + CAPACITY
+    heard.hear(measurement(n=510))
+    assert heard.dropped["missing measurement"] == 8
+
+
+def test_a_program_that_is_started_anew_counts_until_the_session_begins() -> None:
+    heard = Heard()
+    heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
+    assert heard.arm.newest.q == [2.0, 2.0]
+    heard.arm.bind((2.0, 2.0))
+    heard.hear(measurement(boot=3, n=0))
+    assert heard.arm.newest.q == [2.0, 2.0]
+    assert heard.dropped == {"stranger": 1}
+
+
+def test_silence_is_what_the_site_itself_could_have_heard() -> None:
+    """A process that slept for a minute has heard nothing, and knows nothing of the arm."""
+    heard = Heard()
+    heard.hear(measurement())
+    heard.arm.bind((0.5, 0.25))
+    heard.clock.sleep_until(60 * A_SECOND)
+    heard.hear()
+    assert heard.arm.failure is None
+    for _ in range(SILENT_NS // PERIOD_NS + 1):
+        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        heard.hear()
+    assert "the arm of s was silent" in str(heard.arm.failure)
+    heard.hear(measurement(n=1))
+    assert heard.arm.failure is None
+
+
+def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
+    network, clock = LocalNetwork(), ManualClock()
+    site = network.join()
+    port = ArmPort(network.join(), clock, "t", "s")
+    assert port.torque() is None
+    state = {
+        "v": VERSION,
+        "site": "s",
+        "boot": 5,
+        "tick": 0,
+        "t_ns": 0,
+        "mode": "run",
+        **{key: [0.0, 0.0] for key in ("q", "qd", "q_des", "qd_des", "tau_x")},
+        "tau": [1.5, -2.5],
+        "theta_hat": [0.0] * 5,
+        "used": {},
+        "rx": [],
+        "rx_crc": 0,
+        "cmd": [],
+        "mem": [],
+        "late_us": 0,
+        "busy_us": 0,
+    }
+    say = site.publisher("trilat/t/s/state")
+    say(msgpack.packb(state))
+    assert port.torque() == (1.5, -2.5)
+    say(msgpack.packb({**state, "boot": 6, "tau": [9.0, 9.0]}))  # a stranger's
+    say(b"garbage")
+    assert port.torque() == (1.5, -2.5)
+    clock.sleep_until(FRESH_NS + 1)
+    assert port.torque() is None
+    say(msgpack.packb({**state, "tick": 1}))
+    assert port.torque() == (1.5, -2.5)
+    say(msgpack.packb({**state, "tick": 2, "mode": "diverged"}))
+    assert port.torque() is None
+    assert not port.over
+    site.publisher("trilat/t/s/event")(encode(Event(member="s", boot=5, kind="end", text="made 3 ticks")))
+    assert port.over
+
+
+def test_a_site_that_is_gone_is_over() -> None:
+    network = LocalNetwork()
+    port = ArmPort(network.join(), ManualClock(), "t", "s")
+    site = network.join()
+    assert not port.over
+    site.announce("trilat/t/s/alive/5")
+    assert not port.over
+    site.close()
+    assert port.over
+
+
+def test_the_example_of_a_message_is_one() -> None:
+    message = Measurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
+    assert encode(message) == measurement()
+
+
+def test_the_page_names_every_field_of_a_message() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "external-arm.md").read_text(encoding="utf-8")
+    table = page[page.index("| key |") : page.index("The torque stands")]
+    assert set(re.findall(r"`(\w+)`", table)) == set(Measurement.__struct_fields__)
+    assert f"| {VERSION}, the version of the messages |" in table
+    for seconds in (SILENT_NS, FRESH_NS):
+        assert f"{seconds * 1e-9:g} s" in page
+    assert f"at most {CAPACITY} wait" in page

@@ -1,0 +1,121 @@
+"""A law is too slow by its own computing time, never by the machine's lateness; one hiccup ends nothing."""
+
+import signal
+from collections.abc import Callable
+
+import pytest
+
+from sites.overtime import HICCUP_NS, MOST_NS, SHARE, Overtime, thread_use
+from tests.core.sites import setup
+from trilat_net.core.site import Site
+from trilat_net.core.tick import Tick
+from trilat_net.errors import LawFailed
+from trilat_net.net.clock import ManualClock, SystemClock
+
+PERIOD_NS = 1_000_000
+TICKS = 3000
+
+
+class Steps:
+    """A site whose step takes a time that a test chooses, of which its thread computes a part."""
+
+    name, rate_hz = "s", 1000
+
+    def __init__(self, takes_ns: Callable[[int], int], computes: float = 1.0, evicts: int = 0) -> None:
+        self.clock = ManualClock()
+        self.computed_ns = self.evicted = 0
+        self._takes_ns, self._computes, self._evicts = takes_ns, computes, evicts
+
+    def step(self, tick: Tick) -> Tick:
+        took_ns = self._takes_ns(tick.k)
+        self.clock.sleep_until(self.clock.monotonic_ns() + took_ns)
+        self.computed_ns += int(self._computes * took_ns)
+        self.evicted += self._evicts
+        return tick
+
+    def overtime(self) -> Overtime:
+        return Overtime(self, "laws:Law", self.clock, lambda: (self.computed_ns, self.evicted))
+
+
+def ended(steps: Steps, overtime: Overtime | None = None) -> int | None:
+    """At which tick the law is too slow; None where it never is."""
+    overtime = overtime or steps.overtime()
+    for k in range(TICKS):
+        try:
+            overtime.step(Tick(k))
+        except LawFailed as failed:
+            return failed.tick
+    return None
+
+
+@pytest.mark.parametrize("share", [0.5, 0.74, 0.8, 1.0, 2.0, 20.0, 100.0])
+def test_what_a_law_takes_above_its_share_adds_up_to_half_a_second(share: float) -> None:
+    took_ns = int(share * PERIOD_NS)
+    over_ns = min(took_ns, HICCUP_NS) - int(SHARE * PERIOD_NS)
+    k = ended(Steps(lambda _: took_ns))
+    if over_ns <= 0 or MOST_NS / over_ns > TICKS:
+        assert k is None
+    else:
+        assert k == MOST_NS // over_ns
+
+
+def test_a_law_that_is_slow_at_every_other_tick_is_found_too() -> None:
+    """2.5 periods and nothing, by turns: 1.25 on average, and never twice in a row."""
+    k = ended(Steps(lambda k: 2_500_000 * (k % 2)))
+    assert k == pytest.approx(MOST_NS / (0.5 * PERIOD_NS), abs=3)
+
+
+@pytest.mark.parametrize("hiccup_ns", [5_000_000, 300_000_000, 3_000_000_000])
+def test_a_single_hiccup_is_counted_and_no_more(hiccup_ns: int) -> None:
+    steps = Steps(lambda k: hiccup_ns if k == 700 else 200_000)
+    overtime = steps.overtime()
+    assert ended(steps, overtime) is None
+    assert (overtime.hiccups, overtime.longest_tick, overtime.longest_ns) == (1, 700, hiccup_ns)
+    assert "at 1 ticks" in overtime.told()
+
+
+def test_a_machine_that_takes_the_processor_away_is_no_fault_of_the_law() -> None:
+    assert ended(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
+
+
+def test_a_law_that_waits_is_slow_although_it_computes_nothing() -> None:
+    assert ended(Steps(lambda _: 5_000_000, computes=0.0)) is not None
+
+
+def test_a_law_that_keeps_up_has_nothing_told() -> None:
+    steps = Steps(lambda _: 700_000)
+    overtime = steps.overtime()
+    assert ended(steps, overtime) is None
+    assert overtime.told() == ""
+
+
+class Hanging:
+    """A law that does not come back, and lets nothing pass."""
+
+    def __init__(self, _facts: object) -> None:
+        self.caught = 0
+
+    def torque(self, _now: object) -> list[float]:
+        while True:
+            try:
+                signal.raise_signal(signal.SIGALRM)  # as the timer does every second
+            except ValueError:
+                self.caught += 1
+
+
+def test_a_law_that_does_not_come_back_is_stopped() -> None:
+    site = Site(setup("s", "two_sites")._replace(own=Hanging))
+    before = signal.getsignal(signal.SIGALRM)
+    with Overtime(site, "laws:Hanging", SystemClock()) as overtime:
+        with pytest.raises(LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"):
+            overtime.step(Tick(0))
+        signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_the_use_of_a_thread_only_grows() -> None:
+    before = thread_use()
+    sum(range(20_000))
+    after = thread_use()
+    assert after >= before

@@ -1,0 +1,129 @@
+"""The other end of `plant = "external"`: what the program of an arm outside says to its site, and hears.
+
+Law: the arm says where it is, as often as it likes; the torque that it is to apply stands in the record that
+the site publishes at every tick, so that what drives the arm is what the log holds. Where there is no torque
+that counts, there is None, and the arm is to brake.
+
+    with ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:
+        while not port.over:
+            port.send(*robot.joints())
+            robot.apply(port.torque() or (0.0, 0.0))
+            robot.wait()
+"""
+
+from collections.abc import Sequence
+from types import TracebackType
+
+from ..errors import WireError
+from . import topics
+from .bus import Bus
+from .clock import Clock, SystemClock
+from .measurement import Measurement
+from .messages import State
+from .voice import new_boot, said
+from .wire import decode, encode
+from .zenoh_bus import ZenohBus
+
+FRESH_NS = 100_000_000
+"""A torque that came longer ago counts no more: the site is late, or away."""
+
+
+class ArmPort:
+    """The connection of an arm to its site; a context, which closes it.
+
+    Args:
+        bus: a connection that reaches the site.
+        clock: the time.
+        session: the session's name.
+        site: whose arm this is.
+
+    Attributes:
+        record: the newest record of the site, None before the first.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
+        self.record: State | None = None
+        self._bus, self._clock, self._site = bus, clock, site
+        self._boot = new_boot()
+        self._n = 0
+        self._came_ns = 0
+        self._met = self._gone = False
+        self._publish = bus.publisher(topics.key(session, site, topics.MEASURED))
+        self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, 64)
+        self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
+        self._presence = bus.presence(topics.key(session, site, topics.ALIVE) + "/*")
+
+    @classmethod
+    def connected(cls, session: str, site: str, connect: Sequence[str]) -> "ArmPort":
+        """Returns a port that reaches a site over Zenoh.
+
+        Args:
+            session: the session's name; by default a scenario's name.
+            site: whose arm this is.
+            connect: where the site listens, as it says when it waits for its arm.
+
+        Raises:
+            UsageError: an endpoint cannot be used.
+        """
+        return cls(ZenohBus([], list(connect)), SystemClock(), session, site)
+
+    def __enter__(self) -> "ArmPort":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bus.close()
+
+    def send(self, q: Sequence[float], qd: Sequence[float]) -> None:
+        """Says where the arm is now.
+
+        Args:
+            q: joint angles, rad.
+            qd: joint velocities, rad/s.
+        """
+        message = Measurement(
+            site=self._site,
+            boot=self._boot,
+            n=self._n,
+            q=[float(angle) for angle in q],
+            qd=[float(speed) for speed in qd],
+            sent_ns=self._clock.monotonic_ns(),
+        )
+        self._n += 1
+        self._publish(encode(message))
+
+    def torque(self) -> tuple[float, ...] | None:
+        """Returns the torque to apply now, N m per joint; None where the arm is to brake.
+
+        That is so before the first tick, when the run is over, and while nothing newer than `FRESH_NS` came.
+        """
+        self._hear()
+        record = self.record
+        if record is None or self._gone or record.mode == "diverged":
+            return None
+        if self._clock.monotonic_ns() - self._came_ns > FRESH_NS:
+            return None
+        return tuple(record.tau)
+
+    @property
+    def over(self) -> bool:
+        """True once the site's run has ended, or the site is gone."""
+        self._hear()
+        return self._gone
+
+    def _hear(self) -> None:
+        """Takes in what has come."""
+        while (message := self._records.poll()) is not None:
+            try:
+                record = decode(message[0], State)
+            except WireError:
+                continue  # a stranger's
+            if self.record is None or record.boot == self.record.boot:
+                self.record, self._came_ns = record, message[1]
+        for event in said(self._events):
+            if event.kind == "end" and self.record is not None and event.boot == self.record.boot:
+                self._gone = True
+        while (change := self._presence.poll()) is not None:
+            self._met = self._met or change[1]
+            self._gone = self._gone or (self._met and not change[1])
