@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from trilat_net.analysis.envelope import Trend
 from trilat_net.scenario import Expect
+from trilat_net.scenario.window import Window
 from trilat_net.trial.judgement import Outcome, judge
+from trilat_net.trial.stretch import Span
 
 from .results import CALM, figures
 
@@ -40,7 +42,7 @@ def only(expect: Expect, **changes: Any) -> Outcome:
 
 
 def test_every_key_that_asks_is_answered_and_no_other() -> None:
-    assert READINGS.keys() | OTHERS.keys() | TOLERANCES == set(Expect.__struct_fields__)
+    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | {"windows"} == set(Expect.__struct_fields__)
     assert judge(Expect(), CALM) == []
     for key, value in {**READINGS, **OTHERS}.items():
         assert only(Expect(**{key: value})).key.split(".")[0] == key
@@ -127,3 +129,36 @@ def test_gaps_are_counted() -> None:
     assert not only(Expect(no_gaps=True)).held
     assert only(Expect(no_gaps=True), missing=0).held
     assert judge(Expect(no_gaps=False), CALM) == []
+
+
+SPANS = {"error_peak_rad": Span(0.5, 0.5), "speed_peak_rad_s": Span(2.0, 2.0), "q1_rad": Span(-0.2, 0.4)}
+
+
+def window(**limits: Any) -> Expect:
+    return Expect(windows=(Window(from_s=9.0, to_s=15.5, site="s", **limits),))
+
+
+@given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
+def test_a_quantity_of_a_window_holds_where_all_of_it_lies_between_its_limits(
+    least: float, width: float
+) -> None:
+    most = least + width
+    for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
+        outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
+        assert outcome.key == f"{key} s 9-15.5 s"
+        assert outcome.held == (least <= low and high <= most)
+        if most > least:
+            assert outcome.margin is not None
+            assert outcome.held == (outcome.margin >= 0.0)
+
+
+def test_a_window_that_the_run_did_not_reach_does_not_hold() -> None:
+    outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
+    assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
+
+
+def test_a_window_names_its_units_and_all_sites_where_it_is_of_all() -> None:
+    asked = Window(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0))
+    outcomes = judge(Expect(windows=(asked,)), figures(windows=(SPANS,)))
+    assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
+    assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]

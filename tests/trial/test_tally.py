@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.trial.tally import BUCKET_NS, Rows, Tally
+from trilat_net.trial.rows import Rows
+from trilat_net.trial.tally import BUCKET_NS, Tally
 
 PERIOD_NS = 10_000_000
 RECORDS = 400
@@ -18,7 +19,7 @@ def records(seed: int) -> Rows:
     rng = np.random.default_rng(seed)
     k = np.arange(RECORDS)
     used = np.array([k - 5, np.where(k < 20, -1, k // 2 - rng.integers(2, 9, RECORDS))]).T
-    return Rows(k * PERIOD_NS, *rng.normal(size=(4, RECORDS, 2)), np.maximum(used, -1))
+    return Rows(k * PERIOD_NS, *rng.normal(size=(5, RECORDS, 2)), np.maximum(used, -1))
 
 
 def tallied(rows: Rows, cuts: list[int], synchronised_rad: float = 1.0) -> Tally:

@@ -52,6 +52,9 @@ def test_a_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file:
 def test_what_is_expected_of_a_time_that_no_run_reaches_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"synchronised_by_s.*0\.5 s"):
         trilat_net.trials(quick(), set={"expect.synchronised_by_s": 0.5})
+    window = {"from_s": 0.4, "to_s": 0.6, "error_peak_rad": [0.0, 1.0]}
+    with pytest.raises(ScenarioError, match=r"expect\.windows\[0\]\.to_s: .*0\.5 s, is 0\.6"):
+        trilat_net.trials(quick(), set={"expect.windows": [window]})
 
 
 def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:

@@ -27,11 +27,11 @@ def scenario_list() -> None:
     from ..scenario import load, shipped
 
     table = Table(box=None, pad_edge=False)
-    for column in ("name", "sites", "s", "what it is"):
-        table.add_column(column)
+    for column in ("name", "sites", "time", "what it is"):
+        table.add_column(column, justify="right" if column in ("sites", "time") else "left")
     for name in shipped():
         chosen = load(name)
-        table.add_row(name, str(len(chosen.names)), f"{chosen.duration_s:g}", escape(chosen.title))
+        table.add_row(name, str(len(chosen.names)), f"{chosen.duration_s:g} s", escape(chosen.title))
     out.print(table)
 
 

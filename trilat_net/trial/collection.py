@@ -5,6 +5,7 @@ Law: both feed the same tallies with the same records; what drove a run has no s
 
 from array import array
 
+import msgspec
 import numpy as np
 
 from .. import collector
@@ -14,10 +15,12 @@ from ..core.site import Site
 from ..core.tick import Mode, Output
 from ..log.reader import Log
 from ..replay.comparison import late_samples
-from ..scenario import Scenario
+from ..scenario import Expect, Scenario
 from ..sim import virtual
 from .figures import Figures, measured
-from .tally import Rows, Tally
+from .rows import Rows
+from .stretch import Stretch
+from .tally import Tally
 
 BLOCK = 1000
 """How many records of a site are held before its tally takes them in."""
@@ -47,13 +50,17 @@ def run_virtual(scenario: Scenario) -> Figures:
     )
 
 
-def measure_log(log: Log) -> Figures:
+def measure_log(log: Log, expect: Expect | None = None) -> Figures:
     """Returns the figures of a log.
+
+    Args:
+        log: the log.
+        expect: what will be asked of it; by default what its own scenario expects.
 
     Raises:
         LogError: a record cannot be read.
     """
-    scenario = log.scenario
+    scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
     diverged_ns = [s.t_ns for name in log.sites for s in log[name].states[-1:] if s.mode == "diverged"]
     tallies = {name: _tally(scenario, name) for name in log.sites}
@@ -61,7 +68,7 @@ def measure_log(log: Log) -> Figures:
     for name, tally in tallies.items():
         part = log[name]
         used = np.array([part.used[peer] for peer in part.peers]).T
-        tally.add(Rows(part.t_ns, part.q, part.qd, part.q_des, part.tau, used))
+        tally.add(Rows(part.t_ns, part.q, part.qd, part.q_des, part.tau, part.tau_x, used))
         wanted = made.get(name, 0) if diverged_ns else scenario.ticks(name)
         missing += max(0, wanted - len(part))
     return measured(
@@ -75,7 +82,11 @@ def measure_log(log: Log) -> Figures:
 
 def _tally(scenario: Scenario, site: str) -> Tally:
     peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
-    return Tally(peer_rates, scenario.expect.synchronised_rad)
+    stretches = [
+        Stretch(window, scenario.sites[site]) if window.site in ("", site) else None
+        for window in scenario.expect.windows
+    ]
+    return Tally(peer_rates, scenario.expect.synchronised_rad, stretches)
 
 
 class _Held:
@@ -95,6 +106,7 @@ class _Held:
         floats.extend(output.qd)
         floats.extend(output.q_des)
         floats.extend(output.tau)
+        floats.extend(output.tau_x)
         if len(self._t_ns) >= BLOCK:
             self.flush()
 
@@ -102,7 +114,7 @@ class _Held:
         """Hands over what is held."""
         t_ns = np.array(self._t_ns, dtype=np.int64)
         used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), len(self.site.peers))
-        q, qd, q_des, tau = np.array(self._floats).reshape(len(t_ns), 4, JOINTS).transpose(1, 0, 2)
-        self.tally.add(Rows(t_ns, q, qd, q_des, tau, used))
+        q, qd, q_des, tau, tau_x = np.array(self._floats).reshape(len(t_ns), 5, JOINTS).transpose(1, 0, 2)
+        self.tally.add(Rows(t_ns, q, qd, q_des, tau, tau_x, used))
         for held in (self._t_ns, self._used, self._floats):
             del held[:]

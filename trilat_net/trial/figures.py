@@ -3,7 +3,7 @@
 Law: one definition of every figure, whatever drove the run; what a run cannot tell is None, never a guess.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -12,6 +12,8 @@ from ..analysis.envelope import Envelope, Trend, envelope
 from ..core.arm import Array
 from ..core.grid import NS_PER_S
 from ..scenario import Scenario
+from ..scenario.window import OF_ALL
+from .stretch import Span, Stretch
 from .tally import BUCKET_NS, Tally
 
 
@@ -46,6 +48,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
         ages: per link "j->i".
         late_samples: samples that came too late for what their link meant to do with them.
         missing: ticks without a record.
+        windows: per window of [expect] its quantities by their keys; none where the run ended before it did.
     """
 
     simulated_s: float
@@ -63,6 +66,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     ages: dict[str, LinkAge]
     late_samples: int
     missing: int
+    windows: tuple[dict[str, Span], ...] = ()
 
 
 def measured(
@@ -108,7 +112,21 @@ def measured(
         },
         late_samples=late_samples,
         missing=missing,
+        windows=tuple(
+            _spans([t.stretches[n] for t in tallies.values()]) for n in range(len(scenario.expect.windows))
+        ),
     )
+
+
+def _spans(stretches: Sequence[Stretch | None]) -> dict[str, Span]:
+    """Returns the quantities of a window, of all sites that it is of."""
+    parts = [stretch.figures() for stretch in stretches if stretch is not None]
+    if len(parts) == 1:
+        return parts[0]
+    known = set.intersection(*map(set, parts)) & set(OF_ALL)
+    return {
+        key: Span(*(max(part[key][n] for part in parts) for n in (0, 1))) for key in OF_ALL if key in known
+    }
 
 
 def _largest(values: list[float]) -> float | None:

@@ -10,7 +10,9 @@ import msgspec
 
 from ..analysis.envelope import Trend
 from ..scenario import Expect
+from ..scenario.window import Window
 from .figures import Figures
+from .stretch import Span
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -42,6 +44,7 @@ def judge(expect: Expect, figures: Figures) -> list[Outcome]:
         *_limits(expect, figures),
         *_poses(expect, figures),
         *_gaps(expect, figures),
+        *_windows(expect, figures),
     ]
 
 
@@ -131,3 +134,30 @@ def _poses(expect: Expect, figures: Figures) -> Iterator[Outcome]:
 def _gaps(expect: Expect, figures: Figures) -> Iterator[Outcome]:
     if expect.no_gaps:
         yield Outcome("no_gaps", figures.missing == 0, f"{figures.missing} missing", "0 missing")
+
+
+def _windows(expect: Expect, figures: Figures) -> Iterator[Outcome]:
+    for window, spans in zip(expect.windows, figures.windows, strict=True):
+        for key, (least, most) in window.asked:
+            yield _within(_called(key, window), spans.get(key), least, most, _unit(key))
+
+
+def _unit(key: str) -> str:
+    """Returns the unit that a quantity of a window ends in, for people."""
+    units = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}
+    return next((word for ending, word in units.items() if key.endswith(ending)), "")
+
+
+def _called(key: str, window: Window) -> str:
+    """Returns how a quantity of a window is called, as in `wall_mean_n s 9-15 s`."""
+    site = f" {window.site}" if window.site else ""
+    return f"{key}{site} {window.from_s:g}-{window.to_s:g} s"
+
+
+def _within(key: str, span: Span | None, least: float, most: float, unit: str) -> Outcome:
+    wanted = f"{least:g} to {most:g} {unit}".rstrip()
+    if span is None:
+        return Outcome(key, False, "never", wanted)
+    text = f"{span.least:.4g}" if span.least == span.most else f"{span.least:.4g} to {span.most:.4g}"
+    spare, half = min(span.least - least, most - span.most), 0.5 * (most - least)
+    return Outcome(key, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, spare / half if half else None)

@@ -29,7 +29,7 @@ def judged_log(trial: Trial, log_file: Path, problems: Sequence[str], wall_s: fl
         log = open_log(log_file)
         if not any(len(log[name]) for name in log.sites):
             raise LogError(f"{log_file}: no records")
-        result = trial.judged(measure_log(log), wall_s)
+        result = trial.judged(measure_log(log, trial.scenario.expect), wall_s)
         verdict = verify(log)
     except LogError as error:
         return Result(trial, [], 0.0, wall_s, "; ".join([*problems, str(error)]), kept)

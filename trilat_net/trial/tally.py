@@ -6,47 +6,20 @@ bits of a mean.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arm import JOINTS, Array
 from ..core.grid import NS_PER_S
 from ..scenario.expectation import END_S
+from .rows import Ints, Rows, joined
+from .stretch import Stretch
 
 BUCKET_NS = 50_000_000
 """The envelope of |e| is kept as one largest value per so many nanoseconds."""
 
 _NO_RECORD = -1.0
 _END_NS = round(END_S * NS_PER_S)
-
-Ints = NDArray[np.int64]
-
-
-class Rows(NamedTuple):
-    """Some records of one site, one after the other.
-
-    Attributes:
-        t_ns: nominal time, shape (K,), ns.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-        q_des: reference, Eq. (6), shape (K, 2), rad.
-        tau: control torque, shape (K, 2), N m.
-        used: tick of the sample in use, -1 before the first, shape (K, P).
-    """
-
-    t_ns: Ints
-    q: Array
-    qd: Array
-    q_des: Array
-    tau: Array
-    used: Ints
-
-    def since(self, t_ns: int) -> "Rows":
-        """Returns the records that are later than a time."""
-        n = int(np.searchsorted(self.t_ns, t_ns, side="right"))
-        return Rows(self.t_ns[n:], self.q[n:], self.qd[n:], self.q_des[n:], self.tau[n:], self.used[n:])
 
 
 class Tally:
@@ -55,6 +28,7 @@ class Tally:
     Args:
         peer_rates: tick rate of every peer, Hz, in scenario order.
         synchronised_rad: the |e| below which the site counts as synchronised, rad.
+        stretches: what is kept of the site within each window of [expect]; None where a window is another's.
 
     Attributes:
         records: how many records were taken in.
@@ -63,11 +37,15 @@ class Tally:
         peak_speed_rad_s: largest |qd|.
         apart_ns: time of the last record whose |e| was not below `synchronised_rad`; -1 before one was.
         age_max_ms: per peer the largest age of the sample in use, shape (P,).
+        stretches: as given.
     """
 
-    def __init__(self, peer_rates: Sequence[int], synchronised_rad: float) -> None:
+    def __init__(
+        self, peer_rates: Sequence[int], synchronised_rad: float, stretches: Sequence[Stretch | None] = ()
+    ) -> None:
         self._peer_rates = np.array(peer_rates, dtype=np.int64)
         self._synchronised_rad = synchronised_rad
+        self.stretches = tuple(stretches)
         self.records = 0
         self.peak_error_rad = self.peak_torque_nm = self.peak_speed_rad_s = 0.0
         self.apart_ns = -1
@@ -94,6 +72,8 @@ class Tally:
             self.apart_ns = int(rows.t_ns[apart[-1]])
         self._add_ages(rows)
         self._add_peaks(rows.t_ns // BUCKET_NS, largest)
+        for stretch in filter(None, self.stretches):
+            stretch.add(rows)
         self._tail.append(rows)
         while len(self._tail) > 1 and self._tail[1].t_ns[0] < rows.t_ns[-1] - _END_NS:
             del self._tail[0]
@@ -132,19 +112,8 @@ class Tally:
 
     def end(self, end_ns: int) -> Rows:
         """Returns the records of the last second before `end_ns`, which is not before the last record."""
-        return _joined(self._tail).since(end_ns - _END_NS)
+        return joined(self._tail).since(end_ns - _END_NS)
 
     def peaks(self) -> Array:
         """Returns the largest |e| of every bucket that ended, from the first on; -1 where it has none."""
         return self._peaks[: self.last_ns // BUCKET_NS]
-
-
-def _joined(blocks: Sequence[Rows]) -> Rows:
-    return Rows(
-        np.concatenate([rows.t_ns for rows in blocks]),
-        np.concatenate([rows.q for rows in blocks]),
-        np.concatenate([rows.qd for rows in blocks]),
-        np.concatenate([rows.q_des for rows in blocks]),
-        np.concatenate([rows.tau for rows in blocks]),
-        np.concatenate([rows.used for rows in blocks]),
-    )

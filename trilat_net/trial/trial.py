@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from ..errors import ScenarioError
+from ..errors import LawFailed, ScenarioError
 from ..net.clock import SystemClock
 from ..scenario import Scenario, load
+from ..sim import virtual
 from .collection import run_virtual
 from .figures import Figures
 from .judgement import Outcome, judge
@@ -96,7 +97,10 @@ class Trial(NamedTuple):
         """Runs the trial in virtual time, in this process."""
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
-        figures = run_virtual(self.scenario)
+        try:
+            figures = run_virtual(self.scenario)
+        except LawFailed as failed:
+            return Result(self, [], 0.0, (clock.monotonic_ns() - start_ns) * 1e-9, str(failed))
         return self.judged(figures, (clock.monotonic_ns() - start_ns) * 1e-9)
 
     def check(self) -> Result:
@@ -135,6 +139,8 @@ def trials(
     scenario = load(source, set)
     called = f"./{scenario.name}.toml" if isinstance(source, Scenario) else str(source)
     _check_asked(scenario, called)
+    if not live:
+        virtual.check_runs(scenario)
     chosen = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in chosen:
         if not 0 <= seed < 2**63:
@@ -160,6 +166,13 @@ def _check_asked(scenario: Scenario, source: str) -> None:
             path="expect.synchronised_by_s",
             source=source,
         )
+    for n, window in enumerate(scenario.expect.windows):
+        if window.to_s > scenario.duration_s:
+            raise ScenarioError(
+                f"must not be after the end of the run at {scenario.duration_s:g} s, is {window.to_s:g}",
+                path=f"expect.windows[{n}].to_s",
+                source=source,
+            )
 
 
 def _texts(overrides: Mapping[str, Any] | Sequence[str]) -> list[str]:

@@ -1,0 +1,44 @@
+"""Virtual runs measured by the windows of `[expect]`, and how close a figure must come.
+
+The figures that tests here cite were made with another implementation of the same equations.
+"""
+
+from typing import Any
+
+import pytest
+
+from trilat_net.scenario import load
+from trilat_net.scenario.window import OF_ALL, QUANTITIES
+from trilat_net.trial.collection import run_virtual
+from trilat_net.trial.figures import Figures
+
+Overrides = dict[str, Any]
+
+
+def measured(name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]) -> Figures:
+    """A shipped scenario, changed, in virtual time; its windows are (from, to, site), "" for all sites."""
+    asked = [
+        {
+            "from_s": from_s,
+            "to_s": to_s,
+            "site": site,
+            **dict.fromkeys(QUANTITIES if site else OF_ALL, (0, 0)),
+        }
+        for from_s, to_s, site in windows
+    ]
+    return run_virtual(load(name, {**(overrides or {}), "expect": {"windows": asked}}))
+
+
+def peak(figures: Figures, n: int = 0) -> float:
+    """Largest |e| of a window."""
+    return figures.windows[n]["error_peak_rad"].most
+
+
+def value(figures: Figures, key: str, n: int = 0) -> float:
+    """A quantity of a window that has one value."""
+    return figures.windows[n][key].most
+
+
+def printed(figure: float, digit: float) -> Any:
+    """What equals a figure within its last printed digit or 2 %, whichever is larger."""
+    return pytest.approx(figure, abs=max(digit, 0.02 * abs(figure)))

@@ -1,0 +1,74 @@
+"""Free motion, the box, shares, a cut: the contrasts of `free`, `paper`, `box`, `training`, `outage`."""
+
+import numpy as np
+import pytest
+
+from tests.theory.figures_of_runs import Overrides, measured, printed, value
+from tests.virtual_runs import run, trajectories
+from trilat_net.scenario import load
+
+NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
+EDGE = {
+    "control.theta_hat0": [0.0, 0.0, 0.0, 1.8, 0.9],
+    "control.theta_low": [-1e9, -1e9, -1e9, 1.6, 0.8],
+    "control.theta_high": [1e9, 1e9, 1e9, 2.0, 1.0],
+}
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "duration_s", "settled_s"), [(0.0, 30.0, 22.2), (200.0, 20.0, 11.9), (400.0, 10.0, 5.5)]
+)
+def test_some_delay_helps_free_motion(delay_ms: float, duration_s: float, settled_s: float) -> None:
+    made = measured("free", {"link.delay_ms": delay_ms, "duration_s": duration_s})
+    assert made.synchronised_at_s == printed(settled_s, 0.1)
+
+
+def test_the_hands_of_the_paper_hardly_move_joint_1_and_leave_nothing_behind() -> None:
+    pushed = run("paper", {"duration_s": 20.0}).stack("q")
+    alone = trajectories(load("paper", {"duration_s": 20.0}).without_hands()).stack("q")
+    assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
+    assert np.abs(pushed - alone)[..., 0].max() <= 0.003
+    assert np.abs(pushed - alone)[:, -1].max() <= 2e-4
+
+
+def test_without_a_box_the_slave_returns() -> None:
+    made = measured("box", NO_BOX)
+    assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
+
+
+def test_a_small_gain_of_the_gravity_terms_lets_the_arms_hang() -> None:
+    made = measured("box", {**NO_BOX, "control.Gamma": [1.0, 1.0, 1.0, 0.01, 0.01]})
+    assert made.end_pose_rad["s"][0] == printed(-1.58, 0.01)
+
+
+def test_a_truth_on_the_edge_of_the_box_lets_them_sag() -> None:
+    made = measured("box", {**EDGE, "duration_s": 20.0})
+    assert made.end_pose_rad["s"][0] < -0.4
+    assert made.end_pose_rad["s"][1] < -0.7
+
+
+@pytest.mark.parametrize(("share", "offset_rad"), [(0.9, 0.203), (0.5, 0.0), (0.1, -0.203)])
+def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
+    row = {"m1": share, "m2": 1.0 - share}
+    overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
+    made = measured("training", overrides, (9.9, 10.0, "s"))
+    assert value(made, "q1_rad") + 0.6 == printed(offset_rad, 1e-3)
+
+
+HEALED = (6.0, 15.0, "s")
+
+
+def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
+    made = measured("outage", {}, HEALED)
+    assert value(made, "speed_peak_rad_s") == printed(0.41, 0.01)
+    assert value(made, "torque_peak_nm") == printed(35.0, 1.0)
+    assert made.synchronised_at_s == printed(12.4, 0.1)
+    uncut = measured("outage", {"link.outages_s": []}, HEALED)
+    assert value(uncut, "torque_peak_nm") == printed(18.8, 0.1)
+
+
+def test_a_ramped_return_needs_no_more_than_links_that_were_not_cut() -> None:
+    held = measured("outage", {"on_stale.action": "hold"}, HEALED)
+    uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
+    assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
+    assert value(held, "speed_peak_rad_s") <= value(uncut, "speed_peak_rad_s")
