@@ -3,6 +3,7 @@
 import sys
 
 from . import (
+    analysis,
     clocks,
     crashes,
     endurance,
@@ -19,6 +20,7 @@ from . import (
 
 BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run, "writer": writer.run}
 LONG = {
+    "analysis": analysis.run,
     "clocks": clocks.run,
     "crashes": crashes.run,
     "presets": presets.run,

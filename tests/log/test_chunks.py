@@ -13,10 +13,12 @@ from mcap.opcode import Opcode
 from tests.log.hostility import chunk
 from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError
-from trilat_net.log import packed
+from trilat_net.log import chunks, packed
 from trilat_net.log.chunks import Item, Walk
 from trilat_net.log.framing import HEAD, Frame, Framing
 from trilat_net.log.packed import Unreadable, unpacked
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
 
 DATA = edited(recorded("paper"), chunk_bytes=4096)
 FRAMES = list(Framing(io.BytesIO(DATA)).frames())
@@ -142,6 +144,15 @@ def test_a_file_that_holds_absurdly_much_is_refused_with_the_place() -> None:
         walked(data)
     streaming = Walk(io.BytesIO(data), "file", kept=False)
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 1_500_000
+
+
+def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hands of `outage` do not push before 3 s, and its arms know their weight."""
+    monkeypatch.setattr(chunks, "KEPT_BYTES", 0)
+    stream = io.BytesIO()
+    virtual.record(load("outage", {"duration_s": 1.0}), stream)
+    stream.seek(0)
+    assert sum(1 for _ in Walk(stream, "log").messages()) > 3000
 
 
 def test_a_chunk_in_a_chunk_is_no_message_and_is_not_looked_into() -> None:

@@ -45,6 +45,18 @@ def records(draw: st.DrawFn) -> dict[str, object]:
     return record
 
 
+@settings(max_examples=50, deadline=None)
+@given(st.lists(records(), max_size=5))
+def test_vectors_that_are_decoded_together_are_those_that_are_decoded_alone(
+    entries: list[dict[str, object]],
+) -> None:
+    payloads = [msgpack.packb(entry) for entry in entries]
+    alone, together = site_log(payloads), site_log(payloads)
+    together.prepare(*STATE_VECTORS)
+    for field in STATE_VECTORS:
+        np.testing.assert_array_equal(getattr(together, field), getattr(alone, field))
+
+
 def site_log(payloads: list[bytes]) -> SiteLog:
     return SiteLog("m1", PEERS, 1000, payloads, "log")
 

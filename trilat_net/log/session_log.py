@@ -199,9 +199,10 @@ class Log:
         They stand in its records, and in its events, which tell of those whose record is missing.
         """
         named = self[site].changes()
-        have = set(self[site].tick.tolist())
-        for event in self.events:
-            if event.kind == "change" and event.member == site and event.ticks not in have:
+        told = [event for event in self.events if event.kind == "change" and event.member == site]
+        have = set(self[site].tick.tolist()) if told else set()
+        for event in told:
+            if event.ticks not in have:
                 named.setdefault(event.ticks, []).append(event.command)
         return dict(sorted(named.items()))
 

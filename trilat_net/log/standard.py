@@ -52,6 +52,7 @@ SESSION_CHANNELS = {
 }
 _LEVELS = {
     "diverged": Level.ERROR,
+    "failed": Level.ERROR,
     "lost": Level.WARN,
     "refused": Level.WARN,
     "clock fault": Level.WARN,

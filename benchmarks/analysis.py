@@ -1,0 +1,80 @@
+"""What the analysis of a minute costs: metrics, certificate and report of three sites at 1 kHz, on one core.
+
+A process of its own, pinned to one core, does all of it one after the other, and nothing is done beforehand.
+Time is that of the processor. The report is its figures, page and summary; what `trilat report` executes
+again beside it, on a second core, and the twin without hands are simulations, and are given apart.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
+
+SECONDS = 60
+SCENARIOS = ("paper", "windup", "jitter")
+BAR_S = 10.0
+_ALONE = """
+import os, sys, time
+from pathlib import Path
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+last = 0.0
+def lap(what):
+    global last
+    now = time.process_time()
+    print(f"{what}={now - last:.3f}")
+    last = now
+from trilat_net.analysis.report import write_report
+from trilat_net.certificate.certificate import certify
+from trilat_net.certificate.section import section
+from trilat_net.experiment import open_log, twin_without_hands, verify
+from trilat_net.metrics.facts import facts
+from trilat_net.metrics.measurement import measure
+lap("start")
+log = open_log(sys.argv[1])
+lap("opening")
+facts(log, measure(log))
+lap("metrics")
+certify(log)
+lap("certificate")
+write_report(log, Path(sys.argv[2]), sections=[section(log)])
+lap("report")
+twin_without_hands(log)
+lap("twin")
+verify(log)
+lap("verify")
+"""
+
+
+def run() -> list[str]:
+    lines = []
+    for name in SCENARIOS:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "run.mcap"
+            with path.open("wb") as stream:
+                virtual.record(load(name, {"duration_s": SECONDS}), stream)
+            lines += measured(name, path, Path(folder))
+    return lines
+
+
+def measured(name: str, path: Path, folder: Path) -> list[str]:
+    """Returns the shares of a log's analysis.
+
+    Args:
+        name: what the lines call it.
+        path: the log.
+        folder: where the report goes.
+    """
+    command = [sys.executable, "-c", _ALONE, path, folder]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
+    cost = {what: float(value) for what, value in (line.split("=") for line in done.stdout.split())}
+    apart = {what: cost.pop(what) for what in ("twin", "verify")}
+    shares = ", ".join(f"{what} {value:.1f}" for what, value in cost.items())
+    executed = ", ".join(f"{what} {value:.1f}" for what, value in apart.items())
+    return [
+        f"{name}, {SECONDS} s: {sum(cost.values()):.1f} s on one core (bar: <= {BAR_S:g}): {shares}",
+        f"  executed beside it: {executed} s",
+    ]
