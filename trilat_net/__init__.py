@@ -15,19 +15,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .drawing.figure import figure
     from .experiment import simulate, verify
     from .log.reader import open_log
     from .trial.running import check
     from .trial.trial import trials
     from .whatif.rerun import rerun
 
-__all__ = ["check", "open_log", "rerun", "simulate", "trials", "verify"]
+__all__ = ["check", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
 
 _MODULES = {
     "rerun": "whatif.rerun",
     "check": "trial.running",
     "trials": "trial.trial",
     "open_log": "log.reader",
+    "figure": "drawing.figure",
 }
 
 

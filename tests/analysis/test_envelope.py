@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -57,9 +57,27 @@ def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: flo
 
 
 @given(rate=st.floats(-1.0, 1.0), omega=st.floats(0.0, 40.0), phase=phases)
+@example(rate=0.0, omega=0.015625, phase=1.3125)
 def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> None:
     error = oscillation(rate, omega, phase)
     assert Trend.GROWS not in {envelope(T_S, error).trend} & {envelope(T_S, error[::-1]).trend}
+
+
+@given(turn_s=st.floats(16.5, 23.5), power=st.floats(0.3, 3.0), scale=scales)
+def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, scale: float) -> None:
+    """A quarter of a swing before the middle of a run and one behind it: nobody knows how it goes on."""
+    trend = envelope(T_S, scale * np.abs(T_S - turn_s) ** power).trend
+    assert trend in (Trend.UNDECIDED, Trend.STEADY)
+
+
+@given(decay=st.floats(0.05, 2.0), rate=st.floats(0.03, 0.3), share=st.floats(0.01, 1.0))
+def test_growth_under_a_start_that_dies_is_growth_once_it_has_gone_on(
+    decay: float, rate: float, share: float
+) -> None:
+    """At the middle of the longer run the growing part is ten times the dying one."""
+    t_s = np.linspace(0.0, 2.0 * max(4.0 / rate, math.log(10.0 / share) / (decay + rate)), 800)
+    error = np.exp(-decay * t_s) + share * np.exp(rate * t_s)
+    assert envelope(t_s, error).trend is Trend.GROWS
 
 
 @given(at_s=st.floats(20.0, 39.0), height=st.floats(10.0, 1e4), decay=st.floats(0.1, 5.0))

@@ -1,9 +1,11 @@
 """What a terminal is told of links, changes, modes and clocks."""
 
+from types import SimpleNamespace
+
 import trilat_net
 from trilat_net.analysis import notes
 from trilat_net.analysis.clocks import clock_use
-from trilat_net.analysis.notes import clock_lines, link_lines, run_lines
+from trilat_net.analysis.notes import MOST_LETTERS, clock_lines, link_lines, outside_lines, run_lines
 from trilat_net.net.messages import Event, LinkStats
 
 from . import logs
@@ -107,3 +109,15 @@ def test_a_shared_clock_and_a_log_without_one_are_not_worth_a_line():
     assert shared.shared
     assert clock_use(clocked(), "m2", "m1") is None
     assert clock_lines(logs.simulated("paper")) == []
+
+
+def test_what_came_from_outside_and_ended_the_run_is_a_line_that_a_terminal_can_have() -> None:
+    long = "the law a:B of s failed at tick 3: \x1b[31m" + "x" * 1000
+    said = [
+        SimpleNamespace(kind=kind, text=text)
+        for kind, text in (("ready", "s is ready"), ("failed", long), ("law", "slow"), ("arm", "off"))
+    ]
+    failed, law, arm = outside_lines(SimpleNamespace(events=said))
+    assert (law, arm) == ("slow", "off")
+    assert failed.startswith("the law a:B of s failed at tick 3:  [31mxxx")
+    assert len(failed) == MOST_LETTERS

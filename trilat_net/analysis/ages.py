@@ -15,6 +15,7 @@ from ..log.reader import Log
 from . import quantities, style
 from .arrivals import arrivals, sent
 from .fates import fates
+from .form import REPORT, Form
 from .happenings import Stated, changes, end_s, stated
 from .link_use import ages_ns, all_constant
 from .marks import Marks
@@ -40,12 +41,12 @@ class Distribution(NamedTuple):
     age_ms: Array
 
 
-def sample_age(log: Log) -> Figure:
+def sample_age(log: Log, form: Form = REPORT) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    marks, changed = Marks(log), changes(log)
+    marks, changed = Marks(log, form), changes(log)
     lines = {link: stated_line(log, stated(log, link, changed)) for link in log.scenario.links}
-    with style.paper():
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
+    with style.paper(form):
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
         grid = style.panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         drawn: list[Array] = []
         for site, row in zip(log.sites, grid, strict=True):
@@ -54,7 +55,7 @@ def sample_age(log: Log) -> Figure:
                 line = lines[f"{peer}->{site}"]
                 marks.draw(axes, [site], f"{peer}->{site}")
                 style.draw(axes, part.tick, part.t_s, age_ms, **style.line(log, peer, 1.4))
-                axes.plot(*line, **_STATED)
+                axes.plot(*line, **style.LIMIT)
                 axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
                 if not np.any(np.isfinite(age_ms)):
                     style.note(axes, "no sample in use")
@@ -64,28 +65,28 @@ def sample_age(log: Log) -> Figure:
         _age_axis(grid[0, 0], np.concatenate(drawn))
         style.time_axis(log, grid[-1])
         known = any(np.any(np.isfinite(values)) for _, values in lines.values())
-        style.legend(figure, [*_senders(log), *([("mean delay as stated", _STATED)] if known else [])])
+        style.legend(figure, [*_senders(log), *([("mean delay as stated", style.LIMIT)] if known else [])])
         marks.explain(figure, links=True)
     return figure
 
 
-def delay_distributions(log: Log) -> Figure:
+def delay_distributions(log: Log, form: Form = REPORT) -> Figure:
     """Returns the distributions of delay and age on every link: a row per receiver.
 
     A curve says how many samples, or ticks, have no more than so much, %.
     """
     if not varied(log):
-        return style.says(NO_JITTER)
+        return style.says(NO_JITTER, form)
     found = {(d.peer, d.site): d for d in distributions(log)}
-    with style.paper():
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
+    with style.paper(form):
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
         grid = style.panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         x_ms = delay_axis(list(found.values()))
         for site, row in zip(log.sites, grid, strict=True):
             for peer, axes in zip(log[site].peers, row, strict=True):
                 link = found[peer, site]
                 axes.plot(x_ms, percent_up_to(link.age_ms, x_ms), **style.line(log, peer, 1.8))
-                axes.plot(x_ms, percent_up_to(link.delay_ms, x_ms), **_STATED)
+                axes.plot(x_ms, percent_up_to(link.delay_ms, x_ms), **style.LIMIT)
                 axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
@@ -93,7 +94,7 @@ def delay_distributions(log: Log) -> Figure:
             axes.set_xlabel("delay or age (ms)")
         grid[0, 0].set(ylim=(0.0, 104.0), xlim=(0.0, x_ms[-1]))
         entries = [(f"age, {text}", options) for text, options in _senders(log)]
-        style.legend(figure, [*entries, ("delay of the samples", _STATED)])
+        style.legend(figure, [*entries, ("delay of the samples", style.LIMIT)])
     return figure
 
 
@@ -158,6 +159,3 @@ def _age_axis(axes: Axes, values: Array) -> None:
 
 def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
     return [(f"from {style.title(log, site)}", style.line(log, site, 1.8)) for site in log.sites]
-
-
-_STATED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}

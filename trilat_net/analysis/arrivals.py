@@ -94,7 +94,9 @@ def judged(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
     newest = int(came.sample.max(initial=-1))
     last = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
     known: Bools = (np.arange(count) <= newest) | (prompt + slowest <= last)
-    lacking = np.setdiff1d(np.arange(last + 1), part.tick)
+    absent = np.ones(last + 1, dtype=np.bool_)
+    absent[part.tick[part.tick <= last]] = False
+    lacking = np.flatnonzero(absent)
     if len(lacking):
         following = np.append(lacking, np.iinfo(np.int64).max)[np.searchsorted(lacking, prompt)]
         known &= following - prompt > slowest

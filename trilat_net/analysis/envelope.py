@@ -10,14 +10,16 @@ GROWS: the lower bound is positive; the maxima of the four quarters of the half 
 and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first; or
 at least 0.45 of it where the maxima rise to more than 8/5 in all, as nothing does that begins at zero with
 the run and rises ever more slowly. (A disturbance late in the run jumps and falls, a slow step response dies
-away: neither is growth. A steady drift is, as long as one looks.)
+away: neither is growth. A steady drift is, as long as one looks.) And the maxima of the four quarters of the
+first half do not fall, each by 1 % or more: what falls through one half and rises through the other is a V,
+and only a longer record tells what runs away from a swing slower than the run.
 
 DECAYS: the upper bound is negative and the line falls by 4 % or more over the half, or nothing in the half
 exceeds `FLOOR_RAD`. STEADY: the upper bound excludes that the envelope doubles within the half. Both need
 that the last quarter of the half does not exceed twice the one before. A sustained oscillation of whatever
 size is steady: bounded, and no more.
 
-UNDECIDED: everything else: too short, too irregular, growing but ever more slowly.
+UNDECIDED: everything else: too short, too irregular, growing but ever more slowly, a V.
 
 Two things no finite record excludes: growth that begins later, and a beat longer than the run, whose rising
 flank is growth as long as one looks.
@@ -84,7 +86,15 @@ def envelope(t_s: Array, error_rad: Array) -> Envelope:
         found = _judged(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows)
         if found.trend is not Trend.UNDECIDED:
             break
+    if found.trend is Trend.GROWS and _falls_first(t_s, error_rad):
+        return found._replace(trend=Trend.UNDECIDED)
     return found
+
+
+def _falls_first(t_s: Array, error_rad: Array) -> bool:
+    """True where the maxima of the first half's quarters fall throughout: read backwards they rise."""
+    maxima = _window_maxima(-t_s[::-1], error_rad[::-1], 4)
+    return maxima is not None and bool(np.diff(np.log(maxima)).min() >= _RISE)
 
 
 def _window_maxima(t_s: Array, error_rad: Array, windows: int) -> Array | None:

@@ -1,4 +1,7 @@
-"""Every figure of a log, by the name of its file. Each is one function of a log."""
+"""The figures beside a report, by the names of their files; `drawing.plates` has all that there are.
+
+Law: each is one function of a log.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -12,19 +12,21 @@ from matplotlib.figure import Figure
 
 from ..log.reader import Log
 from . import style
+from .form import REPORT, Form
 from .happenings import Changed, changes, spans
 
 MOST = 12
 """Changes that a figure explains; all of them stand on the page."""
 
 _AWAY, _BACK = 0.22, 0.09
+_LETTERS_PER_IN = 120.0
+"""Of 1 pt type, on the average."""
 _SAYS = {"hold": "holds", "brake": "brakes", "return": "returns (lighter)"}
 _CHANGE: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
 _NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
     "textcoords": "offset points",
     "va": "top",
-    "fontsize": 6.0,
     "color": style.REFERENCE,
     "bbox": {"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
 }
@@ -35,20 +37,23 @@ class Marks:
 
     Args:
         log: the log.
+        form: what they are drawn for.
     """
 
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: Log, form: Form = REPORT) -> None:
         self._log = log
+        self._small_pt = form.small_pt
         self._changes = list(enumerate(changes(log), 1))
         self._spans = {site: spans(log[site]) for site in log.sites}
 
-    def draw(self, axes: Axes, sites: Sequence[str], link: str = "") -> None:
+    def draw(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
         """Marks a panel over time: shaded in the colour of a site while it does not follow its peers.
 
         Args:
             axes: the panel.
             sites: whose marks.
             link: the only link whose changes it shows, or "": all that these sites carried out.
+            numbered: whether changes have their numbers there.
         """
         for site in sites:
             for mode, from_s, to_s in self._spans[site]:
@@ -59,7 +64,8 @@ class Marks:
         for n, changed in self._of(sites, link):
             at_s, place = changed.change.at_s, axes.get_xaxis_transform()
             axes.axvline(at_s, zorder=0.6, **_CHANGE)
-            axes.annotate(str(n), (at_s, 1.0), xycoords=place, **_NUMBER)
+            if numbered:
+                axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)
 
     def explain(self, figure: Figure, links: bool = False) -> None:
         """Says below a figure what is marked in it, where anything is.
@@ -72,14 +78,15 @@ class Marks:
         words = [f"{n}: {c.about} {c.text}" for n, c in told[:MOST]]
         if len(told) > MOST:
             words.append(f"and {len(told) - MOST} more")
-        lines = textwrap.wrap(f"Changes: {'; '.join(words)}", 140) if words else []
+        letters = int(_LETTERS_PER_IN * figure.get_figwidth() / self._small_pt)
+        lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
         modes = {span.mode for found in self._spans.values() for span in found}
         if modes:
             doing = ", ".join(text for mode, text in _SAYS.items() if mode in modes)
-            lines.append(f"Shaded in the colour of a site: it {doing}")
+            lines += textwrap.wrap(f"Shaded in the colour of a site: it {doing}", letters)
         if lines:
             text = "\n".join(lines).replace("+-", "±").replace("->", " → ")
-            figure.supxlabel(text, x=0.01, ha="left", fontsize=6.0, color=style.REFERENCE)
+            figure.supxlabel(text, x=0.01, ha="left", fontsize=self._small_pt, color=style.REFERENCE)
 
     def _of(self, sites: Sequence[str], link: str) -> list[tuple[int, Changed]]:
         found = [(n, c) for n, c in self._changes if c.site in sites]

@@ -4,7 +4,6 @@ Law: figures speak of the torque ON the arm, which is the negative of the record
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,6 +12,7 @@ from matplotlib.figure import Figure
 from ..core.arm import JOINTS, PARAMETERS
 from ..log.reader import Log
 from . import quantities, style
+from .form import REPORT, Form
 from .marks import Marks
 
 THETA_UNITS = ("kg m²", "kg m²", "kg m²", "kg m", "kg m")
@@ -22,14 +22,14 @@ NO_HANDS = "nobody at the arms: no site has hands in this run"
 NO_TWIN = "no run without hands to compare with"
 
 
-def operator_torques(log: Log) -> Figure:
+def operator_torques(log: Log, form: Form = REPORT) -> Figure:
     """Returns the torques of the operators' hands ON the arms over time, N m; Fig. 3 of the paper."""
     sites = quantities.sites_with_hands(log)
     if not sites:
-        return style.says(NO_HANDS)
-    marks = Marks(log)
-    with style.paper():
-        figure = style.new_figure(2.2)
+        return style.says(NO_HANDS, form)
+    marks = Marks(log, form)
+    with style.paper(form):
+        figure = style.new_figure(2.2, form.width_in)
         row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
         for joint, axes in enumerate(row):
             axes.set_title(f"joint {joint + 1}")
@@ -45,38 +45,39 @@ def operator_torques(log: Log) -> Figure:
     return figure
 
 
-def positions(log: Log) -> Figure:
+def positions(log: Log, form: Form = REPORT) -> Figure:
     """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
-    marks = Marks(log)
-    with style.paper():
-        figure = style.new_figure(0.7 + 1.25 * len(log.sites))
+    marks = Marks(log, form)
+    says = "{}: q (rad)" if form.narrow else "angle of {} (rad)"
+    with style.paper(form):
+        figure = style.new_figure(0.7 + (0.95 if form.narrow else 1.25) * len(log.sites), form.width_in)
         grid = style.panels(figure, len(log.sites), JOINTS, sharex=True, sharey="col")
         for site, row in zip(log.sites, grid, strict=True):
             part = log[site]
             actual, desired = quantities.angles(part), quantities.references(part)
             for joint, axes in enumerate(row):
                 style.draw(axes, part.tick, part.t_s, actual[:, joint], **style.line(log, site, 1.6))
-                style.draw(axes, part.tick, part.t_s, desired[:, joint], **_REFERENCE)
+                style.draw(axes, part.tick, part.t_s, desired[:, joint], **style.LIMIT)
                 marks.draw(axes, [site])
                 _note_absence(log, site, axes)
-            row[0].set_ylabel(f"angle of {site} (rad)")
+            row[0].set_ylabel(says.format(site))
         _joint_titles(grid[0])
         style.time_axis(log, grid[-1])
         actual_entries = [(f"{style.title(log, s)}, actual", style.line(log, s, 1.6)) for s in log.sites]
-        style.legend(figure, [*actual_entries, ("desired", _REFERENCE)])
+        style.legend(figure, [*actual_entries, ("desired", style.LIMIT)])
         marks.explain(figure)
     return figure
 
 
-def tracking_errors(log: Log) -> Figure:
+def tracking_errors(log: Log, form: Form = REPORT) -> Figure:
     """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it settles.
 
     The lowest panel shows, at every time, the largest error of any joint that is still to come: where it
     crosses the dashed line, the site has settled.
     """
-    marks = Marks(log)
-    with style.paper():
-        figure = style.new_figure(3.6)
+    marks = Marks(log, form)
+    with style.paper(form):
+        figure = style.new_figure(3.6, form.width_in)
         panels = figure.subplot_mosaic([["1", "2"], ["all", "all"]])
         row, settling = [panels["1"], panels["2"]], panels["all"]
         row[1].sharey(row[0])
@@ -91,45 +92,48 @@ def tracking_errors(log: Log) -> Figure:
         for axes in (*row, settling):
             marks.draw(axes, log.sites)
         style.time_axis(log, [*row, settling])
-        limit = (f"settled: {quantities.SETTLED_RAD:g} rad", _REFERENCE)
+        limit = (f"settled: {quantities.SETTLED_RAD:g} rad", style.LIMIT)
         style.legend(figure, [*style.site_entries(log, log.sites), limit])
         marks.explain(figure)
     return figure
 
 
-def parameter_estimates(log: Log, sites: Sequence[str] | None = None) -> Figure:
+def parameter_estimates(log: Log, sites: Sequence[str] | None = None, form: Form = REPORT) -> Figure:
     """Returns the estimates of the five parameters over time with the true values; Fig. 6 of the paper.
 
     Args:
         log: the log.
         sites: whose estimates; None for all. The paper shows master 1.
+        form: what it is drawn for.
     """
     chosen = log.sites if sites is None else tuple(sites)
-    marks = Marks(log)
-    with style.paper():
-        figure = style.new_figure(3.6)
-        panels = figure.subplot_mosaic([[*"112233"], [*"444555"]])
+    marks = Marks(log, form)
+    rows = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
+    with style.paper(form):
+        figure = style.new_figure(4.4 if form.narrow else 3.6, form.width_in)
+        panels = figure.subplot_mosaic([[*row] for row in rows])
         for index in range(PARAMETERS):
-            _estimate(log, chosen, index, panels[str(index + 1)])
+            _estimate(log, chosen, index, panels[str(index + 1)], form)
             marks.draw(panels[str(index + 1)], chosen)
         style.time_axis(log, list(panels.values()))
-        style.legend(figure, [*style.site_entries(log, chosen), ("true value", _REFERENCE)])
+        style.legend(figure, [*style.site_entries(log, chosen), ("true value", style.LIMIT)])
         marks.explain(figure)
     return figure
 
 
-def hands_moved(log: Log, twin: Log | None) -> Figure:
+def hands_moved(log: Log, twin: Log | None, form: Form = REPORT) -> Figure:
     """Returns how far the hands moved every site over time, rad: the log minus a run without hands.
 
     Args:
         log: the log.
         twin: the same experiment with nobody at the arms, or None.
+        form: what it is drawn for.
     """
     if twin is None:
-        return style.says(NO_TWIN if quantities.sites_with_hands(log) else NO_HANDS)
-    marks = Marks(log)
-    with style.paper():
-        figure = style.new_figure(2.2)
+        return style.says(NO_TWIN if quantities.sites_with_hands(log) else NO_HANDS, form)
+    marks = Marks(log, form)
+    with style.paper(form):
+        figure = style.new_figure(2.2, form.width_in)
         row = style.panels(figure, 1, JOINTS, sharex=True, sharey=True)[0]
         for site in log.sites:
             tick, t_s, moved = quantities.moved_by_hands(log, twin, site)
@@ -153,25 +157,23 @@ def _settling(log: Log, axes: Axes) -> None:
         positive = np.where(remaining > 0.0, remaining, np.nan)
         style.draw(axes, part.tick, part.t_s, positive, **style.line(log, site))
         low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
-    axes.axhline(quantities.SETTLED_RAD, **_REFERENCE)
+    axes.axhline(quantities.SETTLED_RAD, **style.LIMIT)
     axes.set(yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel="largest error\nstill to come (rad)")
 
 
-def _estimate(log: Log, sites: Sequence[str], index: int, axes: Axes) -> None:
+def _estimate(log: Log, sites: Sequence[str], index: int, axes: Axes, form: Form) -> None:
     """Draws the estimates of one parameter, and its true value once where all sites have the same."""
     truths = {site: float(quantities.true_parameters(log, site)[index]) for site in sites}
     for site in sites:
         part = log[site]
         style.draw(axes, part.tick, part.t_s, quantities.estimates(part)[:, index], **style.line(log, site))
     if len(set(truths.values())) == 1:
-        axes.axhline(truths[sites[0]], **_REFERENCE)
+        axes.axhline(truths[sites[0]], **style.LIMIT)
     else:
         for site, truth in truths.items():
-            axes.axhline(truth, **{**_REFERENCE, "color": style.colour(log, site)})
-    axes.set_ylabel(rf"estimate of $\theta_{index + 1}$ ({THETA_UNITS[index]})")
-
-
-_REFERENCE: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+            axes.axhline(truth, **{**style.LIMIT, "color": style.colour(log, site)})
+    words = "" if form.narrow else "estimate of "
+    axes.set_ylabel(rf"{words}$\theta_{index + 1}$ ({THETA_UNITS[index]})")
 
 
 def _joint_titles(row: Sequence[Axes]) -> None:

@@ -12,6 +12,9 @@ from .link_use import Counts, LinkUse, Spread, link_uses
 
 MOST = 12
 """Lines of each kind; what is more stands in summary.json."""
+MOST_LETTERS = 400
+OUTSIDE = ("failed", "law", "arm")
+"""Kinds of the events that tell of what came from outside of the program."""
 
 
 def run_lines(log: Log) -> list[str]:
@@ -20,7 +23,23 @@ def run_lines(log: Log) -> list[str]:
     Raises:
         LogError: a record names a change that is none.
     """
-    return [*link_lines(log), *change_lines(log), *mode_lines(log), *clock_lines(log)]
+    return [
+        *outside_lines(log),
+        *link_lines(log),
+        *change_lines(log),
+        *mode_lines(log),
+        *clock_lines(log),
+    ]
+
+
+def outside_lines(log: Log) -> list[str]:
+    """Returns what sites said of laws and arms from outside: why one ended the run, and what was odd."""
+    return _first([_plain(event.text) for event in log.events if event.kind in OUTSIDE])
+
+
+def _plain(text: str) -> str:
+    """Returns what somebody wrote into a log as a line of bounded length."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:MOST_LETTERS])
 
 
 def link_lines(log: Log) -> list[str]:

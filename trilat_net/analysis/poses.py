@@ -14,8 +14,10 @@ from ..core.arm import JOINTS, Array, forward_kinematics
 from ..log.reader import Log
 from ..scenario import Arm
 from . import quantities, style
+from .form import REPORT, Form
 
 INSTANTS = 6
+_NARROW_INSTANTS = 3
 _PATH_POINTS = 400
 
 
@@ -90,20 +92,22 @@ def bounds_m(poses: Sequence[Pose | None]) -> tuple[float, float, float, float]:
     return float(left), float(right), float(bottom), float(top)
 
 
-def arms(log: Log, instants: Sequence[float] | None = None) -> Figure:
+def arms(log: Log, instants: Sequence[float] | None = None, form: Form = REPORT) -> Figure:
     """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
 
     Args:
         log: the log.
         instants: which, s; None for `instants_s`.
+        form: what it is drawn for.
     """
-    times = instants_s(log) if instants is None else list(instants)
+    count = _NARROW_INSTANTS if form.narrow else INSTANTS
+    times = instants_s(log, count) if instants is None else list(instants)
     drawn = {site: [pose(log, site, t) for t in times] for site in log.sites}
     left, right, bottom, top = bounds_m([p for row in drawn.values() for p in row])
-    side_in = (style.WIDTH_IN - 0.6) / len(times)
-    with style.paper():
+    side_in = (form.width_in - 0.6) / len(times)
+    with style.paper(form):
         height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
-        figure = style.new_figure(height_in)
+        figure = style.new_figure(height_in, form.width_in)
         grid = style.panels(figure, len(log.sites), len(times), sharex=True, sharey=True)
         for site, row in zip(log.sites, grid, strict=True):
             for axes, one in zip(row, drawn[site], strict=True):

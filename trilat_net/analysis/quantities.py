@@ -27,6 +27,11 @@ def errors(part: SiteLog) -> Array:
     return part.e.reshape(-1, JOINTS)
 
 
+def error_rates(part: SiteLog) -> Array:
+    """Returns qd - qd_des, Eq. (18), shape (K, 2), rad/s."""
+    return (part.qd - part.qd_des).reshape(-1, JOINTS)
+
+
 def control_torques(part: SiteLog) -> Array:
     """Returns tau, Eq. (13), shape (K, 2), N m."""
     return part.tau.reshape(-1, JOINTS)

@@ -6,6 +6,7 @@ The first three colours are the "high contrast" set of Paul Tol's notes on colou
 blind, and apart in lightness, so that they are apart in grey print. More sites than colours: dashes.
 """
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from ..core.arm import Array
 from ..log.reader import Ints, Log
 from .decimation import thin
+from .form import REPORT, Form
 from .happenings import end_s
 
 Grid = NDArray[np.object_]
@@ -31,8 +34,11 @@ DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)
 REFERENCE = "#333333"
 FAINT = "#8c8c8c"
 
-WIDTH_IN = 7.0
-DPI = 200
+LIMIT: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+"""The line of what is desired, true, stated or allowed."""
+
+WIDTH_IN = REPORT.width_in
+DPI = REPORT.dpi
 BUCKETS = 700
 """Per panel: half a page is 700 pixels wide."""
 
@@ -49,11 +55,10 @@ _RC: Any = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.formatter.use_mathtext": True,
+    "axes.formatter.useoffset": False,  # an axis says what it shows, not what it shows less one
     "grid.color": "#dddddd",
     "grid.linewidth": 0.5,
     "lines.linewidth": 1.1,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
     "legend.fontsize": 8.0,
@@ -67,11 +72,18 @@ _RC: Any = {
     "path.simplify": True,
 }
 
+_NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "legend.borderaxespad": 0.2}
+
 
 @contextmanager
-def paper() -> Iterator[None]:
-    """Makes figures inside the block look like ours; outside, nothing changes."""
-    with mpl.rc_context(_RC):
+def paper(form: Form = REPORT) -> Iterator[None]:
+    """Makes figures inside the block look like ours; outside, nothing changes.
+
+    Args:
+        form: what they are drawn for.
+    """
+    sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
+    with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
         yield
 
 
@@ -143,14 +155,19 @@ def span_s(log: Log) -> float:
 
 
 def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
-    """Puts a legend above the panels, where it hides nothing.
+    """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for.
 
     Args:
         figure: whose.
         entries: (text, options of the line).
     """
     handles = [Line2D([], [], label=text, **options) for text, options in entries]
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 6))
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    for columns in range(min(len(handles), 6), 0, -1):
+        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+        if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        made.remove()
 
 
 def site_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
@@ -158,11 +175,12 @@ def site_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, An
     return [(title(log, s), line(log, s)) for s in sites]
 
 
-def says(text: str) -> Figure:
+def says(text: str, form: Form = REPORT) -> Figure:
     """Returns a figure that says why there is nothing to draw."""
-    with paper():
-        figure = new_figure(1.0)
-        figure.text(0.5, 0.5, text, ha="center", va="center", color=REFERENCE)
+    with paper(form):
+        figure = new_figure(1.0, form.width_in)
+        lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
+        figure.text(0.5, 0.5, lines, ha="center", va="center", color=REFERENCE)
     return figure
 
 

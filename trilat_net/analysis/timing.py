@@ -3,8 +3,6 @@
 Law: in virtual time there is no clock, and a figure of one says so instead of drawing zeros.
 """
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,10 +10,13 @@ from matplotlib.figure import Figure
 from ..core.arm import Array
 from ..log.reader import Ints, Log
 from . import style
+from .form import REPORT, Form
 
 NO_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
+_WORDS = ("wake-up after the deadline", "computing time of a tick")
+_SHORT = ("lateness", "computing time")
 
 
 def has_clock(log: Log) -> bool:
@@ -53,35 +54,34 @@ def histogram(times_us: Ints, edges: Array) -> Ints:
     return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
 
 
-def loop_timing(log: Log) -> Figure:
+def loop_timing(log: Log, form: Form = REPORT) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
     if not has_clock(log):
-        return style.says(no_clock_text(log))
+        return style.says(no_clock_text(log), form)
     edges = bin_edges(log)
-    with style.paper():
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites))
+    words = _SHORT if form.narrow else _WORDS
+    with style.paper(form):
+        figure = style.new_figure(0.6 + (1.3 if form.narrow else 1.05) * len(log.sites), form.width_in)
         grid = style.panels(figure, len(log.sites), 2, sharex=True, sharey=True)
         for site, (late, busy) in zip(log.sites, grid, strict=True):
-            _bars(log, site, late, log[site].late_us, edges)
-            _bars(log, site, busy, log[site].busy_us, edges)
+            _bars(log, site, late, log[site].late_us, edges, form)
+            _bars(log, site, busy, log[site].busy_us, edges, form)
             late.set_ylabel("ticks (count)")
         grid[0, 0].set_ylim(bottom=0.7)
-        grid[-1, 0].set_xlabel("wake-up after the deadline (µs)")
-        grid[-1, 1].set_xlabel("computing time of a tick (µs)")
-        style.legend(figure, [("one period", _PERIOD)])
+        for axes, text in zip(grid[-1], words, strict=True):
+            axes.set_xlabel(f"{text} (µs)")
+        style.legend(figure, [("one period", style.LIMIT)])
     return figure
 
 
-def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array) -> None:
+def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: Form) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.stairs(histogram(times_us, edges), edges, baseline=0.5, fill=True, color=style.colour(log, site))
-    axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **_PERIOD)
+    axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT)
     if not len(times_us):
         style.note(axes, f"no times of {site}")
         return
     p50, p99, largest = (f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0)))
-    axes.set_title(f"{site}: p50 {p50}, p99 {p99}, max {largest} µs", loc="left", pad=2.0)
-
-
-_PERIOD: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+    between = "\n" if form.narrow else " "
+    axes.set_title(f"{site}: p50 {p50}, p99 {p99},{between}max {largest} µs", loc="left", pad=2.0)

@@ -1,0 +1,64 @@
+"""`trilat figure`: files for a paper."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from .running import trilat
+
+
+@pytest.fixture
+def folder(tmp_path: Path, short_log: bytes) -> Path:
+    (tmp_path / "run.mcap").write_bytes(short_log)
+    return tmp_path
+
+
+def test_figures_are_written_by_name(folder: Path) -> None:
+    done = trilat(
+        "figure", "run.mcap", "phase", "settling", "--format", "svg,pdf", "--out", "paper", cwd=folder
+    )
+    names = ["phase.svg", "phase.pdf", "settling.svg", "settling.pdf"]
+    assert done.succeeds().split() == [f"paper/{name}" for name in names]
+    assert sorted(path.name for path in (folder / "paper").iterdir()) == sorted(names)
+    assert b"MediaBox [ 0 0 252 " in (folder / "paper" / "phase.pdf").read_bytes()
+
+
+def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
+    done = trilat("figure", "run.mcap", "control_torques", "--width", "7", "--json", cwd=folder)
+    paths = json.loads(done.succeeds())
+    assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
+    assert b"MediaBox [ 0 0 504 " in (folder / paths[0]).read_bytes()
+
+
+def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
+    printed = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
+    assert "settling times" in printed
+    assert "no site has a wall" in printed
+    rows = json.loads(trilat("figure", "run.mcap", "--list", "--json", cwd=folder).succeeds())
+    absent = {row["name"]: row["absent"] for row in rows}
+    assert absent["positions"] is None
+    assert absent["contact"] == "no site has a wall in this run"
+    assert not (folder / "run-figures").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "facts"),
+    [
+        (["posittions"], ["did you mean 'positions'"]),
+        (["contact"], ["no site has a wall"]),
+        (["phase", "--width", "4"], ["3.5 or 7 in wide, not 4"]),
+        (["phase", "--format", "bmp"], ["pdf, png, svg", "'bmp'"]),
+        (["phase", "--format", ","], ["--format names no format"]),
+        (["phase", "--out", "run.mcap"], ["run.mcap"]),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(folder: Path, words: list[str], facts: list[str]) -> None:
+    trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)
+
+
+def test_a_file_is_replaced_only_by_force(folder: Path) -> None:
+    words = ("figure", "run.mcap", "phase", "--format", "pdf")
+    trilat(*words, cwd=folder).succeeds()
+    trilat(*words, cwd=folder).refuses("phase.pdf: exists", "--force")
+    trilat(*words, "--force", cwd=folder).succeeds()

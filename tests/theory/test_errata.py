@@ -1,0 +1,165 @@
+"""The corrections of docs/errata.md, 5 and 8: the derivative of V by the chain rule, in symbols."""
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from tests.theory.symbols import (
+    QD,
+    THETA,
+    Q,
+    columns,
+    coriolis,
+    diagonal,
+    dot,
+    gravity,
+    inertia,
+    norm,
+    pair,
+    zero,
+)
+
+
+def test_every_test_that_the_errata_name_is_there() -> None:
+    here = Path(__file__).parent
+    named = re.findall(
+        r"`(test_\w+?)(?:_\.\.\.)?`", (here / "../../docs/errata.md").read_text(encoding="utf-8")
+    )
+    files = [here / f"test_errata{part}.py" for part in ("", "_arm", "_weights")]
+    written = "".join(file.read_text(encoding="utf-8") for file in files)
+    assert len(named) > 15
+    assert [name for name in named if f"def {name}" not in written] == []
+
+
+# --- 5: the derivative of V_i ---------------------------------------------------------------------------
+
+
+class Rates(NamedTuple):
+    """Site 1 with peers 2 and 3: V_1' by the chain rule, and what Eq. (16)-(19) are written with."""
+
+    chain: Any
+    r: sp.Matrix
+    e: sp.Matrix
+    ed: sp.Matrix
+    qd_j: list[sp.Matrix]
+    seen: list[sp.Matrix]
+    alpha: list[Any]
+    growth: list[Any]
+    hand: sp.Matrix
+    Kp: sp.Matrix
+    Kd: sp.Matrix
+    Lambda: sp.Matrix
+
+    @property
+    def passed(self) -> Any:
+        """Sum over peers of alpha (|qd_j|^2 - |qd_j(t - T)|^2)."""
+        terms = zip(self.alpha, self.qd_j, self.seen, strict=True)
+        return sum(a * (norm(now, self.Kd) - norm(then, self.Kd)) for a, now, then in terms)
+
+    @property
+    def disagreement(self) -> Any:
+        return sum(a * norm(QD - then, self.Kd) for a, then in zip(self.alpha, self.seen, strict=True))
+
+
+@cache
+def rates() -> Rates:
+    """Eq. (8), (13), (15) put into the derivative of Eq. (16), for delays T(t) that may grow."""
+    Lambda, Kp, Kd, Gamma = diagonal("L"), diagonal("P"), diagonal("D"), sp.diag(*sp.symbols("gamma1:6"))
+    share, growth = sp.Symbol("alpha12", positive=True), list(sp.symbols("Tdot2 Tdot3", real=True))
+    alpha = [share, 1 - share]  # Eq. (7)
+    e, qd_j, seen, hand = pair("e"), [pair("u"), pair("w")], [pair("us"), pair("ws")], pair("h")
+    estimate = sp.Matrix(sp.symbols("hat1:6", real=True))
+    ed = QD - sum((a * x for a, x in zip(alpha, seen, strict=True)), sp.zeros(2, 1))  # Eq. (18)
+    lags = zip(alpha, growth, seen, strict=True)
+    e_dot = ed + sum((a * grows * x for a, grows, x in lags), sp.zeros(2, 1))
+    r = QD + Lambda * e  # Eq. (10)
+    Y = columns(-Lambda * e, -Lambda * ed)
+    tau = Y * estimate - Kp * r - Kd * ed  # Eq. (13)
+    M_qdd = tau + hand - coriolis(QD) * QD - gravity()  # Eq. (8), tau_h = -tau_x
+    M_dot = sum((inertia().diff(Q[n]) * QD[n] for n in (0, 1)), sp.zeros(2, 2))
+    chain = dot(r, M_qdd + inertia() * Lambda * e_dot) + norm(r, M_dot) / 2
+    chain += dot(estimate - THETA, Gamma.inv() * (-Gamma * Y.T * r))  # Eq. (15)
+    chain += dot(e, Lambda * Kd * e_dot)
+    for a, grows, now, then in zip(alpha, growth, qd_j, seen, strict=True):
+        chain += a * (norm(now, Kd) - (1 - grows) * norm(then, Kd)) / 2
+    return Rates(chain, r, e, ed, qd_j, seen, alpha, growth, hand, Kp, Kd, Lambda)
+
+
+@cache
+def chain(constant: bool) -> Any:
+    """V_1' by the chain rule, with constant delays or not."""
+    x = rates()
+    still = dict.fromkeys(x.growth, 0) if constant else {}
+    return sp.expand(sp.expand_trig(x.chain.subs(still)))
+
+
+def test_eq_17_has_the_other_sign_and_half_of_the_last_term() -> None:
+    """Errata 5, Eq. (17), and 9: the hands' power is r'tau_h, not qd'tau_h."""
+    x = rates()
+    right = -norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed / 2
+    assert zero(chain(True) - right - dot(x.r, x.hand))
+    free = chain(True).subs(dict.fromkeys(x.hand, 0))
+    printed = -norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed
+    assert not zero(free - printed)
+    assert not zero(free - (-norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed))  # the sign alone
+    assert not zero(free - (-norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed / 2))  # the factor alone
+    assert not zero(chain(True) - right - dot(QD, x.hand))
+
+
+def test_eq_19_does_not_follow_from_eq_17_and_what_does() -> None:
+    """Errata 5, Eq. (19): halves, and the other sign of the last two norms."""
+    x = rates()
+    stored = norm(QD, x.Kd) - sum(a * norm(u, x.Kd) for a, u in zip(x.alpha, x.qd_j, strict=True))
+    printed_17 = -norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed
+    printed_19 = -norm(x.r, x.Kp) - x.disagreement + stored
+    assert not zero(printed_17 - printed_19)
+    right_17 = -norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed / 2
+    right_19 = -norm(x.r, x.Kp) - x.disagreement / 2 - stored / 2
+    assert zero(right_17 - right_19)
+    assert not zero(right_17 - printed_19)
+
+
+# --- 8: delays that vary --------------------------------------------------------------------------------
+
+
+def test_a_delay_that_varies_adds_exactly_this() -> None:
+    """Errata 8: sum_j alpha_ij T_ij' (1/2 |qd_jd|^2 + (Lambda Kd e + Lambda M r)'qd_jd)."""
+    x = rates()
+    push = x.Lambda * x.Kd * x.e + x.Lambda * inertia() * x.r
+    terms = zip(x.alpha, x.growth, x.seen, strict=True)
+    added = sum(a * grows * (norm(then, x.Kd) / 2 + dot(push, then)) for a, grows, then in terms)
+    assert zero(chain(False) - chain(True) - added)
+
+
+def one_joint(grows: float, Kp: float, Kd: float, Lambda: float, M: float) -> Any:
+    """V_i' less what beta cancels, as a symmetric matrix in (r, Lambda e, qd_jd), one joint, one peer.
+
+    From the chain rule above: -Kp r^2 - Kd/2 (qd - w)^2 + T' (Kd/2 w^2 + (Lambda Kd e + Lambda M r) w).
+    """
+    r, x, w = sp.symbols("r x w", real=True)
+    rate = -Kp * r**2 - Kd / 2 * (r - x - w) ** 2
+    rate += grows * (Kd / 2 * w**2 + Kd * x * w + Lambda * M * r * w)
+    return np.array(sp.hessian(rate, (r, x, w)), dtype=float) / 2
+
+
+@pytest.mark.parametrize("grows", [-1.0, -0.1, -1e-3, -1e-6])
+def test_a_delay_that_shrinks_lets_v_rise_however_slowly(grows: float) -> None:
+    """Errata 8: all arms in common motion, r = 0, Lambda e = -qd: V' = -T'/2 |qd|^2 > 0."""
+    form = one_joint(grows, 1.0, 3.0, 1.0, 5.83)
+    state = np.array([0.0, -1.0, 1.0])
+    assert state @ form @ state == pytest.approx(-grows * 3.0 / 2)
+    assert np.linalg.eigvalsh(form)[-1] > 0.0
+
+
+@pytest.mark.parametrize("gains", [(1.0, 3.0, 1.0, 5.83), (20.0, 5.0, 2.0, 0.17), (0.1, 10.0, 1.0, 1.0)])
+def test_a_delay_that_grows_slowly_enough_does_not(gains: tuple[float, float, float, float]) -> None:
+    """Errata 8: T' (Kd + Lambda M)^2 <= 2 Kp Kd (1 - T') is where V' <= 0 ends."""
+    Kp, Kd, Lambda, M = gains
+    limit = 2 * Kp * Kd / ((Kd + Lambda * M) ** 2 + 2 * Kp * Kd)
+    assert np.linalg.eigvalsh(one_joint(0.99 * limit, *gains))[-1] < 0.0
+    assert np.linalg.eigvalsh(one_joint(1.01 * limit, *gains))[-1] > 0.0

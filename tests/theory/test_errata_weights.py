@@ -1,0 +1,238 @@
+"""The corrections of docs/errata.md, continued: weights, hands, convergence, and what dominance means."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.optimize import linprog
+
+from tests.theory.energy import balance
+from tests.virtual_runs import run
+from trilat_net.certificate.weights import closed_groups, left_vector, weights
+from trilat_net.core.exogenous import Actor, Acts, rows_of, torque_on_arm
+
+A12, A21, A31 = sp.symbols("alpha12 alpha21 alpha31", positive=True)
+ALPHA = sp.Matrix([[0, A12, 1 - A12], [A21, 0, 1 - A21], [A31, 1 - A31, 0]])  # Eq. (7)
+UPSILON = ALPHA - sp.eye(3)  # Eq. (20)
+ONES = sp.ones(1, 3)
+PI = sp.Matrix([[1 - ALPHA[1, 2] * ALPHA[2, 1], 1 - ALPHA[0, 2] * ALPHA[2, 0], 1 - A12 * A21]])
+SQUARES = sp.Matrix(sp.symbols("Q1:4", positive=True))
+
+
+def shares(rng: np.random.Generator, size: int) -> Any:
+    """A dominance matrix of so many sites."""
+    alpha = rng.uniform(0.05, 1.0, (size, size)) * (1 - np.eye(size))
+    return alpha / alpha.sum(axis=1, keepdims=True)
+
+
+def perron(alpha: Any) -> Any:
+    """Its left eigenvector of eigenvalue 1, from NumPy, sum 1."""
+    values, vectors = np.linalg.eig(alpha.T)
+    vector = np.real(vectors[:, np.argmin(np.abs(values - 1))])
+    return vector / vector.sum()
+
+
+# --- 6: beta --------------------------------------------------------------------------------------------
+
+
+def test_beta_is_the_left_null_vector_and_ones_the_right_one() -> None:
+    """Errata 6, after Eq. (20)."""
+    assert (PI * UPSILON).expand() == sp.zeros(1, 3)
+    assert (UPSILON * ONES.T).expand() == sp.zeros(3, 1)
+    assert (ONES * UPSILON).expand() != sp.zeros(1, 3)
+
+
+def test_ones_work_on_one_parameter_of_the_three() -> None:
+    """Errata 6: alpha12 = alpha31 = 1 - alpha21, the circulant matrices."""
+    (found,) = sp.solve(list(ONES * UPSILON), [A12, A31], dict=True)
+    assert found == {A12: 1 - A21, A31: 1 - A21}
+
+
+def test_eq_22_has_the_other_sign_of_what_eq_21_ends_with() -> None:
+    """Errata 6, Eq. (21)-(23): it goes unnoticed as the term is zero, if beta is right."""
+    beta = sp.Matrix([sp.symbols("b1:4", positive=True)])
+    ends = sum(beta[i] * (SQUARES[i] - (ALPHA * SQUARES)[i]) for i in range(3))
+    assert sp.expand(ends + (beta * UPSILON * SQUARES)[0]) == 0
+    assert sp.expand(ends - (beta * UPSILON * SQUARES)[0]) != 0
+    printed = sp.Matrix([SQUARES[0]] * 3)  # Eq. (23) has the velocity of site 1 three times
+    assert sp.expand(ends + (beta * UPSILON * printed)[0]) != 0
+
+
+def test_with_ones_v_can_rise() -> None:
+    """Errata 6: one arm moves, its peers saw it move before; r = 0, and its column sums to more than one."""
+    alpha = np.array([[0.0, 0.9, 0.1], [0.5, 0.0, 0.5], [0.2, 0.8, 0.0]])
+    qd = np.array([0.0, 1.0, 0.0])
+    seen = np.repeat(qd[:, np.newaxis], 3, axis=1)  # of every peer what makes the disagreement zero
+
+    def rate(beta: Any) -> float:
+        each = -0.5 * (alpha * (qd[:, np.newaxis] - seen) ** 2).sum(1) - 0.5 * qd**2 + 0.5 * alpha @ qd**2
+        return float(beta @ each)
+
+    assert rate(np.ones(3)) == pytest.approx(0.5 * (0.9 + 0.8 - 1))
+    assert rate(perron(alpha)) == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("size", [2, 3, 4, 6])
+def test_the_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: int) -> None:
+    """Errata 6, N sites."""
+    alpha = shares(np.random.default_rng(size), size)
+    assert left_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
+    c = np.linspace(0.3, 10.0, size)
+    beta = weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
+    assert beta * c / (beta @ c) == pytest.approx(perron(alpha), rel=1e-9)
+
+
+# --- 7: Kd ----------------------------------------------------------------------------------------------
+
+
+def passed_on(alpha: Any, Kd: Any) -> Any:
+    """Rows: what beta has to cancel of |qd_j|^2, per joint; shape (joints * N, N), times beta."""
+    rows = [(alpha - np.eye(len(alpha))).T * Kd[:, joint] for joint in range(Kd.shape[1])]
+    return np.concatenate(rows)
+
+
+def feasible(alpha: Any, Kd: Any) -> bool:
+    """Whether some beta >= 0, not zero, leaves nothing positive."""
+    rows = passed_on(alpha, Kd)
+    n = len(alpha)
+    found = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])
+    return bool(found.status == 0)
+
+
+def test_kd_may_differ_by_a_scalar_per_site_and_by_nothing_else() -> None:
+    """Errata 7: beta_i = pi_i / c_i; of another shape there is no beta, not even for V' <= 0."""
+    alpha, c = shares(np.random.default_rng(3), 3), np.array([10.0, 3.0, 0.3])
+    common = c[:, np.newaxis] * [2.0, 5.0]
+    assert passed_on(alpha, common) @ (perron(alpha) / c) == pytest.approx(np.zeros(6), abs=1e-14)
+    assert np.abs(passed_on(alpha, common) @ perron(alpha)).max() > 0.1
+    assert feasible(alpha, common)
+    assert not feasible(alpha, np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]]))
+
+
+def test_there_is_no_slack_not_even_with_other_weights_in_the_integrals() -> None:
+    """Errata 7: with w_ij in the integral what is left sums to alpha_ij (k_i - w_ij)^2 / (2 w_ij) >= 0."""
+    k, w = sp.symbols("k w", positive=True)
+    own, seen = sp.symbols("own seen", real=True)
+    (best,) = sp.solve(sp.diff(k * own * seen - w * seen**2 / 2, seen), seen)
+    most = (k * own * seen - w * seen**2 / 2).subs(seen, best)  # over what the peer may have done
+    assert sp.simplify(most - k**2 * own**2 / (2 * w)) == 0
+    assert sp.simplify(-k + k**2 / (2 * w) + w / 2 - (k - w) ** 2 / (2 * w)) == 0
+
+
+# --- 9: hands -------------------------------------------------------------------------------------------
+
+
+def test_a_wall_that_is_passive_at_its_contact_gives_energy_to_v() -> None:
+    """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda e'tau_h > 0."""
+    wall = Actor(Acts.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
+    rows, table = rows_of((wall,))
+    lengths, work, torque = np.ones(2), np.zeros((6, 2)), np.zeros(2)
+
+    def push(q: Any) -> Any:
+        torque_on_arm(0.0, q, np.zeros(2), lengths, rows, table, 0, work, torque)
+        return torque.copy()
+
+    turns = np.linspace(0.0, 2 * np.pi, 4001)
+    path = np.array([-0.5, 1.85]) + 0.2 * np.stack([np.cos(turns), np.sin(2 * turns)], axis=1)
+    steps, middles = np.diff(path, axis=0), 0.5 * (path[1:] + path[:-1])
+    work_done = np.array([step @ push(q) for step, q in zip(steps, middles, strict=True)])
+    assert np.abs(work_done).sum() > 10.0
+    assert (work_done == 0.0).any()  # part of the way is free
+    assert work_done.sum() == pytest.approx(0.0, abs=0.01)  # once around: the wall gives back what it took
+    rests, desired = np.array([-0.5, 1.75]), np.array([-0.45, 1.6])  # its peers are deeper in the wall
+    assert push(rests) @ (rests - desired) > 10.0
+
+
+# --- 10: convergence ------------------------------------------------------------------------------------
+
+
+def test_a_rate_that_vanishes_does_not_make_a_limit() -> None:
+    """Errata 10: e = sin(ln(1 + t)): its rate is square integrable and goes to zero, and e never settles."""
+    t = sp.Symbol("t", positive=True)
+    e = sp.sin(sp.log(1 + t))
+    rate = sp.diff(e, t)
+    assert sp.limit(sp.Abs(rate), t, sp.oo) == 0
+    assert sp.simplify(rate**2 * (1 + t) ** 2 - sp.cos(sp.log(1 + t)) ** 2) == 0  # at most 1 / (1 + t)^2
+    late = [sp.exp(sp.pi * (n + sp.Rational(1, 2))) - 1 for n in (10, 11)]
+    assert [e.subs(t, when) for when in late] == [1, -1]
+
+
+def test_weighted_errors_are_what_moved_while_samples_were_under_way() -> None:
+    """Errata 10.4: sum pi_i e_i = sum pi_i alpha_ij (q_j(t) - q_j(t - T_ij)); the step to 3c omits it."""
+    q = sp.Matrix(sp.symbols("q1:4"))
+    seen = sp.Matrix(3, 3, lambda i, j: sp.Symbol(f"q{j + 1}_at_{i + 1}"))
+    e = [q[i] - sum(ALPHA[i, j] * seen[i, j] for j in range(3)) for i in range(3)]
+    moved = sum(PI[i] * ALPHA[i, j] * (q[j] - seen[i, j]) for i in range(3) for j in range(3))
+    assert sp.expand(sum(PI[i] * e[i] for i in range(3)) - moved) == 0
+    assert sp.expand(sum(PI[i] * e[i] for i in range(3))) != 0
+    c, t, T = sp.symbols("c t T")
+    steady = {q[j]: c * t for j in range(3)} | {seen[i, j]: c * (t - T) for i in range(3) for j in range(3)}
+    assert [sp.expand(x.subs(steady)) for x in e] == [c * T] * 3  # arms that drift together have e = c T
+
+
+def test_nothing_but_rest_is_left() -> None:
+    """Errata 10.4: what w is multiplied with, sum pi_i / Lambda_i + sum pi_i alpha_ij T_ij, is positive."""
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        alpha = shares(rng, 4)
+        pi, Lambda, T = perron(alpha), rng.uniform(0.1, 5.0, 4), rng.uniform(0.0, 2.0, (4, 4))
+        assert (pi / Lambda).sum() + (pi[:, np.newaxis] * alpha * T).sum() >= (pi / Lambda).sum() > 0.0
+
+
+# --- 11: reducible matrices -----------------------------------------------------------------------------
+
+LOCKED = {"m1": {"s": 1.0, "m2": 0.0}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 1.0, "m2": 0.0}}
+"""Expert and slave follow each other; the trainee follows both."""
+
+
+def test_a_weight_is_zero_where_the_other_two_are_locked() -> None:
+    """Errata 11: 1 - alpha_ij alpha_ji = 0 with shares of at most one."""
+    assert list(PI.subs({A12: 0, A31: 1})) == [1, 0, 1]
+    for own in (0.2, 0.7, 0.999):
+        assert min(PI.subs({A12: 1 - own, A31: 1, A21: 0.5})) > 0
+
+
+def test_a_site_that_nobody_follows_settles_all_the_same() -> None:
+    """Errata 11: V with beta = (1, 0, 1) never rises; V_2 alone may; e goes to zero at every site."""
+    rows = {f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()}
+    made = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
+    locked = balance(made, np.array([0.5, 0.0, 0.5])).V
+    assert np.diff(locked).max() <= 1e-6 * locked.max()
+    alone = balance(made, np.array([0.0, 1.0, 0.0])).V
+    assert np.diff(alone).max() > 1e-6 * alone.max()
+    e = np.abs(made.stack("q") - made.stack("q_des")).max(axis=(0, 2))
+    assert e[-200:].max() < 0.02 < 0.5 < e.max()
+
+
+def test_four_sites_in_two_closed_groups_have_no_one_beta() -> None:
+    """Errata 11, N >= 4."""
+    alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
+    assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
+    assert closed_groups(alpha) == ((0, 1), (2, 3))
+
+
+# --- 12: what is not an error but follows ---------------------------------------------------------------
+
+
+def test_learning_gravity_is_a_spring() -> None:
+    """Errata 12: theta_4_hat + Gamma g sin q1 changes by -Gamma g cos(q1) Lambda e1 alone: qd integrates."""
+    t, gain, g, Lambda = sp.symbols("t Gamma g Lambda", positive=True)
+    q, e = sp.Function("q")(t), sp.Function("e")(t)
+    learnt = -gain * g * sp.cos(q) * (q.diff(t) + Lambda * e)  # Eq. (15), fourth column of Y
+    assert sp.simplify(learnt + (gain * g * sp.sin(q)).diff(t) + gain * g * sp.cos(q) * Lambda * e) == 0
+
+
+def test_dominance_is_who_feels_whom() -> None:
+    """Errata 12: at rest sum beta_i tau_h,i = 0, so that a hand at i feels tau_s beta_s / beta_i."""
+    alpha = np.array([[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]])
+    beta, stiffness = perron(alpha), 40.0
+    for holding, felt in ((0, 4.79), (1, 16.4)):
+        free = np.array([i for i in range(3) if i != holding])
+        load = np.array([0.0, 0.0, 5.0])
+        stiff = stiffness * (np.eye(3) - alpha)  # Kp Lambda e = tau_h, with the holding site's q = 0
+        q = np.zeros(3)
+        q[free] = np.linalg.solve(stiff[np.ix_(free, free)], load[free])
+        hand = (stiff @ q - load)[holding]
+        assert -hand == pytest.approx(5.0 * beta[2] / beta[holding])
+        assert -hand == pytest.approx(felt, rel=5e-3)
