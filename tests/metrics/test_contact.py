@@ -5,10 +5,10 @@ import math
 import pytest
 
 from tests.analysis.logs import rewritten
+from trilat_net.analysis.actors import tip_of
 from trilat_net.core.arm import JOINTS
 from trilat_net.metrics.contact import met, walls
 from trilat_net.metrics.measurement import measure
-from trilat_net.metrics.pushing import tip_of
 from trilat_net.metrics.rows import tracks
 
 from .written import pair, simulated

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.certificate import runs
+from trilat_net.analysis.actors import tip_of, torque_of
 from trilat_net.core.exogenous import Actor, Acts, add_torque, rows_of
-from trilat_net.metrics.pushing import pushed, script_of, tip_of, torque_of
+from trilat_net.metrics.pushing import pushed, script_of
 from trilat_net.metrics.rows import tracks
 
 real = st.floats(-2.0, 2.0)

@@ -1,17 +1,17 @@
 """The figure of contact: the force of the walls, and how deep the tips were in them.
 
-Law: a wall is as its scenario says, at the logged states; `metrics` has its equations.
+Law: a wall is as its scenario says, at the logged states; `analysis.actors` has its equations.
 """
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ..analysis import style
+from ..analysis.actors import tip_of, wall_depth, wall_force
 from ..analysis.form import REPORT, Form
 from ..analysis.marks import Marks
 from ..core.exogenous import Acts
 from ..log.reader import Log
-from ..metrics.pushing import tip_of, wall_depth, wall_force
 
 NO_WALLS = "no site has a wall in this run"
 

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.actors import Tip, wall_depth, wall_force
 from ..certificate.track import Bools, Track
 from ..core.arm import Array
 from ..core.exogenous import Actor, Acts
 from ..scenario import SiteSpec
-from .pushing import Tip, wall_depth, wall_force
 from .rows import nominal_s
 from .said import Facts, said, unsaid
 

@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.actors import tip_of, wall_force
 from ..core.arm import JOINTS, Array
 from ..core.grid import NS_PER_S
 from ..scenario import SiteSpec
 from ..scenario.actors import Wall
 from ..scenario.window import Window
-from .rows import Ints, Rows
+from .rows import Rows
 
 
 class Span(NamedTuple):
@@ -41,7 +42,7 @@ class Stretch:
         self._from_ns, self._to_ns = (round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s))
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._spec = spec
-        self._walls = [one for one in spec.environment if isinstance(one, Wall)]
+        self._walls = [one.actor for one in spec.environment if isinstance(one, Wall)]
         self._seen_ns = -1
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
@@ -64,8 +65,9 @@ class Stretch:
         self._q_most = np.maximum(self._q_most, inside.q.max(axis=0))
         self._push_sum -= inside.tau_x.sum(axis=0)
         if self._walls:
-            forces = [force_n(wall, self._spec, inside.t_ns, inside.q, inside.qd) for wall in self._walls]
-            self._add_force(np.sum(forces, axis=0))
+            tip = tip_of((self._spec.arm.l1_m, self._spec.arm.l2_m), inside.q, inside.qd)
+            t_s = inside.t_ns / NS_PER_S
+            self._add_force(np.sum([wall_force(wall, t_s, tip) for wall in self._walls], axis=0))
 
     def _add_force(self, force: Array) -> None:
         touching = force > 0.0
@@ -94,29 +96,3 @@ class Stretch:
         angles = zip(("q1_rad", "q2_rad"), self._q_least.tolist(), self._q_most.tolist(), strict=True)
         spans = {key: Span(least, most) for key, least, most in angles}
         return {**spans, **{key: Span(value, value) for key, value in single.items()}}
-
-
-def force_n(wall: Wall, spec: SiteSpec, t_ns: Ints, q: Array, qd: Array) -> Array:
-    """Returns the force of a wall on the tip along its normal: max(K depth - B outward, 0) within, else 0, N.
-
-    Args:
-        wall: the wall.
-        spec: the site that meets it.
-        t_ns: when, shape (K,), ns.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-
-    Returns:
-        shape (K,).
-    """
-    l1, l2 = spec.arm.l1_m, spec.arm.l2_m
-    normal = np.array(wall.normal) / math.hypot(*wall.normal)
-    q1, q12, qd12 = q[:, 0], q.sum(axis=1), qd.sum(axis=1)
-    s1, c1, s12, c12 = np.sin(q1), np.cos(q1), np.sin(q12), np.cos(q12)
-    tip = np.stack([l1 * c1 + l2 * c12, l1 * s1 + l2 * s12], axis=1)
-    speed = np.stack([-l1 * s1 * qd[:, 0] - l2 * s12 * qd12, l1 * c1 * qd[:, 0] + l2 * c12 * qd12], axis=1)
-    depth = (np.array(wall.point_m) - tip) @ normal
-    there = (t_ns >= wall.start_s * NS_PER_S) & (t_ns < wall.end_s * NS_PER_S) & (depth > 0.0)
-    push = wall.stiffness_n_m * depth - wall.damping_n_s_m * (speed @ normal)
-    force: Array = np.where(there, np.maximum(push, 0.0), 0.0)
-    return force
