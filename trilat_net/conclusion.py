@@ -15,11 +15,12 @@ import numpy as np
 
 from .analysis.notes import run_lines
 from .analysis.tables import VerdictLine
-from .errors import UsageError
+from .errors import LawFailed, ScenarioError, UsageError
 from .experiment import compare_with_virtual, twin_without_hands
 from .log.chunks import Progress
 from .log.reader import Log, open_log
 from .replay.comparison import Comparison
+from .replay.outside import outside_laws
 from .replay.verify import Verdict, executed_sites, last_ticks, verify
 from .scenario import Scenario
 
@@ -110,7 +111,7 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
     lines: list[VerdictLine] = []
     with _worker() as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(_check_files, log.sources)
-        twin = twin_without_hands(log) if any(s.hands for s in log.scenario.sites.values()) else None
+        twin = _twin(log)
         certified = section(log)
         notes = [*run_lines(log), f"certificate: {certified.facts['text']}"]
 
@@ -125,6 +126,18 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
     return Conclusion(_COLUMNS, rows, notes, lines, [*map(Path, log.sources), *made])
 
 
+def _twin(log: Log) -> Log | None:
+    """Returns the same run without hands; None where it would be the same, or cannot be run."""
+    broke_off = any(event.kind == "failed" for event in log.events)  # so would the twin, or hang
+    pushed = any(site.hands for site in log.scenario.sites.values())
+    if broke_off or log.scenario.external or not pushed:
+        return None
+    try:
+        return twin_without_hands(log)
+    except (ScenarioError, LawFailed):  # a law from outside that is not there, or fails: the check says so
+        return None
+
+
 def _worker() -> ProcessPoolExecutor:
     """Returns one process beside this one, which leaves Ctrl-C to this one."""
     context = multiprocessing.get_context("spawn")
@@ -133,7 +146,10 @@ def _worker() -> ProcessPoolExecutor:
 
 def _check_files(sources: Sequence[str]) -> list[VerdictLine]:
     log = open_log(*sources)
-    return list(_checks(log, verify(log), virtual=True))
+    try:
+        return list(_checks(log, verify(log), virtual=True))
+    except ScenarioError as error:  # a law from outside that is not there
+        return [_records_line(log), VerdictLine("executed again", f"cannot be: {error}", False)]
 
 
 def checked(log: Log, *, virtual: bool, progress: Progress | None = None) -> Checked:
@@ -146,6 +162,7 @@ def checked(log: Log, *, virtual: bool, progress: Progress | None = None) -> Che
 
     Raises:
         LogError: a record cannot be read.
+        ScenarioError: a law from outside is not there.
     """
     verdict = verify(log, progress)
     lines = list(_checks(log, verdict, virtual=virtual, progress=progress))
@@ -212,6 +229,7 @@ def _checks(
     log: Log, verdict: Verdict, *, virtual: bool, progress: Progress | None = None
 ) -> Iterator[VerdictLine]:
     yield _records_line(log)
+    yield from (VerdictLine("law from outside", str(law), True) for law in outside_laws(log.scenario))
     yield _verify_line(verdict, _standing(log))
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield VerdictLine("scenario", "is not the one whose hash the log names: it was changed", False)
@@ -220,8 +238,10 @@ def _checks(
     elif virtual:
         twins = compare_with_virtual(log, progress)
         yield _twin_line("virtual time fed with the log's arrivals", twins.fed, None)
-        if log.scenario.measured and log.driver != "virtual":
-            yield VerdictLine("plain virtual time", "is another run: a link was measured, not modelled", True)
+        why = "a link was measured, not modelled" if log.scenario.measured else ""
+        why = "an arm was outside of the program" if log.scenario.external else why
+        if why and log.driver != "virtual":
+            yield VerdictLine("plain virtual time", f"is another run: {why}", True)
             return
         late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
         yield _twin_line(

@@ -23,7 +23,7 @@ LYAPUNOV = {
 }
 """Unequal shares and Kd, upon `free`."""
 
-JITTER = {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0, "duration_s": 5.0}
+JITTER = {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0, "duration_s": 3.0}
 
 RICH = """
 name = "rich"

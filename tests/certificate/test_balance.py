@@ -30,18 +30,19 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
 
 @pytest.mark.parametrize("name", ["paper", "free", "asymmetric"])
 def test_it_closes_to_2e_5_of_the_largest_v_with_order_two(name: str) -> None:
-    assert of_largest_v(runs.balanced(name, {"duration_s": 5.0, "rate_hz": 1000})) <= 2e-5
-    assert order(name, duration_s=5.0) == pytest.approx(2.0, abs=0.1)
+    assert of_largest_v(runs.balanced(name, {"duration_s": 3.0, "rate_hz": 1000})) <= 2e-5
+    assert order(name, duration_s=3.0) == pytest.approx(2.0, abs=0.1)
 
 
 def test_it_closes_until_both_hands_have_let_go() -> None:
-    assert of_largest_v(runs.balanced("paper", {"duration_s": 11.5})) <= 2e-5
+    """At half the rate four times the error is allowed."""
+    assert of_largest_v(runs.balanced("paper", {"duration_s": 11.5, "rate_hz": 500})) <= 8e-5
 
 
 def test_digital_closes_to_some_percent_with_order_one_and_sampling_is_what_is_left() -> None:
-    b = runs.balanced("paper", {"duration_s": 5.0, "scheme": "digital", "rate_hz": 1000})
+    b = runs.balanced("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 1000})
     assert of_largest_v(b) == pytest.approx(1.6e-2, rel=0.2)
-    assert order("paper", duration_s=5.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
+    assert order("paper", duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
     assert np.abs(b.unexplained).max() <= 1e-5 * b.scale
 
 
@@ -50,13 +51,23 @@ def test_jitter_closes_to_1e_4_where_the_jumps_are_booked_and_not_to_3e_3_where_
     links = np.sum([x for name, x in b.given.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
     assert np.abs(b.residual + links).max() / b.V.max() >= 3e-3
+    assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
 
 
 def test_jitter_is_of_order_one_at_least() -> None:
     """Of some seeds together: which jumps a run has is a matter of its draws; errors cancel to order 1.5."""
-    seeds = [{**runs.JITTER, "duration_s": 2.0, "seed": seed} for seed in (1, 2, 3, 4)]
+    seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2, 3, 4)]
     orders = [order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
+
+
+def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
+    """Arms that brake: e and its derivative jump at once, and the torque that is held is that of before."""
+    cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
+    rest = [
+        float(np.abs(runs.balanced("free", {**cut, "rate_hz": hz}).unexplained).max()) for hz in (200, 400)
+    ]
+    assert np.log2(rest[0] / rest[1]) == pytest.approx(2.0, abs=0.2)
 
 
 def test_a_wall_closes_to_1e_4_though_it_gives_energy_to_r() -> None:
@@ -95,7 +106,7 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
 
 def test_ones_for_beta_is_caught_and_named() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
-    ones = balance(runs.booked("asymmetric", {"duration_s": 5.0, "rate_hz": 1000}), ones=True)
+    ones = balance(runs.booked("asymmetric", {"duration_s": 3.0, "rate_hz": 1000}), ones=True)
     assert ones.relative > 10 * CAUGHT
     assert np.abs(ones.residual + ones.passed).max() <= 2e-5 * ones.V.max()
 

@@ -8,11 +8,12 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.certificate.certificate import NO_COMMON_TIME, certify
+from trilat_net.certificate.certificate import NO_COMMON_TIME, NO_PERIOD, certify
 from trilat_net.certificate.growth import Motion
 from trilat_net.certificate.premises import unjudged_spans
 from trilat_net.certificate.verdict import Finding
 from trilat_net.errors import LogError
+from trilat_net.log.reader import Log
 from trilat_net.scenario import load
 
 from . import runs
@@ -29,22 +30,65 @@ def test_every_released_version_is_certified(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("d", "motion", "passed"), [(0.2, Motion.DIVERGED, False), (2.5, Motion.CONVERGED, True)]
+    ("d", "motion", "passed"), [(0.2, Motion.DIVERGED, False), (2.5, Motion.DECAYS, True)]
 )
 def test_a_law_without_a_functional_is_judged_by_growth_alone(d: float, motion: Motion, passed: bool) -> None:
-    law = {"control.law": "p_d", "control.K": 10.0, "control.d": d, "duration_s": 15.0, "rate_hz": 200}
+    law = {"control.law": "p_d", "control.K": 10.0, "control.d": d, "duration_s": 12.0, "rate_hz": 200}
     found = certify(trilat_net.simulate(load("free", law)))
     assert found.verdict.finding is Finding.NOT_JUDGED
-    assert "there is no such functional" in found.verdict.text
+    assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
     assert found.growth.motion is motion
     assert found.passed is passed
 
 
-def test_an_arm_outside_of_the_program_has_no_theta() -> None:
-    log = runs.log("free", {"duration_s": 1.0, "rate_hz": 200, "sites.s.plant": "external"})
-    found = certify(log)
+def outside(log: Log, *, known: bool) -> Log:
+    """The same records, of a slave that is outside of the program."""
+    spec = log.scenario.sites["s"]
+    arm = msgspec.structs.replace(spec.arm, known=known)
+    sites = {**log.scenario.sites, "s": msgspec.structs.replace(spec, plant="external", arm=arm)}
+    log.scenario = msgspec.structs.replace(log.scenario, sites=sites)
+    return log
+
+
+def still_free() -> Log:
+    return logs.rewritten(runs.log("free", {"duration_s": 2.0, "rate_hz": 200}), lambda _: True)
+
+
+def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
+    found = certify(outside(still_free(), known=False))
     assert found.verdict.finding is Finding.NOT_JUDGED
-    assert "s: an arm outside of the program: theta is unknown" in found.verdict.text
+    assert found.verdict.text == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
+
+
+def test_an_arm_outside_is_judged_while_it_moves_as_its_theta_says_and_is_not_accused_where_it_does_not() -> (
+    None
+):
+    as_told = certify(outside(still_free(), known=True))
+    assert as_told.verdict.finding is Finding.COVERED
+    assert "no record says who pushes the arm of s" in as_told.verdict.text
+    other = outside(
+        logs.rewritten(
+            still_free(),
+            change=lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s,
+        ),
+        known=True,
+    )
+    found = certify(other)
+    assert found.verdict.finding is Finding.NOT_JUDGED
+    assert "the arm of s, outside of the program, does not move as its theta says" in found.verdict.text
+
+
+def test_records_with_none_beside_them_are_no_period() -> None:
+    found = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
+    assert found.verdict.text == f"V cannot be judged: {NO_PERIOD}"
+
+
+def test_a_period_too_long_for_the_gains_is_not_judged_and_accuses_nobody() -> None:
+    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
+    light = {"arm.m2_kg": 0.001, "rate_hz": 333, "duration_s": 2.0}
+    found = certify(trilat_net.simulate(load("two_sites", light)))
+    assert found.verdict.finding is Finding.NOT_JUDGED
+    assert "the period is too long for these gains" in found.verdict.text
 
 
 def test_gaps_are_left_out_and_told_of() -> None:
@@ -53,7 +97,10 @@ def test_gaps_are_left_out_and_told_of() -> None:
     found = certify(log)
     assert found.balance is not None
     assert found.verdict.finding is Finding.COVERED
+    assert found.verdict.text.startswith("covered by the theorem, as far as the log tells: V did not rise: ")
     assert "not judged: 0.995 to 1.35 s" in found.verdict.text
+    given = sum(np.abs(x).max() for x in found.balance.given.values())
+    assert given <= 1e-6  # nobody is said to have given what changed in the gap
     assert found.balance.relative <= 1e-3
     assert unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]  # s looks back by 150 ms
 
@@ -82,7 +129,7 @@ def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
     found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
-    assert found.verdict.text == NO_COMMON_TIME
+    assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
     assert found.growth.motion is Motion.UNDECIDED
     assert not found.passed
 

@@ -34,12 +34,16 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
 @pytest.mark.parametrize(
     ("e", "qd", "motion", "says"),
     [
-        (swing(-0.8), swing(-0.7), Motion.CONVERGED, "converged"),
-        (swing(-0.1), swing(-0.1), Motion.CONVERGED, "converging"),
-        (swing(0.0), swing(0.0), Motion.BOUNDED, "oscillation at 1.5"),
-        (swing(-0.8), swing(0.0), Motion.BOUNDED, "oscillation at 1.5"),
-        (swing(0.2), swing(0.2), Motion.DIVERGED, "|e| grows by +0.2"),
-        (swing(-0.3), swing(0.3), Motion.DIVERGED, "|qd| grows by +0.3"),
+        (swing(-0.8), swing(-0.7), Motion.CONVERGED, "converged: |e| "),
+        (swing(-0.7), swing(-0.1), Motion.DECAYS, "decaying (|e| -0.7"),
+        (swing(-0.1), swing(-0.1), Motion.DECAYS, "|qd| -0.1"),
+        (swing(0.0), swing(0.0), Motion.BOUNDED, "bounded oscillation at 1.5"),
+        (swing(-0.8), swing(0.0), Motion.BOUNDED, "bounded oscillation at 1.5"),
+        (swing(0.0), swing(-0.02), Motion.BOUNDED, "Hz (|qd| -0.02"),
+        (swing(0.0), swing(-0.15), Motion.DECAYS, "decaying (|e| steady, |qd| -0.15"),
+        (swing(0.2), swing(0.2), Motion.GROWS, "growing (|e| +0.2"),
+        (swing(-0.3), swing(0.3), Motion.GROWS, "|qd| +0.3"),
+        (swing(0.2), swing(0.0), Motion.UNDECIDED, "|e| grows, |qd| steady"),
         (lambda _: 0.2, swing(-0.8), Motion.CONVERGED, "at rest, and the sites do not agree"),
         (lambda _: 0.1, lambda _: 0.4, Motion.BOUNDED, "bounded motion"),
     ],
@@ -48,6 +52,47 @@ def test_a_known_signal_is_named(e, qd, motion: Motion, says: str) -> None:
     found = growth(moving(e, qd))
     assert found.motion is motion
     assert says in found.text
+
+
+@pytest.mark.parametrize(
+    ("d", "motion"), [(0.9, Motion.GROWS), (1.1, Motion.DECAYS)], ids=["below the margin", "above it"]
+)
+def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: Motion) -> None:
+    """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
+    assert growth(trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 100})).motion is motion
+
+
+def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
+    """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
+    held = {"scheme": "digital", "link.delay_ms": 0.0}
+    slow = growth(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
+    fast = growth(trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0}))
+    assert slow.motion is Motion.BOUNDED
+    assert slow.end_speed_rad_s > 0.5
+    assert fast.motion is Motion.DECAYS
+    assert fast.end_speed_rad_s < 0.1
+
+
+def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:
+    short, long = (
+        growth(trilat_net.simulate("contact", {"rate_hz": 200, "duration_s": s})) for s in (15.0, 30.0)
+    )
+    assert short.motion is Motion.UNDECIDED
+    assert long.motion is Motion.BOUNDED
+    assert "bounded oscillation at 0.5 Hz" in long.text
+    near = growth(trilat_net.simulate("contact", {"rate_hz": 200, "link.delay_ms": 20.0, "duration_s": 12.0}))
+    assert near.text.startswith("at rest, and the sites do not agree")
+
+
+def test_a_site_without_records_leaves_it_undecided() -> None:
+    found = growth(logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m"))
+    assert found.motion is Motion.UNDECIDED
+    assert found.text == "undecided: no record of s"
+
+
+def test_only_times_of_which_all_sites_have_records_count() -> None:
+    torn = logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300))
+    assert growth(torn).motion is Motion.UNDECIDED
 
 
 def test_what_came_late_is_undecided() -> None:

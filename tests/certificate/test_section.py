@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.analysis import logs
-from trilat_net.analysis.report import write_report
+from trilat_net.analysis.section import sections_html, write_sections
 from trilat_net.certificate.certificate import certify
 from trilat_net.certificate.facts import facts
 from trilat_net.certificate.figure import functional_over_time
 from trilat_net.certificate.section import section
-from trilat_net.certificate.words import sentences
+from trilat_net.certificate.words import Mark, energies, lines
 from trilat_net.log.reader import Log
 
 from . import runs
@@ -70,24 +70,62 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
     assert len(marked) == (found.verdict.rise is not None)
 
 
-def test_the_report_shows_it_in_one_file(tmp_path: Path) -> None:
-    log = jittered()
-    page, numbers, *figures = write_report(log, tmp_path, sections=[section(log)])
-    html = page.read_text(encoding="utf-8")
+def test_the_page_shows_it_in_one_file_and_a_figure_beside_it(tmp_path: Path) -> None:
+    made = section(jittered())
+    html = sections_html([made])
     assert "Was it stable, and why" in html
-    assert "outside the theorem (delays): V rose by" in html
+    assert "<strong>outside the theorem (delays): V rose by" in html
+    assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
-    assert tmp_path / "certificate.png" in figures
-    assert json.loads(numbers.read_text())["certificate"]["verdict"] == "rose"
+    assert write_sections([made], tmp_path) == [tmp_path / "certificate.png"]
+    assert made.facts["verdict"] == "rose"
 
 
-def test_sentences_give_verdict_balance_and_growth() -> None:
-    said = sentences(certify(LOGS["free"]()))
-    assert [line.split(":")[0] for line in said] == ["certificate", "energy balance", "e and qd"]
-    assert "once sampling is accounted for" in said[1]
-    assert len(sentences(certify(LOGS["p_d"]()))) == 2
+@pytest.mark.parametrize(
+    ("name", "marks"),
+    [
+        ("free", [Mark.OK, Mark.OK, Mark.OK]),
+        ("jitter", [Mark.OPEN, Mark.OK, Mark.OK]),
+        ("rich", [Mark.OPEN, Mark.OK, Mark.OK, Mark.NOTE]),
+        ("p_d", [Mark.OPEN, Mark.OPEN]),
+        ("diverged", [Mark.OK, Mark.FAIL, Mark.OK]),
+    ],
+)
+def test_lines_give_verdict_growth_and_balance_and_pass_where_one_vouches_and_none_fails(
+    name: str, marks: list[Mark]
+) -> None:
+    found = certify(LOGS[name]())
+    said = lines(found)
+    assert [line.mark for line in said] == marks
+    assert said[0].text == found.verdict.text
+    assert found.passed is (Mark.OK in marks[:2] and Mark.FAIL not in marks)
+
+
+def test_the_papers_weights_are_told_of_where_they_are_wrong_and_v_rises_with_them() -> None:
+    told = lines(runs.certified("free", runs.LYAPUNOV))[-1]
+    assert told.mark is Mark.NOTE
+    assert told.text.startswith("with the paper's weights, ones, V would have risen by 12.3 J of 32.8")
+    assert runs.certified("free", {"duration_s": 4.0, "rate_hz": 200}).ones is None
+
+
+@pytest.mark.parametrize("name", ["jitter", "rich", "busy"])
+def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
+    found = certify(LOGS[name]())
+    assert found.balance is not None
+    (_, first), *between, (_, last) = energies(found.balance)
+    assert first + sum(amount for _, amount in between) == pytest.approx(last, abs=1e-5 * found.balance.scale)
+
+
+def test_many_links_are_one_entry() -> None:
+    found = certify(LOGS["four"]())
+    assert found.balance is not None
+    some = {f"a->{n}": np.ones_like(found.balance.V) for n in range(7)}
+    listed = energies(found.balance._replace(given={**found.balance.given, **some}))
+    assert [name for name, _ in listed if "->" in name] == []
+    assert any("links" in name for name, _ in listed)
 
 
 def test_no_energy_is_said() -> None:
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
-    assert sentences(certify(runs.log("paper", rest)))[1] == "energy balance: there is no energy in this run"
+    found = certify(runs.log("paper", rest))
+    assert lines(found)[-1].text == "energy balance: there is no energy in this run"

@@ -26,20 +26,24 @@ def made(name: str = "free", **overrides: object) -> Log:
 def test_free_motion_is_covered() -> None:
     found = certify(made())
     assert found.verdict.finding is Finding.COVERED
-    assert found.verdict.text.startswith("covered by the theorem: V did not rise; it went from 29.78 to ")
+    assert found.verdict.text.startswith("covered by the theorem: V did not rise: 29.78 J at 0 s, 12")
     assert found.passed
 
 
 def test_hands_are_told_of_and_excused() -> None:
     found = runs.certified("paper", {"duration_s": 11.5, "rate_hz": 100})
     assert found.verdict.finding is Finding.COVERED
-    assert "V rose by no more than hands and walls gave" in found.verdict.text
+    assert (
+        "covered by the theorem: V rose by no more than the hands gave: 24 J at 0 s, " in found.verdict.text
+    )
 
 
 def test_outside_and_yet_not_risen() -> None:
     found = runs.certified("wall")
     assert found.verdict.finding is Finding.DID_NOT_RISE
-    assert found.verdict.text.startswith("outside the theorem (hands), yet V rose by no more than hands and")
+    assert found.verdict.text.startswith(
+        "outside the theorem (hands), yet V rose by no more than the hands and walls gave: "
+    )
     assert found.passed
 
 
@@ -51,7 +55,9 @@ def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
     assert rise.amount > 10 * found.verdict.tolerance
     assert sum(rise.causes.values()) >= rise.amount
     assert all("->" in cause for cause in rise.causes)
-    assert f"V rose by {rise.amount:.3g} J from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
+    share = 100.0 * rise.amount / found.balance.V.max()
+    assert f"V rose by {rise.amount:.3g} J ({share:.2g} % of its largest value) " in found.verdict.text
+    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
 
 
 def test_kd_of_different_shape_lets_v_rise_by_what_beta_does_not_cancel() -> None:
@@ -71,13 +77,13 @@ def test_a_slow_digital_loop_is_fed_by_sampling() -> None:
 
 
 def tampered(change: Callable[[State], State]) -> Certificate:
-    return certify(logs.rewritten(made(), change=change))
+    return certify(logs.rewritten(made(rate_hz=500, duration_s=2.0), change=change))
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
 def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) -> None:
     def change(state: State) -> State:
-        late = state.site == "m2" and state.tick >= 150
+        late = state.site == "m2" and state.tick >= 375
         values = [1.05 * x for x in getattr(state, field)]
         return msgspec.structs.replace(state, **{field: values}) if late else state
 
@@ -85,6 +91,15 @@ def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) ->
     assert found.verdict.finding is Finding.BROKEN
     assert not found.passed
     assert "were not made by the equations that the log claims" in found.verdict.text
+
+
+def test_a_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
+    log = runs.log("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500})
+    late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
+    found = certify(
+        logs.rewritten(log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s)
+    )
+    assert found.verdict.finding is Finding.BROKEN
 
 
 def test_hands_that_were_erased_break_the_balance() -> None:
@@ -122,6 +137,7 @@ def test_two_closed_groups_are_refused_and_named() -> None:
     found = certify(trilat_net.simulate(parse(FOUR)))
     assert found.verdict.finding is Finding.NOT_JUDGED
     assert "{a, b} and {c, d} follow nobody outside: beta is not unique" in found.verdict.text
+    assert found.groups == (("a", "b"), ("c", "d"))
     assert found.balance is None
 
 
@@ -133,10 +149,28 @@ def test_groups_that_only_a_change_makes_are_refused_too() -> None:
     assert found.verdict.finding is Finding.NOT_JUDGED
 
 
-def test_a_site_without_weight_leaves_the_word_to_growth() -> None:
-    """V says nothing of m2, which follows the locked pair: a short run cannot tell."""
-    expert = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
-    found = certify(trilat_net.simulate(load("free", {**SHORT, **expert, "duration_s": 1.0})))
+EXPERT = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
+"""m1 and s follow each other, and m2 follows both."""
+
+
+def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
+    """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
+    found = certify(trilat_net.simulate(load("free", {**SHORT, **EXPERT, "duration_s": 1.0})))
+    assert found.verdict.finding is Finding.DID_NOT_RISE
+    assert found.growth.grows is None
+    assert found.passed
+
+
+def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
+    hand = {"sites.m2.hands": [{"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}]}
+    found = certify(trilat_net.simulate(load("free", {**SHORT, **EXPERT, **hand, "duration_s": 1.0})))
     assert found.verdict.finding is Finding.DID_NOT_RISE
     assert not found.bounded_by_v
     assert not found.passed
+
+
+def test_growth_fails_a_run_whatever_v_did() -> None:
+    found = runs.certified("wall")
+    grown = found.growth._replace(motion=Motion.GROWS)
+    assert found.passed
+    assert not found._replace(growth=grown).passed

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from trilat_net.certificate import work
 from trilat_net.certificate.equations import Equations
 from trilat_net.certificate.functional import parts
+from trilat_net.certificate.parting import parted
 from trilat_net.certificate.periods import periods
 from trilat_net.certificate.shares import Shares
 from trilat_net.certificate.track import Past, Track
@@ -144,7 +145,7 @@ def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: 
 def test_hands_and_walls_are_told_apart_and_are_all_that_pushes() -> None:
     log = runs.log("rich")
     for name, book in runs.booked("rich").items():
-        torque = work.Pushed(book.track, log.scenario.sites[name])
+        torque = parted(book.track, log.scenario.sites[name])
         total = torque.hands + torque.hands_held + torque.walls + torque.walls_held
         assert total == pytest.approx(-book.track.tau_x, abs=1e-12)
         assert (name == "s") == bool(torque.walls.any())

@@ -5,6 +5,28 @@ from pathlib import Path
 
 from .running import trilat
 
+PAIRS = """
+name = "pairs"
+rate_hz = 100
+duration_s = 1.0
+[link]
+delay_ms = 50.0
+[sites.a]
+role = "master"
+q0_rad = [0.3, 0.0]
+[sites.b]
+role = "slave"
+[sites.c]
+role = "master"
+[sites.d]
+role = "slave"
+[dominance]
+a = { b = 1.0 }
+b = { a = 1.0 }
+c = { d = 1.0 }
+d = { c = 1.0 }
+"""
+
 
 def recorded(folder: Path, *settings: str, scenario: str = "free", seconds: str = "2") -> str:
     options = [word for setting in settings for word in ("--set", setting)]
@@ -14,9 +36,9 @@ def recorded(folder: Path, *settings: str, scenario: str = "free", seconds: str 
 
 def test_a_covered_run_ends_with_0(tmp_path: Path) -> None:
     printed = trilat("certify", recorded(tmp_path, "rate_hz=200"), cwd=tmp_path).succeeds()
-    assert "certificate: covered by the theorem: V did not rise" in printed
+    assert printed.startswith("ok   covered by the theorem: V did not rise: 29.78 J at 0 s, ")
     assert "constant on every link: 200 ms" in printed
-    assert "energy balance: off by at most" in printed
+    assert "ok   energy balance: closes to " in printed
     assert "taken: disagreement" in printed
 
 
@@ -38,8 +60,19 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
 def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
     done = trilat("certify", recorded(tmp_path, "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
     assert done.code == 1
-    assert "undecided (record longer)" in done.out
-    assert "there is no such functional" in done.out
+    assert "open e and qd: undecided, record longer: " in done.out
+    assert "law p_d, for which there is no such V" in done.out
+
+
+def test_two_closed_groups_are_named_for_people_and_programs(tmp_path: Path) -> None:
+    (tmp_path / "pairs.toml").write_text(PAIRS)
+    trilat("sim", "pairs.toml", "-o", "run.mcap", cwd=tmp_path)
+    told = trilat("certify", "run.mcap", cwd=tmp_path)
+    assert told.code == 1
+    assert "V cannot be judged: {a, b} and {c, d} follow nobody outside: beta is not unique" in told.out
+    facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)
+    assert facts["closed_groups"] == [["a", "b"], ["c", "d"]]
+    assert facts["functional"] is None
 
 
 def test_what_is_no_log_ends_with_2(tmp_path: Path) -> None:

@@ -17,6 +17,21 @@ def test_list_names_every_shipped_scenario(tmp_path: Path) -> None:
         assert name in text
 
 
+def test_list_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
+    lines = trilat("scenario", "list", cwd=tmp_path).succeeds().splitlines()
+    assert len(lines) == 1 + len(shipped())
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_what_show_says_of_a_scenario_fits_a_terminal_of_80_columns(name: str) -> None:
+    """The same words as in its file: `show` prints them as they stand there."""
+    scenario = load(name)
+    assert f'about = """\n{scenario.about}"""' in scenario.text
+    assert max(map(len, scenario.about.splitlines())) <= 80
+    assert len(scenario.about.splitlines()) <= 16
+
+
 @pytest.mark.parametrize("name", sorted(SHIPPED))
 def test_what_show_prints_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     text = trilat("scenario", "show", name, cwd=tmp_path).succeeds()

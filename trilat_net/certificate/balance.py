@@ -25,6 +25,8 @@ NOTHING_J = 1e-12
 class Balance(NamedTuple):
     """The functional over time, at the ticks of the fastest site; energies in J.
 
+    What is taken, given and passed counts in judged periods alone.
+
     Attributes:
         t_s: shape (T,), s.
         beta: the weights over time, shape (T, N).
@@ -77,6 +79,11 @@ class Balance(NamedTuple):
         return self.given["hands"] + self.given["walls"]
 
     @property
+    def pushers(self) -> list[str]:
+        """Who pushed: hands, walls, both or nobody."""
+        return [name for name in ("hands", "walls") if self.given[name].any()]
+
+    @property
     def scale(self) -> float:
         """What residuals are held against: the largest V, or the largest work where that is more, J."""
         return max(float(np.abs(x).max()) for x in (self.V, *self.given.values()))
@@ -98,17 +105,23 @@ def balance(books: Mapping[str, Book], *, ones: bool = False) -> Balance:
     weigh = _weigher(books, ones=ones)
     columns = {site: _column(books, site, times, weigh) for site in books}
     every = list(columns.values())
+    judged: Bools = np.logical_and.reduce([np.diff(column.unjudged) == 0.0 for column in every])
+
+    def booked(amounts: list[Array]) -> Array:
+        """Adds up what came together, without what came while records are missing."""
+        return cumulative(np.where(judged, np.diff(np.sum(amounts, axis=0)), 0.0))
+
     names = dict.fromkeys(name for column in every for name in column.given)
     return Balance(
         times,
         np.stack([column.beta for column in every], axis=1),
         {site: _sum(column.parts) for site, column in columns.items()},
         {name: _sum({n: c.parts[name] for n, c in columns.items()}) for name in Parts._fields},
-        {name: _sum({n: c.taken[name] for n, c in columns.items()}) for name in every[0].taken},
-        {name: _sum({n: c.given[name] for n, c in columns.items() if name in c.given}) for name in names},
-        _sum({n: c.sampling for n, c in columns.items()}),
-        _sum({n: c.passed for n, c in columns.items()}),
-        np.logical_and.reduce([np.diff(column.unjudged) == 0.0 for column in every]),
+        {name: booked([column.taken[name] for column in every]) for name in every[0].taken},
+        {name: booked([column.given[name] for column in every if name in column.given]) for name in names},
+        booked([column.sampling for column in every]),
+        booked([column.passed for column in every]),
+        judged,
     )
 
 

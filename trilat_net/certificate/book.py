@@ -13,10 +13,14 @@ from ..log.reader import Log
 from . import dissipation, work
 from .equations import Equations, equations
 from .functional import Parts, parts
-from .periods import Booked, periods
+from .parting import parted
+from .periods import Booked, Periods, periods
 from .shares import Shares, shares
 from .track import Bools, Past, Track, tracks
 from .views import View, view
+
+LEAST_PERIODS = 10
+"""Fewer show nothing of what happens within them."""
 
 
 class Book(NamedTuple):
@@ -33,6 +37,7 @@ class Book(NamedTuple):
         given: work: `hands`, `walls`, per link "j->i", `shares`, `rule`, `torque limit`, `estimates`.
         sampling: the work of the scheme by which the continuous law was sampled.
         judged: whether a period rests on records alone, shape (K - 1,).
+        coupling: the part of `doubt` by changes of r and a torque together, J.
     """
 
     track: Track
@@ -45,6 +50,7 @@ class Book(NamedTuple):
     given: dict[str, Booked]
     sampling: Booked
     judged: Bools
+    coupling: float
 
     @property
     def residual(self) -> Array:
@@ -66,16 +72,29 @@ class Book(NamedTuple):
         rows = np.flatnonzero(np.logical_and.reduce(seen))
         return float(self.track.t_s[rows[0]]) if len(rows) else np.inf
 
+    @property
+    def followed(self) -> set[str]:
+        """The peers that have a share at any time."""
+        return {peer for j, peer in enumerate(self.views) if self.follows(j)}
+
     def follows(self, j: int) -> bool:
         """True where a peer, by its index, has a share at any time."""
         return bool(self.shares.alpha[:, j].any())
 
     @property
     def doubt(self) -> float:
-        """How far off the trapezoid rule may be here, J: the second differences of all powers, summed."""
+        """How far off the books may be here by what happens within a period, J.
+
+        The trapezoid rule by the second differences of all powers, summed; sampling and hands by what r and a
+        torque change by together: where that adds up, the period is long for these gains. Where there are too
+        few periods for second differences, all is in doubt.
+        """
+        if self.judged.sum() < LEAST_PERIODS:
+            every = (self.passed, *self.taken.values(), *self.given.values())
+            return float(sum(np.abs(one.left).sum() + np.abs(one.right).sum() for one in every))
         power = self.passed.left + np.sum([one.left for one in self.taken.values()], axis=0)
         power -= np.sum([one.left for one in self.given.values()], axis=0)
-        return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0
+        return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + self.coupling
 
 
 def cumulative(amounts: Array) -> Array:
@@ -107,11 +126,11 @@ def _book(log: Log, found: dict[str, Track], pasts: dict[str, Past], site: str) 
     views = {peer: view(track, found[peer], pasts[peer]) for peer in track.used}
     seen = list(views.values())
     ends = periods(track, eq, share, seen)
-    torque = work.Pushed(track, spec)
+    pushed = parted(track, spec)
     digital = Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL
     given = {
-        "hands": work.of_torque(track, ends, torque.hands, torque.hands_held),
-        "walls": work.of_torque(track, ends, torque.walls, torque.walls_held),
+        "hands": work.of_torque(track, ends, pushed.hands, pushed.hands_held),
+        "walls": work.of_torque(track, ends, pushed.walls, pushed.walls_held),
         **{
             f"{peer}->{site}": work.of_link(track, eq, share, ends, j, one)
             for j, (peer, one) in enumerate(views.items())
@@ -127,6 +146,7 @@ def _book(log: Log, found: dict[str, Track], pasts: dict[str, Past], site: str) 
     }
     known = [track.known[:-1], track.known[1:]]
     known += [v.known for j, v in enumerate(seen) if share.alpha[:, j].any()]
+    judged: Bools = np.logical_and.reduce(known)
     return Book(
         track,
         eq,
@@ -137,5 +157,12 @@ def _book(log: Log, found: dict[str, Track], pasts: dict[str, Past], site: str) 
         dissipation.passed_on(track, eq, share, seen),
         given,
         work.of_sampling(track, eq, ends, digital=digital),
-        np.logical_and.reduce(known),
+        judged,
+        sum(_coupling(track, ends, torque, judged) for torque in (track.tau, track.tau_x)),
     )
+
+
+def _coupling(track: Track, ends: Periods, torque: Array, judged: Bools) -> float:
+    """Returns twice the largest sum of h dr' dtau over the judged periods, J."""
+    together = track.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
+    return 2.0 * float(np.abs(cumulative(np.where(judged, together, 0.0))).max())

@@ -1,6 +1,7 @@
 """What the equations of a site are made of: its gains and its arm, as the books need them.
 
-Law: a site has a functional where its law is the paper's and its arm is known; elsewhere there is none.
+Law: a site has a functional where its law is the paper's and its arm's theta is known; elsewhere there is
+none.
 """
 
 from typing import NamedTuple
@@ -8,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.arm import Array
-from ..core.setup import Law
 from ..scenario import SiteSpec
+from ..scenario.laws import LAWS, Adaptive, AdaptiveBox
 
 
 class Equations(NamedTuple):
@@ -25,6 +26,7 @@ class Equations(NamedTuple):
         low: least that each estimate may be.
         high: most.
         tau_limit: largest torque of a joint, N m.
+        outside: whether the arm is outside of the program: theta is then what its author says of it.
     """
 
     theta: Array
@@ -36,6 +38,7 @@ class Equations(NamedTuple):
     low: Array
     high: Array
     tau_limit: float
+    outside: bool = False
 
 
 def equations(spec: SiteSpec) -> Equations:
@@ -51,14 +54,15 @@ def equations(spec: SiteSpec) -> Equations:
         np.array(gains.low),
         np.array(gains.high),
         spec.limits.tau_limit_nm,
+        spec.plant == "external",
     )
 
 
 def without_functional(spec: SiteSpec) -> str:
     """Says why a site has no functional; "" where it has one."""
-    if spec.plant == "external":
-        return "an arm outside of the program: theta is unknown"
-    theta = spec.arm.theta
-    if spec.control.gains(theta).law is not Law.ADAPTIVE:
-        return "a law that is not the paper's: there is no such functional for it"
+    if not spec.arm.known:
+        return "nobody knows the arm's theta, and V is made of it"
+    if not isinstance(spec.control, Adaptive | AdaptiveBox):
+        name = next(name for name, kind in LAWS.items() if isinstance(spec.control, kind))
+        return f"law {name}, for which there is no such V"
     return ""

@@ -12,6 +12,7 @@ from ..core.arm import Array
 from .balance import Balance
 from .certificate import Certificate
 from .premises import unjudged_spans
+from .verdict import Rise
 
 Facts = dict[str, Any]
 
@@ -23,27 +24,34 @@ def facts(certificate: Certificate) -> Facts:
         "passed": certificate.passed,
         "verdict": verdict.finding.name.lower(),
         "text": verdict.text,
-        "rise": None if verdict.rise is None else _rise(certificate),
+        "rise": None if verdict.rise is None else _rise(verdict.rise),
+        "tolerance_j": verdict.tolerance,
+        "closed_groups": [list(group) for group in certificate.groups],
         "premises": [premise._asdict() for premise in certificate.premises],
         "growth": {
             "motion": grown.motion.name.lower(),
             "text": grown.text,
             "error_rate_per_s": _known(grown.error.rate_per_s),
             "speed_rate_per_s": _known(grown.speed.rate_per_s),
+            "end_error_rad": grown.end_error_rad,
+            "end_speed_rad_s": grown.end_speed_rad_s,
         },
         "functional": None if certificate.balance is None else _functional(certificate, certificate.balance),
     }
 
 
-def _rise(certificate: Certificate) -> Facts:
-    rise = certificate.verdict.rise
-    assert rise is not None
+def _rise(rise: Rise) -> Facts:
+    return {"from_s": rise.from_s, "at_s": rise.at_s, "amount_j": rise.amount, "causes_j": rise.causes}
+
+
+def _ones(certificate: Certificate) -> Facts | None:
+    if certificate.ones is None:
+        return None
+    rise, V = certificate.ones_rise, certificate.ones.V
     return {
-        "from_s": rise.from_s,
-        "at_s": rise.at_s,
-        "amount_j": rise.amount,
-        "causes_j": rise.causes,
-        "tolerance_j": certificate.verdict.tolerance,
+        "v_first_j": float(V[0]),
+        "v_max_j": float(V.max()),
+        "rise": None if rise is None else _rise(rise),
     }
 
 
@@ -65,6 +73,7 @@ def _functional(certificate: Certificate, balance: Balance) -> Facts:
         "unexplained_max_j": _largest(balance.unexplained),
         "sites_unexplained_max_j": {site: _largest(book.unexplained) for site, book in sites.items()},
         "not_judged_s": unjudged_spans(balance),
+        "ones": _ones(certificate),
     }
 
 

@@ -6,7 +6,7 @@ every other, one Kd but for a scalar per site, the adaptive law, nobody who push
 with respect to r.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,7 +54,7 @@ def of_scenario(scenario: Scenario) -> list[Premise]:
     if lacking:
         return [Premise("law", False, "; ".join(lacking))]
     found = weights(scenario.alpha, _damping(scenario))
-    law = Premise("law", True, "the paper's adaptive law at every site, of arms that are known")
+    law = Premise("law", True, "adaptive at every site, of arms whose theta is known")
     return [law, _truth(scenario), _gains(scenario, found)]
 
 
@@ -114,20 +114,21 @@ def _shares(log: Log, books: Mapping[str, Book]) -> Premise:
     Kd = np.array([book.eq.Kd for book in books.values()])
     found = weights(alpha, Kd)
     if not found.unique:
-        return Premise("shares", False, groups_text(names, found))
+        groups = tuple(tuple(names[n] for n in group) for group in found.groups)
+        return Premise("shares", False, groups_text(groups))
     outside = [site for n, site in enumerate(names) if n not in found.groups[0]]
     if outside:
         group = ", ".join(names[n] for n in found.groups[0])
-        why = f"nobody of {group} follows {', '.join(outside)}: its beta is 0, and V tells nothing of it"
-        return Premise("shares", False, f"alpha is reducible: {why}; it follows as in a cascade")
-    beta = "" if found.scales is None else f"; beta = {_per_site(names, found.beta)}"
+        why = f"nobody of {group} follows {', '.join(outside)}, whose beta is 0: V tells nothing of it"
+        return Premise("shares", False, f"alpha is reducible, {why}; it follows as in a cascade")
+    beta = "" if found.scales is None else f"; beta: {_per_site(names, found.beta)}"
     return Premise("shares", True, f"constant, alpha irreducible{beta}")
 
 
-def groups_text(names: tuple[str, ...], found: Weights) -> str:
-    """Says which closed groups there are, and that beta is not unique."""
-    groups = " and ".join("{" + ", ".join(names[n] for n in group) + "}" for group in found.groups)
-    return f"{groups} follow nobody outside: beta is not unique, certify each group by itself"
+def groups_text(groups: Sequence[Sequence[str]]) -> str:
+    """Says which closed groups of sites there are, and that beta is not unique."""
+    named = " and ".join("{" + ", ".join(group) + "}" for group in groups)
+    return f"{named} follow nobody outside: beta is not unique, certify each group by itself"
 
 
 def _delays(books: Mapping[str, Book]) -> Premise:
@@ -154,9 +155,9 @@ def _delays(books: Mapping[str, Book]) -> Premise:
 
 def _following(log: Log) -> Premise:
     found = {site: spans(log[site]) for site in log.sites}
-    away = [f"{site} from {span[0].from_s:.4g} s on" for site, span in found.items() if span]
+    away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
     text = "every site follows its peers all the time"
-    return Premise("following", not away, f"not always following a peer: {_list(away)}" if away else text)
+    return Premise("following", not away, f"hold, brake or return: {_list(away)}" if away else text)
 
 
 def _limits(books: Mapping[str, Book]) -> Premise:
@@ -172,10 +173,16 @@ def _hands(books: Mapping[str, Book], balance: Balance) -> Premise:
     """Passive with respect to r: no more was given than had been taken before, but for a constant."""
     pushing = {s: np.flatnonzero(book.track.tau_x.any(axis=1)) for s, book in books.items()}
     sites = [site for site, rows in pushing.items() if len(rows)]
+    outside = [site for site, book in books.items() if book.eq.outside]
+    if outside and not sites:
+        return Premise("hands", None, f"no record says who pushes the arm of {_list(outside)}")
     if not sites:
         return Premise("hands", True, "nobody pushes")
+    weightless = [s for n, s in enumerate(books) if s in sites and not balance.beta[:, n].any()]
+    if weightless:
+        return Premise("hands", False, f"{_list(weightless)}, of beta 0, is pushed: V tells nothing of that")
     gave = largest_rise(balance.pushed)
-    who = " and ".join(name for name in ("hands", "walls") if balance.given[name].any())
+    who = " and ".join(balance.pushers)
     if gave <= 1e-9 * balance.scale + NOTHING_J:
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(books[site].track.t_s[pushing[site][-1]] for site in sites)

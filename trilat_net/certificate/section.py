@@ -7,14 +7,14 @@ from html import escape
 
 from ..analysis.section import Section
 from ..log.reader import Log
-from .certificate import certify
+from .certificate import Certificate, certify
 from .facts import facts
 from .figure import functional_over_time
-from .words import sentences
+from .words import energies, lines
 
 KEY = "certificate"
 HEADING = "Was it stable, and why"
-_MARKS = {True: "holds", False: "fails", None: "not told"}
+_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
 _NOTE = (
     "V of the theorem, with the weights that the shares ask for, and its energy balance: what is left of "
     "V − V(0) + dissipation − work must vanish, whatever the hands do."
@@ -29,9 +29,22 @@ def section(log: Log) -> Section:
     """
     found = certify(log)
     rows = "".join(
-        f"<tr><th>{escape(p.name)}</th><td>{_MARKS[p.holds]}</td><td>{escape(p.text)}</td></tr>"
+        f"<tr><th>{escape(p.name)}</th><th>{_MARKS[p.holds]}</th><td>{escape(p.text)}</td></tr>"
         for p in found.premises
     )
-    said = "".join(f"<p>{escape(line)}</p>" for line in sentences(found))
-    html = f'{said}<div class="scroll"><table>{rows}</table></div><p class="note">{escape(_NOTE)}</p>'
+    first, *others = (escape(line.text) for line in lines(found))
+    said = f"<p><strong>{first}</strong></p>" + "".join(f"<p>{text}</p>" for text in others)
+    html = f'{said}<div class="scroll"><table class="facts">{rows}</table></div>{_energies(found)}'
     return Section(KEY, HEADING, html, facts(found), functional_over_time(log, found))
+
+
+def _energies(found: Certificate) -> str:
+    """Returns the table of energies; "" without a functional."""
+    if found.balance is None:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td>{value:.4g}</td></tr>" for name, value in energies(found.balance)
+    )
+    head = "<thead><tr><th>energy</th><th>J</th></tr></thead>"
+    table = f'<div class="scroll"><table class="sites">{head}<tbody>{rows}</tbody></table></div>'
+    return f'{table}<p class="note">{escape(_NOTE)}</p>'

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arm import JOINTS, Array
+from ..core.grid import NS_PER_S
 from ..log.reader import Ints, Log
 
 Bools = NDArray[np.bool_]
@@ -60,6 +61,13 @@ class Track(NamedTuple):
         return times
 
     @property
+    def nominal_s(self) -> Array:
+        """The same as the core has it, of whole nanoseconds: where actors begin and end, shape (K,), s."""
+        tick = np.arange(self.first, self.first + len(self.known), dtype=np.int64)
+        times: Array = (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
+        return times
+
+    @property
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, 2), rad."""
         return self.q - self.q_des
@@ -73,16 +81,17 @@ def tracks(log: Log) -> dict[str, Track]:
     rows = {site: _healthy(log, site) for site in log.sites}
     if min(map(len, rows.values())) < 2:
         return {}
-    begin_s = max(log[site].t_s[row[0]] for site, row in rows.items())
-    end_s = min(log[site].t_s[row[-1]] for site, row in rows.items())
+    begin_s = max(log[site].tick[row[0]] / log[site].rate_hz for site, row in rows.items())
+    end_s = min(log[site].tick[row[-1]] / log[site].rate_hz for site, row in rows.items())
     found = {site: _track(log, site, row, end_s) for site, row in rows.items() if end_s > begin_s}
     return found if min((len(track.known) for track in found.values()), default=0) > 1 else {}
 
 
 def _healthy(log: Log, site: str) -> Ints:
     part = log[site]
-    first = np.unique(part.tick, return_index=True)[1]
-    return np.array([n for n in first.tolist() if part.states[n].mode != "diverged"], dtype=np.int64)
+    first: Ints = np.unique(part.tick, return_index=True)[1]
+    healthy: Ints = first[part.mode[first] != "diverged"]
+    return healthy
 
 
 def _track(log: Log, site: str, rows: Ints, end_s: float) -> Track:
@@ -93,10 +102,10 @@ def _track(log: Log, site: str, rows: Ints, end_s: float) -> Track:
     grid = np.arange(first, max(last, first) + 1)
     before = np.clip(np.searchsorted(tick, grid, side="right") - 1, 0, None)
     known = tick[before] == grid
-    modes = np.array([part.states[n].mode == "run" for n in rows.tolist()], dtype=np.bool_)
+    follows: Bools = part.mode[rows] == "run"
     columns = {name: _filled(getattr(part, name)[rows], tick, grid, known) for name in COLUMNS}
     used = {peer: part.used[peer][rows][before] for peer in part.peers}
-    return Track(site, part.rate_hz, first, known, modes[before], used=used, **columns)
+    return Track(site, part.rate_hz, first, known, follows[before], used=used, **columns)
 
 
 def _filled(values: Array, tick: Ints, grid: Ints, known: Bools) -> Array:

@@ -6,9 +6,7 @@ Hands and walls count with r = qd + Lambda e, not with qd: that is what the theo
 
 import numpy as np
 
-from ..core.arm import JOINTS, Array
-from ..core.exogenous import Actor, add_torque, rows_of
-from ..scenario import SiteSpec
+from ..core.arm import Array
 from .dynamics import inertia_times, regressor
 from .equations import Equations
 from .functional import sliding, stored_on_the_way
@@ -17,42 +15,8 @@ from .shares import Shares
 from .track import Track
 from .views import View
 
-
-class Pushed:
-    """The torque ON an arm over its rows, parted into hands and environment, held and not.
-
-    Args:
-        track: the site's records.
-        spec: the site: who pushes, and what it meets.
-
-    Attributes:
-        hands: torque of the hands that is a function of the present, shape (K, 2), N m.
-        hands_held: of those that are computed once a tick and held, shape (K, 2), N m.
-        walls: of the environment, a function of the present, shape (K, 2), N m.
-        walls_held: of what in it is held, shape (K, 2), N m.
-    """
-
-    def __init__(self, track: Track, spec: SiteSpec) -> None:
-        self._track = track
-        self._lengths = np.array([spec.arm.l1_m, spec.arm.l2_m])
-        walls = [one.actor for one in spec.environment]
-        held = [one.actor for one in spec.hands if one.actor.sampled]
-        self.walls = self._torque([actor for actor in walls if not actor.sampled])
-        self.walls_held = self._torque([actor for actor in walls if actor.sampled])
-        self.hands_held = self._torque(held)
-        # what is left of the record is the hands', also where nobody has written down whose it was
-        self.hands: Array = -track.tau_x - self.walls - self.walls_held - self.hands_held
-
-    def _torque(self, actors: list[Actor]) -> Array:
-        """Returns what actors do at the logged states, shape (K, 2), N m."""
-        torque = np.zeros_like(self._track.q)
-        rows, table = rows_of(tuple(actors))
-        work = np.zeros((6, JOINTS))
-        for row in rows:
-            states = zip(self._track.t_s.tolist(), self._track.q, self._track.qd, torque, strict=True)
-            for t_s, q, qd, total in states:
-                add_torque(t_s, q, qd, self._lengths, row, table, work, total)
-        return torque
+ROUNDING = 1e-12
+"""rad, and rad/s: a jump that is none."""
 
 
 def of_torque(track: Track, ends: Periods, now: Array, held: Array) -> Booked:
@@ -139,7 +103,7 @@ def of_estimates(track: Track, eq: Equations, *, digital: bool) -> Booked:
     wrong = (off != 0.0) & ~learnt
     if not (at_edge.any() or wrong.any()):
         return jumps(np.zeros(len(off) - 1))
-    Yr = np.einsum("kij,ki->kj", _regressor(track, eq), sliding(track, eq))
+    Yr = _regressed(track, eq)
     mean = Yr[:-1] if digital else 0.5 * (Yr[:-1] + Yr[1:])
     held = np.diff(off, axis=0) + track.h_s * eq.Gamma * mean  # what the box kept the estimate from
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -151,21 +115,42 @@ def of_estimates(track: Track, eq: Equations, *, digital: bool) -> Booked:
 def of_sampling(track: Track, eq: Equations, ends: Periods, *, digital: bool) -> Booked:
     """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its step of (15).
 
-    int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, tau straight
-    from tick to tick, and for `digital` what forward Euler makes of the estimate in place of the trapezoid
-    rule. No part of the balance: what that leaves without this, nobody accounts for.
+    int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, and tau straight
+    to where it is before the jump; and what the scheme makes of the estimate in place of the trapezoid rule
+    up to there. No part of the balance: what that leaves without this, nobody accounts for.
     """
     tau = track.tau
     u = tau[:-1].copy()
     if not digital:
         u[1:] = np.clip(1.5 * tau[1:-1] - 0.5 * tau[:-2], -eq.tau_limit, eq.tau_limit)
-    off_law = u - 0.5 * (tau[:-1] + tau[1:])
+    Yr = _regressed(track, eq)
+    tau_right, Yr_right = _before_jump(track, eq, ends, Yr)
+    off_law = u - 0.5 * (tau[:-1] + tau_right)
     amount = track.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)
-    if digital:
-        Yr = np.einsum("kij,ki->kj", _regressor(track, eq), sliding(track, eq))
-        off = (track.theta_hat - eq.theta) * (eq.Gamma > 0.0)
-        amount = amount + 0.25 * track.h_s * ((off[1:] + off[:-1]) * np.diff(Yr, axis=0)).sum(axis=1)
-    return jumps(amount)
+    off = (track.theta_hat - eq.theta) * (eq.Gamma > 0.0)
+    step = Yr[:-1] if digital else 0.5 * (Yr[:-1] + Yr[1:])
+    missed = 0.5 * (Yr[:-1] + Yr_right) - step
+    return jumps(amount + 0.5 * track.h_s * ((off[1:] + off[:-1]) * missed).sum(axis=1))
+
+
+def _before_jump(track: Track, eq: Equations, ends: Periods, Yr: Array) -> tuple[Array, Array]:
+    """Returns tau of Eq. (13) and Y'r at the end of every period, before its jump, K - 1 rows each."""
+    tau, Yr = track.tau[1:].copy(), Yr[1:].copy()
+    q, qd, e = track.q[1:], track.qd[1:], 2.0 * ends.e_middle - track.e[1:]
+    moved = np.abs(e - track.e[1:]) + np.abs(ends.qd_des_right - track.qd_des[1:]) > ROUNDING
+    rows = np.flatnonzero(moved.any(axis=1))
+    e, ed, r = e[rows], (qd - ends.qd_des_right)[rows], ends.r_right[rows]
+    Y = regressor(eq.g, q[rows], qd[rows], -eq.Lambda * e, -eq.Lambda * ed)
+    Yr[rows] = np.einsum("kij,ki->kj", Y, r)
+    law = np.einsum("kij,kj->ki", Y, track.theta_hat[1:][rows]) - eq.Kp * r - eq.Kd * ed
+    tau[rows] = np.clip(law, -eq.tau_limit, eq.tau_limit)
+    return tau, Yr
+
+
+def _regressed(track: Track, eq: Equations) -> Array:
+    """Returns Y'r, shape (K, 5)."""
+    Yr: Array = np.einsum("kij,ki->kj", _regressor(track, eq), sliding(track, eq))
+    return Yr
 
 
 def _regressor(track: Track, eq: Equations) -> Array:

@@ -15,7 +15,22 @@ from typer.core import TyperGroup
 
 from ..errors import TrilatError
 from ..interrupt import Interrupt
-from . import certificates, changes, log, logs, pings, replays, reruns, routers, scenarios, sessions, trials
+from . import (
+    certificates,
+    changes,
+    comparisons,
+    figures,
+    log,
+    logs,
+    metering,
+    pings,
+    replays,
+    reruns,
+    routers,
+    scenarios,
+    sessions,
+    trials,
+)
 from .options import err
 
 
@@ -51,6 +66,9 @@ app.add_typer(routers.app)
 app.add_typer(pings.app)
 app.add_typer(logs.app)
 app.add_typer(certificates.app)
+app.add_typer(metering.app)
+app.add_typer(comparisons.app)
+app.add_typer(figures.app)
 app.add_typer(replays.app)
 app.add_typer(reruns.app)
 app.add_typer(log.app, name="log")

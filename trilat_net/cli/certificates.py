@@ -1,38 +1,43 @@
 """The command that says whether a run was stable, and why: certify."""
 
 import json
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from .options import LogArgument, out
+from .opening import opened
+from .options import JsonOption, LogsArgument, out
 
 if TYPE_CHECKING:
     from ..certificate.certificate import Certificate
 
 app = typer.Typer()
 
-_MARKS = {True: "[green]holds[/green]", False: "[red]fails[/red]", None: "not told"}
+_HOLDS = {True: "[green]holds[/green]", False: "[yellow]fails[/yellow]", None: "not told"}
+_MARKS = {
+    "ok": "[green]ok  [/green]",
+    "FAIL": "[red]FAIL[/red]",
+    "open": "[yellow]open[/yellow]",
+    "note": "note",
+}
 
 
 @app.command(epilog="Example: trilat certify run.mcap")
-def certify(
-    file: LogArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON, for programs.")] = False,
-) -> None:
-    """Says whether a run was stable, and why: the theorem's premises, V and its energy balance, growth.
+def certify(files: LogsArgument, as_json: JsonOption = False) -> None:
+    """Says whether a run was stable, and why: V and its energy balance, the theorem's premises, growth.
 
-    Ends with 0 where V bounds the run, covered by the theorem or not, or where nothing grows; with 1 where
-    the run diverged or grows, where that is undecided and V does not tell (record longer; `stable` of
-    `trilat test` is the same), or where the energy balance is broken; with 2 where FILE is no log.
+    Nothing is executed; docs/certificate.md defines every word and every key of the JSON.
+
+    Exit code 0: V bounds the run, whether the theorem covers it or not, or e and qd show that nothing grows.
+    1: it diverged or grows; the energy balance is broken; or neither V nor growth decides (record longer).
+    2: no log.
     """
     from ..certificate.certificate import certify as certified
     from ..certificate.facts import facts
-    from ..experiment import open_log
 
-    found = certified(open_log(file))
+    found = certified(opened(*files))
     if as_json:
         typer.echo(json.dumps(facts(found), indent=2, ensure_ascii=False, allow_nan=False))
     else:
@@ -42,32 +47,21 @@ def certify(
 
 
 def _show(found: "Certificate") -> None:
-    """Prints a certificate: premises, energies, sentences."""
-    from ..certificate.words import sentences
+    """Prints a certificate: what it comes to, then premises and energies."""
+    from ..certificate.words import energies, lines
 
+    for line in lines(found):
+        out.print(f"{_MARKS[line.mark]} {escape(line.text)}", soft_wrap=True)
     premises = Table("premise", "", "found", box=None, pad_edge=False)
     for premise in found.premises:
-        premises.add_row(premise.name, _MARKS[premise.holds], escape(premise.text))
+        premises.add_row(premise.name, _HOLDS[premise.holds], escape(premise.text))
+    out.print()
     out.print(premises)
-    if found.balance is not None:
-        out.print(_energies(found))
-    for line in sentences(found):
-        out.print(escape(line), soft_wrap=True)
-
-
-def _energies(found: "Certificate") -> Table:
-    """Returns what V was at both ends, what was taken from it and given to it, J."""
-    balance = found.balance
-    assert balance is not None
+    if found.balance is None:
+        return
     table = Table("energy", "J", box=None, pad_edge=False)
     table.columns[1].justify = "right"
-    entries = {
-        "V at the start": balance.V[0],
-        "V at the end": balance.V[-1],
-        **{f"taken: {name}": -values[-1] for name, values in balance.taken.items()},
-        **{f"given: {name}": values[-1] for name, values in balance.given.items() if values.any()},
-        "given: sampling": balance.sampling[-1],
-    }
-    for name, value in entries.items():
-        table.add_row(escape(name), f"{value:.4g}")
-    return table
+    for name, amount in energies(found.balance):
+        table.add_row(escape(name), f"{amount:.4g}")
+    out.print()
+    out.print(table)

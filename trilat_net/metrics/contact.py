@@ -12,7 +12,6 @@ from ..certificate.track import Bools, Track
 from ..core.arm import Array
 from ..core.exogenous import Actor, Acts
 from ..scenario import SiteSpec
-from .rows import nominal_s
 from .said import Facts, said, unsaid
 
 LAST_S = 5.0
@@ -53,7 +52,7 @@ def walls(spec: SiteSpec) -> list[Actor]:
 
 def met(actor: Actor, track: Track, tip: Tip) -> Met:
     """Returns how a tip met a wall."""
-    t_s = nominal_s(track)
+    t_s = track.nominal_s
     force = wall_force(actor, t_s, tip)
     touches = force > 0.0
     # the first record, of all and behind a gap, begins nothing: nobody knows since when it touches

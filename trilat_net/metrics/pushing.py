@@ -1,18 +1,18 @@
-"""Who pushed an arm, over all of its rows at once: hands and environment, apart.
+"""Who pushed an arm, and what the hands were to do, over all of its rows at once.
 
-Law: what a scenario cannot tell apart is the hands': the record's torque less that of the environment.
+Law: a hand has a script only where its torque is what the scenario says.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.actors import Tip, spring_of, tip_of, torque_of
+from ..analysis.actors import Tip, spring_of, torque_of
+from ..certificate.parting import parted
 from ..certificate.track import Track
 from ..core.arm import JOINTS, Array
 from ..core.exogenous import Actor, Acts
 from ..scenario import SiteSpec
-from .rows import nominal_s
 
 ALIKE = 1e-8
 """Relative difference up to which a torque is what the scenario says."""
@@ -77,32 +77,20 @@ class Pushed(NamedTuple):
 
 
 def pushed(track: Track, spec: SiteSpec) -> Pushed:
-    """Returns the torque on an arm, parted into hands and environment, held and not.
+    """Returns the torque on an arm, parted into hands and environment, with the script of the hands.
 
     Args:
         track: the site's records.
         spec: the site: who pushes, and what it meets.
     """
-    tip = tip_of((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
-    t_s = nominal_s(track)
-
-    def together(actors: list[Actor]) -> Array:
-        total = np.zeros_like(track.q)
-        for actor in actors:
-            total = total + torque_of(actor, t_s, track.q, track.qd, tip)
-        return total
-
-    around, hands = [one.actor for one in spec.environment], [one.actor for one in spec.hands]
-    walls = together([actor for actor in around if not actor.sampled])
-    walls_held = together([actor for actor in around if actor.sampled])
-    hands_held = together([actor for actor in hands if actor.sampled])
-    rest = -track.tau_x - walls - walls_held - hands_held
-    scripts = [script_of(actor, t_s, tip.J[0]) for actor in hands]
+    who, t_s = parted(track, spec), track.nominal_s
+    hands, rest = [one.actor for one in spec.hands], who.hands.copy()
+    scripts = [script_of(actor, t_s, who.tip.J[0]) for actor in hands]
     told = sum(
         (
             script
             if actor.acts in (Acts.PULSE, Acts.RECORDED)
-            else torque_of(actor, t_s, track.q, track.qd, tip)
+            else torque_of(actor, t_s, track.q, track.qd, who.tip)
             for actor, script in zip(hands, scripts, strict=True)
             if not actor.sampled
         ),
@@ -112,4 +100,4 @@ def pushed(track: Track, spec: SiteSpec) -> Pushed:
     if not hands:  # what rounding leaves of nobody
         rest[as_told] = 0.0
     script = sum(scripts, np.zeros_like(track.q)) if as_told[track.known].all() else None
-    return Pushed(tip, rest, hands_held, walls, walls_held, script)
+    return Pushed(who.tip, rest, who.hands_held, who.walls, who.walls_held, script)

@@ -7,7 +7,6 @@ import numpy as np
 
 from ..certificate.track import COLUMNS, Bools, Track
 from ..core.arm import Array
-from ..core.grid import NS_PER_S
 from ..log.reader import Ints, Log, SiteLog
 
 END_S = 1.0
@@ -53,13 +52,6 @@ def steps(track: Track) -> Bools:
     """Returns which periods have the records of both of their ends, shape (K - 1,)."""
     both: Bools = track.known[:-1] & track.known[1:]
     return both
-
-
-def nominal_s(track: Track) -> Array:
-    """Returns the times of the rows as the core has them: whole nanoseconds, shape (K,), s."""
-    tick = np.arange(track.first, track.first + len(track.known), dtype=np.int64)
-    times: Array = (tick * NS_PER_S // track.rate_hz).astype(np.float64) * 1e-9
-    return times
 
 
 def at_end(track: Track, end_s: float, length_s: float = END_S) -> Bools:
