@@ -1,0 +1,108 @@
+"""`trilat compare`: logs side by side, and laws tuned alike."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.tuning.experiments import TRIO
+
+from .running import trilat
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two runs of one scenario, one that hangs, and one of another scenario."""
+    folder = tmp_path_factory.mktemp("logs")
+    quick = ["--set", "rate_hz=100", "--duration"]
+    trilat("sim", "free", "-o", "a.mcap", *quick, "2", cwd=folder)
+    trilat("sim", "free", "-o", "b.mcap", *quick, "2", "--set", "link.delay_ms=50", cwd=folder)
+    hanging = ["--set", "control.law=pd_d", "--set", "control.gravity=0"]
+    trilat("sim", "free", "-o", "hang.mcap", *quick, "12", *hanging, cwd=folder)
+    trilat("sim", "two_sites", "-o", "c.mcap", *quick, "1", cwd=folder)
+    (folder / "trio.toml").write_text(TRIO)
+    (folder / "no.mcap").write_bytes(b"no log")
+    return folder
+
+
+def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
+    lines = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
+    assert next(line for line in lines if "every link" in line).split() == [
+        "every",
+        "link",
+        "200",
+        "ms",
+        "50",
+        "ms",
+    ]
+    spread = next(line for line in lines if "RMS spread, undelayed" in line)
+    assert " rad " in spread
+    assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
+
+
+def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
+    printed = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
+    assert "one and the same experiment" in printed
+    assert "1: a.mcap" in printed
+
+
+def test_arms_that_hang_are_named(logs: Path) -> None:
+    printed = trilat("compare", "a.mcap", "hang.mcap", cwd=logs).succeeds()
+    assert "hang: m1, m2, s hang at the end" in printed
+
+
+def test_logs_of_different_scenarios_are_compared_and_that_is_said(logs: Path) -> None:
+    printed = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
+    assert "logs of different scenarios: free, two_sites" in printed
+
+
+def test_json_is_for_programs(logs: Path) -> None:
+    facts = json.loads(trilat("compare", "a.mcap", "hang.mcap", "--json", cwd=logs).succeeds())
+    assert facts["columns"] == ["a", "hang"]
+    assert [log["scenario"] for log in facts["logs"]] == ["free", "free"]
+    assert {"control", "duration_s"} <= {one["key"] for one in facts["differences"]}
+    assert facts["remarks"]["a"] == []
+    assert "hang at the end" in facts["remarks"]["hang"][0]
+    assert all(len(row["values"]) == 2 for row in facts["rows"])
+
+
+def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path) -> None:
+    options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "5", "--out", "fronts"]
+    printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
+    assert "18 runs on 1 core: about " in printed
+    assert "torques clamped at 60 N m" in printed
+    assert "trilat sim trio.toml --set duration_s=5.0 --set 'control={law = " in printed
+    assert sorted(path.name for path in (logs / "fronts").iterdir()) == [
+        "front.json",
+        "front.md",
+        "front.pdf",
+        "front.png",
+    ]
+    again = trilat("compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs).succeeds()
+    assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
+    trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses("fronts: holds something", "--force")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "facts"),
+    [
+        ([], ["name two logs or more", "--tune free"]),
+        (["a.mcap"], ["name two logs or more"]),
+        (["a.mcap", "no.mcap"], ["no.mcap"]),
+        (["a.mcap", "none.mcap"], ["none.mcap", "cannot be read"]),
+        (["a.mcap", "b.mcap", "--budget", "3"], ["--budget belongs to --tune SCENARIO"]),
+        (["a.mcap", "b.mcap", "--force"], ["--force belongs to --tune SCENARIO"]),
+        (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
+        (["--tune", "fre"], ["no scenario of that name", "free"]),
+        (["--tune", "free", "--law", "adaptve"], ["no law 'adaptve'", "did you mean 'adaptive'"]),
+        (["--tune", "free", "--law", "p_f"], ["p_f", "one master and one slave", "3 sites"]),
+        (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
+        (["--tune", "free", "--objective", "rank"], ["--objective is error or settling"]),
+        (["--tune", "free", "--gravity", "5"], ["--gravity is from 50 to 150 %"]),
+        (["--tune", "free", "--set", "link.model=measured"], ["links.m2->m1", "is measured"]),
+        (["--tune", "free", "--set", "sites.s.plant=external"], ["sites.s.plant", "outside of the program"]),
+        (["--tune", "training"], ["keep one of the hands"]),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(logs: Path, arguments: list[str], facts: list[str]) -> None:
+    trilat("compare", *arguments, cwd=logs).refuses(*facts)
