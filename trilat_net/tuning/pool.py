@@ -7,9 +7,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from types import TracebackType
 
@@ -34,6 +35,7 @@ class Crew:
 
     def __init__(self, jobs: int) -> None:
         self._pool: ProcessPoolExecutor | None = None
+        self._others = multiprocessing.active_children()
         if jobs > 1:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(jobs, context, _prepare)
@@ -44,8 +46,13 @@ class Crew:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        if self._pool is None:
+            return
+        if error is not None:  # nobody waits for what they are at; a second Ctrl-C finds them gone
+            for child in multiprocessing.active_children():
+                if child not in self._others:
+                    child.kill()
+        self._pool.shutdown(cancel_futures=True)
 
     def scores(self, tasks: Sequence[Task], done: Callable[[], None]) -> list[Score]:
         """Returns the score of every candidate.
@@ -57,10 +64,13 @@ class Crew:
         Raises:
             RunFailed: a process was ended.
         """
-        run = map if self._pool is None else self._pool.map
+        if not tasks:
+            return []
         found: list[Score] = []
         try:
-            for score in run(measure, *zip(*tasks, strict=True)) if tasks else ():
+            with _deaf():  # processes that begin inherit it
+                scores = (map if self._pool is None else self._pool.map)(measure, *zip(*tasks, strict=True))
+            for score in scores:
                 found.append(score)
                 done()
         except BrokenProcessPool:
@@ -68,6 +78,19 @@ class Crew:
                 "a process of the search was ended, or could not begin; try again, or with --jobs 1"
             ) from None
         return found
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Ignores Ctrl-C for a moment, where this thread may."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _prepare() -> None:
