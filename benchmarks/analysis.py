@@ -14,8 +14,11 @@ from pathlib import Path
 from trilat_net.scenario import load
 from trilat_net.sim import virtual
 
+from .sessions import paper
+
 SECONDS = 60
-SCENARIOS = ("paper", "windup", "jitter")
+VIRTUAL = ("windup", "jitter")
+"""Beside `paper`, which is recorded live."""
 BAR_S = 10.0
 _ALONE = """
 import os, sys, time
@@ -50,8 +53,12 @@ lap("verify")
 
 
 def run() -> list[str]:
-    lines = []
-    for name in SCENARIOS:
+    with paper(SECONDS) as session:
+        session.all()
+        for process in session.processes.values():
+            process.code(SECONDS + 60.0)
+        lines = measured("paper, live", session.log, session.log.parent / "report")
+    for name in VIRTUAL:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "run.mcap"
             with path.open("wb") as stream:

@@ -200,7 +200,7 @@ def _use(log: Log, peer: str, site: str, states: list[Stated], count: int, came:
     first = came.first
     known = judged(log, site, fate.stamp_ns, first)
     loss, burst = _losses(fate, first, known)
-    stamped = log.driver == "live" and len(part) > 0 and part.states[0].v >= ONE_WAY_SINCE
+    stamped = log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SINCE
     in_use = np.flatnonzero(used >= 0)
     return LinkUse(
         peer,

@@ -113,6 +113,14 @@ class SiteLog:
         with self._told():
             return columns.numbers(self.payloads, field)
 
+    def record(self, n: int) -> State:
+        """Returns one record, decoded and checked alone.
+
+        Args:
+            n: its place; -1 is the last one.
+        """
+        return self._decoded([self.payloads[n]])[0]
+
     @cached_property
     def states(self) -> Sequence[State]:
         """The records, decoded and checked as a whole."""

@@ -62,7 +62,8 @@ def measure_log(log: Log, expect: Expect | None = None) -> Figures:
     """
     scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    diverged_ns = [s.t_ns for name in log.sites for s in log[name].states[-1:] if s.mode == "diverged"]
+    last = [log[name].record(-1) for name in log.sites if len(log[name])]
+    diverged_ns = [state.t_ns for state in last if state.mode == "diverged"]
     tallies = {name: _tally(scenario, name) for name in log.sites}
     missing = 0
     for name, tally in tallies.items():

@@ -28,7 +28,7 @@ def standing(log: Log) -> list[str]:
     Raises:
         LogError: a record cannot be read.
     """
-    diverged = [s for s in log.sites if log[s].states[-1:] and log[s].states[-1].mode == "diverged"]
+    diverged = [s for s in log.sites if len(log[s]) and log[s].record(-1).mode == "diverged"]
     if diverged:
         return [f"{', '.join(diverged)} diverged: its figures end there"]
     ends = {site: _end_rad(log, site) for site in log.sites if len(log[site])}
