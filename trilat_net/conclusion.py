@@ -4,10 +4,8 @@ Law: nothing is claimed that was not executed again just now.
 """
 
 import itertools
-import multiprocessing
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +13,7 @@ import numpy as np
 
 from .analysis.notes import run_lines
 from .analysis.tables import VerdictLine
-from .errors import LawFailed, ScenarioError, UsageError
+from .errors import LawFailed, RunFailed, ScenarioError, UsageError
 from .experiment import compare_with_virtual, twin_without_hands
 from .log.chunks import Progress
 from .log.reader import Log, open_log
@@ -23,6 +21,7 @@ from .replay.comparison import Comparison
 from .replay.outside import outside_laws
 from .replay.verify import Verdict, executed_sites, last_ticks, verify
 from .scenario import Scenario
+from .workers import deaf, workers
 
 
 class Conclusion(NamedTuple):
@@ -103,20 +102,25 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
 
     Raises:
         LogError: a record cannot be read.
+        RunFailed: the process that executes the log was ended.
     """
     # Matplotlib takes a second, and `verify` needs none of it
     from .analysis.report import write_report
     from .certificate.section import section
 
     lines: list[VerdictLine] = []
-    with _worker() as pool:  # two cores: the log is executed while its figures are drawn
-        checking = pool.submit(_check_files, log.sources)
+    with workers(1) as pool:  # two cores: the log is executed while its figures are drawn
+        with deaf():
+            checking = pool.submit(_check_files, log.sources)
         twin = _twin(log)
         certified = section(log)
         notes = [*run_lines(log), f"certificate: {certified.facts['text']}"]
 
         def verdicts() -> Iterator[VerdictLine]:
-            lines.extend(checking.result())
+            try:
+                lines.extend(checking.result())
+            except BrokenProcessPool:
+                raise RunFailed("the process that executes the log again was ended; try again") from None
             yield from lines
 
         made = write_report(
@@ -136,12 +140,6 @@ def _twin(log: Log) -> Log | None:
         return twin_without_hands(log)
     except (ScenarioError, LawFailed):  # a law from outside that is not there, or fails: the check says so
         return None
-
-
-def _worker() -> ProcessPoolExecutor:
-    """Returns one process beside this one, which leaves Ctrl-C to this one."""
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
 
 
 def _check_files(sources: Sequence[str]) -> list[VerdictLine]:

@@ -6,7 +6,7 @@ import pytest
 
 from trilat_net.errors import RunFailed
 from trilat_net.tuning.measurement import measure
-from trilat_net.tuning.pool import Crew
+from trilat_net.tuning.pool import crew
 
 from .experiments import trio
 
@@ -24,15 +24,15 @@ class _Lost:
 def test_scores_come_in_the_order_of_the_candidates_and_each_is_told() -> None:
     texts = [trio(f"control.Kp={Kp}", "duration_s=0.2").text for Kp in (1.0, 5.0, 2.0)]
     told: list[int] = []
-    with Crew(1) as crew:
-        scores = crew.scores([(text, None) for text in texts], lambda: told.append(len(told)))
-        assert crew.scores([], lambda: None) == []
+    with crew(1) as runners:
+        scores = runners.scores([(text, None) for text in texts], lambda: told.append(len(told)))
+        assert runners.scores([], lambda: None) == []
     assert scores == [measure(text, None) for text in texts]
     assert told == [0, 1, 2]
 
 
 def test_processes_that_end_are_told_of_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Crew(1) as crew:
-        monkeypatch.setattr(crew, "_pool", _Lost())
+    with crew(1) as runners:
+        monkeypatch.setattr(runners, "_pool", _Lost())
         with pytest.raises(RunFailed, match="a process of the search was ended"):
-            crew.scores([("", None)], lambda: None)
+            runners.scores([("", None)], lambda: None)

@@ -49,8 +49,8 @@ def tune(asked: "Plan", folder: Path | None, jobs: int | None, *, force: bool, a
 
 def _announce(asked: "Plan", jobs: int | None) -> None:
     """Prints what is the same for all laws, and how long the search will take."""
-    from ..tuning.pool import cores
     from ..tuning.tables import procedure
+    from ..workers import cores
 
     laws = ", ".join(space.law for space in asked.spaces)
     out.print(escape(f"{asked.base.scenario.name}, laws {laws}; the same for all:"), soft_wrap=True)

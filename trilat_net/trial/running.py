@@ -22,16 +22,12 @@ from ..core.jit import is_cached
 from ..net.clock import SystemClock
 from ..scenario import Scenario
 from ..sim import virtual
+from ..workers import cores
 from .report import Report
 from .trial import Result, Trial, trials
 from .worker import Answer
 
 _PACKAGES = str(Path(__file__).resolve().parents[2])
-
-
-def cores() -> int:
-    """Returns how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_trials(

@@ -12,13 +12,14 @@ from ..core.jit import is_cached
 from ..errors import ScenarioError, UsageError
 from ..net.clock import SystemClock
 from ..sim import virtual
+from ..workers import cores
 from .candidate import Base, base
 from .front import Objective, front
 from .goal import refuse_unfit, twin
 from .knowledge import Knowledge, told
 from .measurement import Score
 from .outcome import Outcome
-from .pool import Crew, cores
+from .pool import crew
 from .search import Search
 from .space import PRINTED, Space, chosen
 
@@ -149,7 +150,7 @@ class Plan(NamedTuple):
 
         if not is_cached():
             next(virtual.run(self.base.scenario))  # compiles, once for all processes
-        with Crew(min(jobs or cores(), len(searches) * self.budget)) as crew:
+        with crew(min(jobs or cores(), len(searches) * self.budget)) as runners:
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
                 tasks = [
@@ -159,7 +160,7 @@ class Plan(NamedTuple):
                 ]
                 if number == 0:
                     tasks += [candidate.task for candidate in printed.values()]
-                scores = iter(crew.scores(tasks, one_more))
+                scores = iter(runners.scores(tasks, one_more))
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores
