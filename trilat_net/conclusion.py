@@ -3,24 +3,21 @@
 Law: nothing is claimed that was not executed again just now.
 """
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from .analysis.notes import run_lines
 from .analysis.tables import VerdictLine
-from .errors import LawFailed, RunFailed, ScenarioError, UsageError
-from .experiment import compare_with_virtual, twin_without_hands
+from .checking import RECORDS, check_files
+from .errors import LawFailed, RunFailed, ScenarioError
+from .experiment import twin_without_hands
 from .log.chunks import Progress
-from .log.reader import Log, open_log
-from .replay.comparison import Comparison
-from .replay.outside import outside_laws
-from .replay.verify import Verdict, executed_sites, last_ticks, verify
-from .scenario import Scenario
+from .log.reader import Log
+from .replay.verify import last_ticks
 from .workers import deaf, workers
 
 
@@ -49,47 +46,7 @@ class Conclusion(NamedTuple):
     @property
     def agreed(self) -> bool:
         """True where every execution agreed with the log, complete or not."""
-        return all(line.passed for line in self.lines if line.label != _RECORDS)
-
-
-class Checked(NamedTuple):
-    """What executing a log again showed.
-
-    Attributes:
-        verdict: every site executed from its records.
-        lines: that and the other checks, a line each.
-    """
-
-    verdict: Verdict
-    lines: list[VerdictLine]
-
-    @property
-    def passed(self) -> bool:
-        """True where every execution agreed with the log, complete or not."""
-        return all(line.passed for line in self.lines)
-
-    def facts(self) -> dict[str, Any]:
-        """Returns the same for a program: every gap, and the first difference with both values."""
-        verdict, first = self.verdict, self.verdict.first
-        return {
-            "passed": self.passed,
-            "whole_run": verdict.whole_run,
-            "records": verdict.records,
-            "identical": verdict.identical,
-            "differing": verdict.differing,
-            "unjudged": verdict.unjudged,
-            "gaps": [{"site": site, "first": a, "last": b} for site, a, b in verdict.gaps],
-            "first_difference": None
-            if first is None
-            else {
-                "site": first.site,
-                "tick": first.tick,
-                "field": first.field,
-                "logged": repr(first.logged),
-                "computed": repr(first.computed),
-            },
-            "checks": [line._asdict() for line in self.lines],
-        }
+        return all(line.passed for line in self.lines if line.label != RECORDS)
 
 
 def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:
@@ -111,7 +68,7 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
     lines: list[VerdictLine] = []
     with workers(1) as pool:  # two cores: the log is executed while its figures are drawn
         with deaf():
-            checking = pool.submit(_check_files, log.sources)
+            checking = pool.submit(check_files, log.sources)
         twin = _twin(log)
         certified = section(log)
         notes = [*run_lines(log), f"certificate: {certified.facts['text']}"]
@@ -142,175 +99,6 @@ def _twin(log: Log) -> Log | None:
         return None
 
 
-def _check_files(sources: Sequence[str]) -> list[VerdictLine]:
-    log = open_log(*sources)
-    try:
-        return list(_checks(log, verify(log), virtual=True))
-    except ScenarioError as error:  # a law from outside that is not there
-        return [_records_line(log), VerdictLine("executed again", f"cannot be: {error}", False)]
-
-
-def checked(log: Log, *, virtual: bool, progress: Progress | None = None) -> Checked:
-    """Returns what executing a log again showed.
-
-    Args:
-        log: the log.
-        virtual: whether to compare it with virtual time as well.
-        progress: told how many records are done, and how many there are.
-
-    Raises:
-        LogError: a record cannot be read.
-        ScenarioError: a law from outside is not there.
-    """
-    verdict = verify(log, progress)
-    lines = list(_checks(log, verdict, virtual=virtual, progress=progress))
-    # whether a log is complete is not what its execution shows: reported, and no failure of it
-    return Checked(
-        verdict, [line._replace(passed=True) if line.label == _RECORDS else line for line in lines]
-    )
-
-
-def results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
-    """Makes a folder for results.
-
-    Args:
-        folder: which one, or None for the next free `runs/NAME-N`.
-        name: what the run is called.
-        force: whether a folder that holds something may be used.
-
-    Raises:
-        UsageError: it holds something, or cannot be made.
-    """
-    chosen = folder if folder is not None else _next_free(Path("runs"), name)
-    try:
-        if not force and chosen.exists() and any(chosen.iterdir()):
-            raise UsageError(f"{chosen}: holds something; choose another folder, or use --force")
-        chosen.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{chosen}: cannot be made or read: {error.strerror}") from None
-    return chosen
-
-
-def _next_free(parent: Path, name: str) -> Path:
-    return next(path for n in itertools.count(1) if not (path := parent / f"{name}-{n:03d}").exists())
-
-
-def scenario_facts(scenario: Scenario) -> list[str]:
-    """Returns what a valid scenario says, and what follows from it."""
-    beta = scenario.beta
-    weights = (
-        "none: alpha is reducible, some site's weight is zero"
-        if beta is None
-        else ", ".join(f"{name} {weight:.4g}" for name, weight in zip(scenario.names, beta, strict=True))
-    )
-    return [
-        f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
-        f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
-        + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
-        *_link_facts(scenario),
-        f"beta, the left null vector of Upsilon: {weights}",
-        *(f"assumed: {text}" for text in scenario.assumed),
-    ]
-
-
-def _link_facts(scenario: Scenario) -> Iterator[str]:
-    """Yields what the links do: in one line where all do the same."""
-    words = {name: link.describe() for name, link in scenario.links.items()}
-    if len(set(words.values())) == 1:
-        yield f"every link: {next(iter(words.values()))}"
-        return
-    for name, text in words.items():
-        yield f"link {name}: {text}"
-
-
-def _checks(
-    log: Log, verdict: Verdict, *, virtual: bool, progress: Progress | None = None
-) -> Iterator[VerdictLine]:
-    yield _records_line(log)
-    yield from (VerdictLine("law from outside", str(law), True) for law in outside_laws(log.scenario))
-    yield _verify_line(verdict, _standing(log))
-    if log.session.get("scenario_sha256") != log.scenario_sha256:
-        yield VerdictLine("scenario", "is not the one whose hash the log names: it was changed", False)
-    if virtual and (standing := _standing(log)):
-        yield VerdictLine("virtual time", f"is another run: {standing} as recorded, and did not react", True)
-    elif virtual:
-        twins = compare_with_virtual(log, progress)
-        yield _twin_line("virtual time fed with the log's arrivals", twins.fed, None)
-        why = "a link was measured, not modelled" if log.scenario.measured else ""
-        why = "an arm was outside of the program" if log.scenario.external else why
-        if why and log.driver != "virtual":
-            yield VerdictLine("plain virtual time", f"is another run: {why}", True)
-            return
-        late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
-        yield _twin_line(
-            f"plain virtual time ({late})", twins.plain, twins.late[0].due_tick if twins.late else None
-        )
-
-
-def _records_line(log: Log) -> VerdictLine:
-    """Says how many records there are of how many."""
-    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    have = sum(len(log[name]) for name in log.sites)
-    want = sum(made.get(name, 0) for name in log.sites)
-    silent = [name for name in log.sites if name not in made]
-    text = f"{have}/{want} in the file" if not silent else f"{have} in the file"
-    if silent:
-        text += f"; {', '.join(silent)} never said how many ticks were made"
-    if log.damaged:
-        text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
-    elif not log.complete:
-        text += "; the file was not finished"
-    return VerdictLine(_RECORDS, text, not silent and have == want and log.complete)
-
-
-def _standing(log: Log) -> str:
-    """Says which sites an open-loop rerun did not execute, if the log is one; "" where all can be."""
-    others = [name for name in log.sites if name not in executed_sites(log)]
-    return f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
-
-
-def _verify_line(verdict: Verdict, standing: str) -> VerdictLine:
-    how = "whole runs, bit for bit" if verdict.whole_run else "tick by tick to 1e-9: another platform made it"
-    text = f"{verdict.identical}/{verdict.records} records identical ({how})"
-    if verdict.gaps:
-        text += f"; no records of {_gaps_text(verdict.gaps)}"
-    if standing:
-        text += f"; {standing} as recorded, against other samples than the file has"
-    if verdict.unjudged:
-        text += f"; {verdict.unjudged} behind gaps could not be judged"
-    if verdict.first:
-        text += f"; {verdict.differing} differ, the first: {verdict.first}"
-    if not verdict.records:
-        return VerdictLine("executed again", "no records to execute", False)
-    return VerdictLine("executed again", text, verdict.passed)
-
-
-def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Names every gap, by site; of very many the first ones."""
-    texts = []
-    left = MOST_GAPS
-    for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):
-        ranges = [f"{first}-{last}" if last > first else f"{first}" for _, first, last in group]
-        if left > 0:
-            texts.append(f"{site} {', '.join(ranges[:left])}")
-        left -= len(ranges)
-    more = f" and {-left} more ranges, which --json names" if left < 0 else ""
-    return "; ".join(texts) + more
-
-
-def _twin_line(label: str, comparison: Comparison, late_from: int | None) -> VerdictLine:
-    """A difference is excused only from the tick at which the first late sample was due."""
-    first = comparison.first
-    text = f"{comparison.identical}/{comparison.records} records identical"
-    if first is None:
-        return VerdictLine(label, text, True)
-    excused = late_from is not None and first.tick >= late_from
-    return VerdictLine(label, f"{text}; the first that differs: {first}", excused)
-
-
-MOST_GAPS = 60
-"""Gaps that a line names."""
-_RECORDS = "records"
 _COLUMNS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.log_editing import opened, recorded
-from trilat_net.conclusion import checked
+from trilat_net.checking import checked
 from trilat_net.errors import UsageError
 from trilat_net.experiment import compare_with_virtual, verify
 from trilat_net.log.reader import open_log

@@ -67,7 +67,7 @@ def verify(
 ) -> None:
     """Executes every site again from a log, and compares every computed field of every record."""
     from ..analysis.notes import run_lines
-    from ..conclusion import checked
+    from ..checking import checked
 
     log = opened(*files)
     tell_outside_laws(log)
@@ -96,7 +96,8 @@ def report(
     force: ForceOption = False,
 ) -> None:
     """Makes the figures, the page and the summary of a log."""
-    from ..conclusion import conclude, results_folder
+    from ..conclusion import conclude
+    from ..results import results_folder
 
     log = opened(*files)  # before a folder is made for it
     tell_outside_laws(log, needed=False)

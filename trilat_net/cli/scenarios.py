@@ -52,7 +52,7 @@ def scenario_check(
     overrides: SetOption = None,
 ) -> None:
     """Says whether a scenario is valid, and what follows from it."""
-    from ..conclusion import scenario_facts
+    from ..scenario.facts import scenario_facts
 
     for line in scenario_facts(chosen_scenario(file, overrides, None, None)):
         out.print(escape(line), soft_wrap=True)

@@ -51,7 +51,8 @@ def demo(
     from sites.demo import run_demo, session_name
     from sites.display import Display
 
-    from ..conclusion import conclude, results_folder
+    from ..conclusion import conclude
+    from ..results import results_folder
 
     chosen = chosen_scenario(scenario, overrides, duration, seed)
     results = results_folder(folder, chosen.name, force=force)

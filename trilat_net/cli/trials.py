@@ -116,8 +116,8 @@ def _run_live(batch: "list[Trial]") -> "Report":
     from sites.demo import run_demo
     from sites.display import Display
 
-    from ..conclusion import results_folder
     from ..net.clock import SystemClock
+    from ..results import results_folder
     from ..trial.live import judged_log
     from ..trial.report import Report
 

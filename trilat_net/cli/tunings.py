@@ -29,7 +29,7 @@ def tune(asked: "Plan", folder: Path | None, jobs: int | None, *, force: bool, a
         force: whether a folder that holds something may be used.
         as_json: whether to print it as JSON.
     """
-    from ..conclusion import results_folder
+    from ..results import results_folder
     from ..tuning.facts import facts
     from ..tuning.report import write
 

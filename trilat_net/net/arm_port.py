@@ -7,7 +7,8 @@ that counts, there is None, and the arm is to brake.
     with ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:
         while not port.over:
             port.send(*robot.joints())
-            robot.apply(port.torque() or (0.0, 0.0))
+            tau = port.torque()
+            robot.brake() if tau is None else robot.apply(tau)
             robot.wait()
 """
 
