@@ -27,6 +27,8 @@ from .report import Report
 from .trial import Result, Trial, trials
 from .worker import Answer
 
+WAKE_S = 0.5
+"""How often who waits looks up: Ctrl-C is heard then at the latest, whichever thread it reached."""
 _PACKAGES = str(Path(__file__).resolve().parents[2])
 
 
@@ -104,8 +106,6 @@ class _Crew:
         ]
 
     def __enter__(self) -> "_Crew":
-        for thread in self._threads:
-            thread.start()
         return self
 
     def __exit__(
@@ -114,7 +114,8 @@ class _Crew:
         for hand in self._hands:
             hand.dismiss()
         for thread in self._threads:
-            thread.join()
+            if thread.ident is not None:
+                thread.join()
 
     def _work(self, hand: "_Hand") -> None:
         while True:
@@ -130,9 +131,16 @@ class _Crew:
 
     def results(self, done: Callable[[Result], None]) -> list[Result]:
         """Returns every result, in the order of the trials."""
+        for (
+            thread
+        ) in self._threads:  # not before the context is entered: who is interrupted here is dismissed
+            thread.start()
         found: dict[int, Result] = {}
         while len(found) < len(self._trials):
-            n, result = self._done.get()
+            try:
+                n, result = self._done.get(timeout=WAKE_S)
+            except queue.Empty:
+                continue
             if isinstance(result, Exception):
                 raise result
             found[n] = result
