@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.arm import JOINTS, Array
 from ..core.grid import NS_PER_S
-from ..log.reader import Ints, Log
+from ..log.reader import Ints, Log, SiteLog
 
 Bools = NDArray[np.bool_]
 COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
@@ -96,16 +96,28 @@ def _healthy(log: Log, site: str) -> Ints:
 
 def _track(log: Log, site: str, rows: Ints, end_s: float) -> Track:
     part = log[site]
+    last = int(np.floor(end_s * part.rate_hz + 1e-6))
+    return on_grid(part, rows, min(last, int(part.tick[rows[-1]])))
+
+
+def on_grid(part: SiteLog, rows: Ints, last: int) -> Track:
+    """Returns records on every tick from the first of them on, those that are missing filled in and marked.
+
+    Args:
+        part: the site's records.
+        rows: which of them, one for a tick, in order, at least one.
+        last: the last tick; not after that of the last row.
+    """
+    part.prepare(*COLUMNS)
     tick = part.tick[rows]
     first = int(tick[0])
-    last = min(int(np.floor(end_s * part.rate_hz + 1e-6)), int(tick[-1]))
     grid = np.arange(first, max(last, first) + 1)
-    before = np.clip(np.searchsorted(tick, grid, side="right") - 1, 0, None)
-    known = tick[before] == grid
-    follows: Bools = part.mode[rows] == "run"
+    before = np.searchsorted(tick, grid, side="right") - 1
+    known: Bools = tick[before] == grid
+    follows: Bools = (part.mode[rows] == "run")[before]
     columns = {name: _filled(getattr(part, name)[rows], tick, grid, known) for name in COLUMNS}
     used = {peer: part.used[peer][rows][before] for peer in part.peers}
-    return Track(site, part.rate_hz, first, known, follows[before], used=used, **columns)
+    return Track(part.name, part.rate_hz, first, known, follows, used=used, **columns)
 
 
 def _filled(values: Array, tick: Ints, grid: Ints, known: Bools) -> Array:

@@ -5,9 +5,8 @@ Law: what a gap has taken is filled in so that times stay times, and is marked; 
 
 import numpy as np
 
-from ..certificate.track import COLUMNS, Bools, Track
-from ..core.arm import Array
-from ..log.reader import Ints, Log, SiteLog
+from ..certificate.track import Bools, Track, on_grid
+from ..log.reader import Log, SiteLog
 
 END_S = 1.0
 """Length of the end of a run, where a quantity speaks of it: its last second."""
@@ -25,27 +24,10 @@ def tracks(log: Log) -> dict[str, Track]:
 def _track(part: SiteLog) -> Track | None:
     if not len(part):
         return None
-    part.prepare(*COLUMNS)
-    mode = part.mode
     ticks, rows = np.unique(part.tick, return_index=True)
-    healthy = mode[rows] != "diverged"
+    healthy = part.mode[rows] != "diverged"
     ticks, rows = ticks[healthy], rows[healthy]
-    if not len(rows):
-        return None
-    grid = np.arange(int(ticks[0]), int(ticks[-1]) + 1)
-    before = np.searchsorted(ticks, grid, side="right") - 1
-    known: Bools = ticks[before] == grid
-    columns = {name: _filled(getattr(part, name)[rows], ticks, grid, known) for name in COLUMNS}
-    used = {peer: part.used[peer][rows][before] for peer in part.peers}
-    follows: Bools = (mode[rows] == "run")[before]
-    return Track(part.name, part.rate_hz, int(grid[0]), known, follows, used=used, **columns)
-
-
-def _filled(values: Array, tick: Ints, grid: Ints, known: Bools) -> Array:
-    """Returns values on the grid; what is missing is interpolated."""
-    if known.all():
-        return values
-    return np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
+    return on_grid(part, rows, int(ticks[-1])) if len(rows) else None
 
 
 def steps(track: Track) -> Bools:
