@@ -14,7 +14,7 @@ from ..core import dominance
 from ..errors import ScenarioError
 from .links import LINKS
 from .presets import PRESETS
-from .tables import Table, fields, known, nearest, one_of
+from .tables import Table, fields, is_number, known, nearest, one_of
 from .timeline import Change
 from .traces import read_trace
 
@@ -25,7 +25,7 @@ _FILE = ("file", "of")
 def resolve_row(row: Table, names: list[str], own: int, path: str) -> Table:
     """Returns one row of the dominance matrix with every peer's share, checked."""
     for peer, share in row.items():
-        if isinstance(share, bool) or not isinstance(share, int | float):
+        if not is_number(share):
             raise ScenarioError(f"must be a number, is {share!r}", path=f"{path}.{peer}")
     fault = dominance.row_fault(np.array([float(row.get(peer, 0.0)) for peer in names]), own)
     if fault:
@@ -118,7 +118,7 @@ def resolve_timeline(written: Any, links: Table, names: list[str]) -> list[Table
         path = f"timeline[{n}]"
         change = dict(known(entry, fields(Change), path))
         at_s = change.get("at_s")
-        if not isinstance(at_s, int | float) or isinstance(at_s, bool):
+        if not is_number(at_s):
             raise ScenarioError("must be a time in s", path=f"{path}.at_s")
         if at_s < before_s:
             raise ScenarioError(

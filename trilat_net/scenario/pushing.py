@@ -13,7 +13,7 @@ import msgspec
 
 from ..errors import ScenarioError
 from .actors import HANDS, SURROUNDINGS
-from .tables import Table, fields, known, one_of
+from .tables import Table, fields, is_number, known, one_of
 
 _PAIRS = ("from_rad", "to_rad", "stiffness_nm_rad", "damping_nm_s_rad", "peak_nm")
 _PLANE = ("stiffness_n_m", "damping_n_s_m")
@@ -66,7 +66,7 @@ def _resolved(entry: Any, kinds: Mapping[str, type[msgspec.Struct]], site: Table
     kind = _kind(entry, kinds, path)
     both = (*_PAIRS, *(_PLANE if kind == "tip_spring" else ()))
     table = {
-        key: [value] * 2 if key in both and _is_number(value) else value
+        key: [value] * 2 if key in both and is_number(value) else value
         for key, value in known(entry, ("kind", *fields(kinds[kind])), path).items()
     }
     if kind == "spring":
@@ -120,15 +120,11 @@ def _wanted(key: str, table: Table) -> str:
     return f"{_PLANE_GAINS[table['kind']]}, {('N/m', 'N s/m')[_PLANE.index(key)]}"
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _tip(site: Table) -> list[float]:
     """Returns where the tip is at the start, m; what is no number is refused later, with its path."""
     lengths = [site["arm"].get("l1_m", 1.0), site["arm"].get("l2_m", 1.0)]
     q0 = site["q0_rad"]
-    if not (isinstance(q0, list) and len(q0) == 2 and all(map(_is_number, [*q0, *lengths]))):
+    if not (isinstance(q0, list) and len(q0) == 2 and all(map(is_number, [*q0, *lengths]))):
         return [0.0, 0.0]
     turned = q0[0] + q0[1]
     return [

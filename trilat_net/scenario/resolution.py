@@ -19,7 +19,7 @@ from .laws import LAWS
 from .own_law import CODE, source_sha256
 from .pushing import resolve_actors
 from .site import Arm, Limits, OnStale, SiteSpec
-from .tables import Table, fields, finite, known, one_of
+from .tables import Table, fields, finite, is_number, known, one_of
 from .window import check_keys as check_windows
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -72,9 +72,7 @@ MAX_SITES = 32
 def _vectors(table: Table) -> Table:
     """Writes a single number out where a vector is wanted."""
     return {
-        key: [value] * _VECTORS[key]
-        if key in _VECTORS and isinstance(value, int | float) and not isinstance(value, bool)
-        else value
+        key: [value] * _VECTORS[key] if key in _VECTORS and is_number(value) else value
         for key, value in table.items()
     }
 

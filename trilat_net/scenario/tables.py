@@ -6,13 +6,18 @@ Law: an error names the path of the key in the shape in which it was written, an
 import difflib
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import msgspec
 
 from ..errors import ScenarioError
 
 Table = dict[str, Any]
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """True where what an author wrote is a number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def nearest(word: str, valid: Sequence[str]) -> str:
