@@ -81,9 +81,10 @@ def open_viewer(
             path = named
         layout = Path(folder) / "layout.rbl"
         save_layout(board(channels_of(path)), path.stem, layout)
-        code = (run or _run)(_command(show, [path, layout], say), {**_QUIET, **os.environ})
-    if code:
-        raise RunFailed(f"Rerun ended with exit code {code}")
+        for command in _commands(show, path, layout, say):
+            code = (run or _run)([*_PROGRAM, *command], {**_QUIET, **os.environ})
+            if code:
+                raise RunFailed(f"Rerun ended with exit code {code}")
 
 
 def application(path: Path) -> str:
@@ -102,17 +103,30 @@ def _needs_display() -> None:
         raise UsageError("there is no display here; show it in a browser with --web, or keep it with --save")
 
 
-def _command(show: Show, files: Sequence[Path], say: Callable[[str], None]) -> list[str]:
-    """Returns what Rerun is called with; it listens on this machine alone."""
-    port = _free_port()
-    command = [*_PROGRAM, *map(str, files), "--bind", _OWN, "--port", str(port)]
+def _commands(show: Show, log: Path, layout: Path, say: Callable[[str], None]) -> list[list[str]]:
+    """Returns what Rerun is called with, one after the other; it listens on this machine alone."""
     if show.save is not None:
-        return [*command, "--save", str(show.save)]
+        return _saving(log, layout, show.save)
+    port = _free_port()
+    command = [str(log), str(layout), "--bind", _OWN, "--port", str(port)]
     if show.web:
         page = _free_port()
         say(f"open http://{_OWN}:{page}/?url=rerun%2Bhttp%3A%2F%2F{_OWN}%3A{port}%2Fproxy; Ctrl-C ends it")
-        return [*command, "--serve-web", "--web-viewer-port", str(page)]
-    return command
+        return [[*command, "--serve-web", "--web-viewer-port", str(page)]]
+    return [command]
+
+
+def _saving(log: Path, layout: Path, save: Path) -> list[list[str]]:
+    """Returns how Rerun writes what it would show.
+
+    Its own `--save` of several files ends with the first of them that was read, and what the others had not
+    yet given is missing (measured with 0.41: up to all of a log).
+    """
+    recording = layout.with_name("log.rrd")
+    return [
+        ["mcap", "convert", str(log), "--application-id", log.stem, "--output", str(recording)],
+        ["rrd", "merge", str(recording), str(layout), "--output", str(save)],
+    ]
 
 
 def _free_port() -> int:
