@@ -6,8 +6,8 @@ Hands and walls count with r = qd + Lambda e, not with qd: that is what the theo
 
 import numpy as np
 
-from ..core.arm import JOINTS, Array
-from ..core.exogenous import Actor, add_torque, rows_of
+from ..core.arm import Array
+from ..core.exogenous import Actor, rows_of, torque_of
 from ..scenario import SiteSpec
 from .dynamics import inertia_times, regressor
 from .equations import Equations
@@ -47,11 +47,10 @@ class Pushed:
         """Returns what actors do at the logged states, shape (K, 2), N m."""
         torque = np.zeros_like(self._track.q)
         rows, table = rows_of(tuple(actors))
-        work = np.zeros((6, JOINTS))
         for row in rows:
             states = zip(self._track.t_s.tolist(), self._track.q, self._track.qd, torque, strict=True)
             for t_s, q, qd, total in states:
-                add_torque(t_s, q, qd, self._lengths, row, table, work, total)
+                total += torque_of(t_s, q, qd, self._lengths, row, table)
         return torque
 
 
