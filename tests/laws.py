@@ -21,22 +21,14 @@ class Adaptive:
 
     def torque(self, now: Now) -> Sequence[float]:
         q, qd, q_des, qd_des = map(np.array, (now.q, now.qd, now.q_des, now.qd_des))
-        e, ed, r, Yr, tau, Y = (
-            np.zeros(2),
-            np.zeros(2),
-            np.zeros(2),
-            np.zeros(5),
-            np.zeros(2),
-            np.zeros((2, 5)),
-        )
-        control.errors(q, qd, q_des, qd_des, self._Lambda, e, ed, r)
-        regressor(self._facts.g_m_s2, q, qd, -self._Lambda * e, -self._Lambda * ed, Y)
-        control.regressor_transpose_times(Y, r, Yr)
+        e, ed, r = control.errors(q, qd, q_des, qd_des, self._Lambda)
+        v, a = -self._Lambda * e, -self._Lambda * ed
+        Y = regressor(self._facts.g_m_s2, q, qd, v, a)
+        Yr = np.array(control.regressor_transpose_times(Y, r))
         if now.k:
             self.theta_hat = self.theta_hat - 0.5 / self._facts.rate_hz * (self._Yr + Yr)
         self._Yr = Yr
-        control.torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm, tau)
-        return tau.tolist()
+        return control.torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm)
 
     def memory(self) -> Sequence[float]:
         return [*self._Yr, *self.theta_hat]

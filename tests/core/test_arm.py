@@ -16,27 +16,19 @@ g_values = st.sampled_from([0.0, 1.62, 9.81])
 
 
 def M_of(theta: Array, q: Array) -> Array:
-    M = np.full((2, 2), np.nan)
-    arm.inertia(theta, q, M)
-    return M
+    return np.array(arm.inertia(theta, q))
 
 
 def C_of(theta: Array, q: Array, qd: Array) -> Array:
-    C = np.full((2, 2), np.nan)
-    arm.coriolis(theta, q, qd, C)
-    return C
+    return np.array(arm.coriolis(theta, q, qd))
 
 
 def G_of(theta: Array, g: float, q: Array) -> Array:
-    G = np.full(2, np.nan)
-    arm.gravity(theta, g, q, G)
-    return G
+    return np.array(arm.gravity(theta, g, q))
 
 
 def Y_of(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
-    Y = np.full((2, 5), np.nan)
-    arm.regressor(g, q, qd, v, a, Y)
-    return Y
+    return np.array(arm.regressor(g, q, qd, v, a))
 
 
 def near(a: Array, b: Array, scale: float) -> bool:
@@ -126,8 +118,7 @@ def test_forward_dynamics_solve_the_equation_of_motion(
     a: Links, g: float, q: Array, qd: Array, torque: Array
 ) -> None:
     """Eq. (8): M qdd + C qd + G = tau - tau_x."""
-    qdd = np.full(2, np.nan)
-    arm.forward_dynamics(parameters(a), g, q, qd, torque, qdd)
+    qdd = np.array(arm.forward_dynamics(parameters(a), g, q, qd, torque))
     M = physics.inertia(a, q)
     rest = M @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q) - torque
     terms = np.abs(M).max() * np.abs(qdd).max() + 400 * size(a) + 200
@@ -136,7 +127,6 @@ def test_forward_dynamics_solve_the_equation_of_motion(
 
 @given(a=links, q=angles)
 def test_the_tip_is_where_the_links_lead(a: Links, q: Array) -> None:
-    xy = np.full((2, 2), np.nan)
-    arm.forward_kinematics(a.l1_m, a.l2_m, q, xy)
+    xy = np.array(arm.elbow_and_tip((a.l1_m, a.l2_m), q))
     ends = physics.centres(a._replace(lc1_m=a.l1_m, lc2_m=a.l2_m), q)
     assert near(xy, np.array(ends), 10.0)

@@ -17,10 +17,9 @@ NO_LIMIT = 1e300
 @given(q=angles, qd=speeds, q_des=angles, qd_des=speeds, Lambda=gains)
 def test_errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array) -> None:
     """Eq. (9), (18), (10)."""
-    e, ed, r = np.empty((3, 2))
-    control.errors(q, qd, q_des, qd_des, Lambda, e, ed, r)
-    assert e.tolist() == (q - q_des).tolist()
-    assert ed.tolist() == (qd - qd_des).tolist()
+    e, ed, r = control.errors(q, qd, q_des, qd_des, Lambda)
+    assert list(e) == (q - q_des).tolist()
+    assert list(ed) == (qd - qd_des).tolist()
     assert r == pytest.approx(qd + Lambda * (q - q_des), rel=1e-14)
 
 
@@ -30,9 +29,8 @@ def test_torque(
 ) -> None:
     """Eq. (11) equals Eq. (13): estimated M, C and G of a wrong arm, and the two damping terms."""
     r = qd + Lambda * e
-    Y, tau = np.empty((2, 5)), np.empty(2)
-    regressor(9.81, q, qd, -Lambda * e, -Lambda * ed, Y)
-    control.torque(Y, parameters(a), Kp, Kd, r, ed, NO_LIMIT, tau)
+    Y = regressor(9.81, q, qd, -Lambda * e, -Lambda * ed)
+    tau = np.array(control.torque(Y, parameters(a), Kp, Kd, r, ed, NO_LIMIT))
     wanted = (
         -physics.inertia(a, q) @ (Lambda * ed)
         - physics.coriolis(a, q, qd) @ (Lambda * e)
@@ -45,10 +43,9 @@ def test_torque(
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
-    tau = np.empty(2)
     one, none = np.ones(2), np.zeros(2)
-    control.torque(np.zeros((2, 5)), np.zeros(5), one, 7.0 * one, none, ed, limit, tau)
-    assert tau.tolist() == np.clip(-7.0 * ed, -limit, limit).tolist()
+    tau = control.torque(((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit)
+    assert list(tau) == np.clip(-7.0 * ed, -limit, limit).tolist()
 
 
 @given(q=angles, qd=speeds, v=speeds, a=speeds, r=speeds, gain_s=st.floats(0, 0.1))
@@ -56,11 +53,11 @@ def test_the_estimate_goes_down_gamma_y_transpose_r(
     q: Array, qd: Array, v: Array, a: Array, r: Array, gain_s: float
 ) -> None:
     """Eq. (15)."""
-    Y, Yr = np.empty((2, 5)), np.empty(5)
-    regressor(9.81, q, qd, v, a, Y)
-    control.regressor_transpose_times(Y, r, Yr)
-    assert Yr == pytest.approx(Y.T @ r, abs=1e-11)
-    theta_hat, Gamma = np.arange(5.0), np.array([1.0, 0.5, 0.0, 2.0, 3.0])
-    control.estimate(theta_hat, gain_s, Gamma, Yr)
-    assert theta_hat == pytest.approx(np.arange(5.0) - gain_s * Gamma * (Y.T @ r), abs=1e-9)
+    Y = regressor(9.81, q, qd, v, a)
+    Yr = control.regressor_transpose_times(Y, r)
+    wanted = np.array(Y).T @ r
+    assert Yr == pytest.approx(wanted, abs=1e-11)
+    Gamma = np.array([1.0, 0.5, 0.0, 2.0, 3.0])
+    theta_hat = control.estimate(np.arange(5.0), gain_s, Gamma, Yr)
+    assert theta_hat == pytest.approx(np.arange(5.0) - gain_s * Gamma * wanted, abs=1e-9)
     assert theta_hat[2] == 2.0

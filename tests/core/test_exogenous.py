@@ -20,9 +20,7 @@ stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
 def torque(
     t_s: float, q: Array, qd: Array, *actors: Actor, sampled: bool = False, lengths: Array = LENGTHS
 ) -> Array:
-    result = np.full(2, math.nan)
-    torque_on_arm(t_s, q, qd, lengths, *rows_of(actors), int(sampled), np.zeros((6, 2)), result)
-    return result
+    return np.array(torque_on_arm(t_s, q, qd, lengths, *rows_of(actors), int(sampled)))
 
 
 def tip(q: Array) -> Array:
@@ -120,8 +118,7 @@ def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: tuple
 @given(start=st.floats(-5, 5), length=st.floats(0.01, 5), x=st.floats(0, 1))
 def test_a_move_has_minimum_jerk(start: float, length: float, x: float) -> None:
     """It is the fifth-order polynomial that begins and ends at rest without acceleration, and its rate."""
-    way = np.empty(2)
-    minimum_jerk(start + x * length, start, start + length, way)
+    way = minimum_jerk(start + x * length, start, start + length)
     conditions = np.zeros((6, 6))
     for row, (at, derivative) in enumerate((at, d) for at in (0.0, 1.0) for d in range(3)):
         for power in range(derivative, 6):

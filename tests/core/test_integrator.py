@@ -9,7 +9,7 @@ from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, speeds
 from trilat_net.core.arm import Links, parameters
 from trilat_net.core.exogenous import Actor, Acts, rows_of
-from trilat_net.core.integrator import STAGE_ROWS, advance
+from trilat_net.core.integrator import advance
 
 ARM = Links(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
 LENGTHS = np.array([1.0, 0.9])
@@ -19,10 +19,10 @@ G = 9.81
 def carried(
     q0: Array, qd0: Array, h_s: float, periods: int, u: Array, actors: tuple[Actor, ...] = ()
 ) -> tuple[Array, Array]:
-    q, qd, work = q0.copy(), qd0.copy(), np.zeros((STAGE_ROWS, 2))
+    q, qd, who = (q0[0], q0[1]), (qd0[0], qd0[1]), rows_of(actors)
     for k in range(periods):
-        advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, LENGTHS, *rows_of(actors), work)
-    return q, qd
+        q, qd = advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, LENGTHS, *who)
+    return np.array(q), np.array(qd)
 
 
 def energy(q: Array, qd: Array) -> float:

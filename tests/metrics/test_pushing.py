@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from tests.certificate import runs
 from trilat_net.analysis.actors import tip_of, torque_of
-from trilat_net.core.exogenous import Actor, Acts, add_torque, rows_of
+from trilat_net.core import exogenous
+from trilat_net.core.exogenous import Actor, Acts, rows_of
 from trilat_net.metrics.pushing import pushed, script_of
 from trilat_net.metrics.rows import tracks
 
@@ -35,9 +36,7 @@ def test_every_actor_does_what_the_core_says(actor: Actor, states: list[tuple[fl
     rows, table = rows_of((actor,))
     expected = np.zeros_like(q)
     for n in range(len(states)):
-        add_torque(
-            float(t_s[n]), q[n], qd[n], np.array(lengths), rows[0], table, np.zeros((6, 2)), expected[n]
-        )
+        expected[n] = exogenous.torque_of(float(t_s[n]), q[n], qd[n], lengths, rows[0], table)
     found = torque_of(actor, t_s, q, qd, tip_of(lengths, q, qd))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..core.arm import JOINTS, Array, forward_kinematics
+from ..core.arm import JOINTS, Array, elbow_and_tip
 from ..log.reader import Log
 from ..scenario import Arm
 from . import quantities, style
@@ -44,7 +44,7 @@ def joints_m(arm: Arm, q: Array) -> Array:
     """
     points = np.zeros((len(q), 1 + JOINTS, 2))
     for pose, angles in zip(points, q, strict=True):
-        forward_kinematics(arm.l1_m, arm.l2_m, angles, pose[1:])
+        pose[1:] = elbow_and_tip((arm.l1_m, arm.l2_m), angles)
     return points
 
 

@@ -9,111 +9,129 @@ force reflection after Lawrence, "Stability and transparency in bilateral teleop
 and Automation 9 (1993). Gains are diagonal and stand as vectors.
 """
 
-from .arm import Array, gravity
+from .arm import gravity
 from .jit import leaf
+from .vectors import Five, Pair, Vector
 
 
 @leaf
-def errors(
-    q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array, e: Array, ed: Array, r: Array
-) -> None:
-    """Writes e, its derivative and r: Eq. (9), (18), (10).
+def errors(q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector) -> tuple[Pair, Pair, Pair]:
+    """Returns e, its derivative and r = qd + Lambda e: Eq. (9), (18), (10).
 
     Args:
-        q: joint angles, shape (n,), rad.
-        qd: joint velocities, shape (n,), rad/s.
-        q_des: reference q_id of Eq. (6), shape (n,), rad.
-        qd_des: its derivative, shape (n,), rad/s.
-        Lambda: shape (n,), 1/s.
-        e: position error, shape (n,), rad; written.
-        ed: its derivative, shape (n,), rad/s; written.
-        r: qd + Lambda e, shape (n,), rad/s; written.
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
+        q_des: reference q_id of Eq. (6), shape (2,), rad.
+        qd_des: its derivative, shape (2,), rad/s.
+        Lambda: shape (2,), 1/s.
     """
-    for i in range(q.shape[0]):
-        e[i] = q[i] - q_des[i]
-        ed[i] = qd[i] - qd_des[i]
-        r[i] = qd[i] + Lambda[i] * e[i]
+    e = (q[0] - q_des[0], q[1] - q_des[1])
+    ed = (qd[0] - qd_des[0], qd[1] - qd_des[1])
+    return e, ed, (qd[0] + Lambda[0] * e[0], qd[1] + Lambda[1] * e[1])
 
 
 @leaf
-def regressor_transpose_times(Y: Array, r: Array, Yr: Array) -> None:
-    """Writes Y' r, shape (p,), what drives the estimate in Eq. (15), for Y of shape (n, p)."""
-    for p in range(Y.shape[1]):
-        total = 0.0
-        for i in range(Y.shape[0]):
-            total += Y[i, p] * r[i]
-        Yr[p] = total
+def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
+    """Returns Y' r, shape (5,), what drives the estimate in Eq. (15), for the two rows of Y."""
+    a, b = Y
+    return (
+        a[0] * r[0] + b[0] * r[1],
+        a[1] * r[0] + b[1] * r[1],
+        a[2] * r[0] + b[2] * r[1],
+        a[3] * r[0] + b[3] * r[1],
+        a[4] * r[0] + b[4] * r[1],
+    )
 
 
 @leaf
-def estimate(theta_hat: Array, gain_s: float, Gamma: Array, Yr: Array) -> None:
-    """Advances theta_hat by -gain Gamma Y' r, Eq. (15) over a time `gain_s`.
+def estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
+    """Returns theta_hat - gain Gamma Y' r, Eq. (15) over a time `gain_s`.
 
     Args:
-        theta_hat: estimate, shape (p,), units of theta; changed in place.
+        theta_hat: estimate, shape (5,), units of theta.
         gain_s: the time over which this value of Y' r counts, s.
-        Gamma: adaptation gain of each parameter, shape (p,).
-        Yr: Y' r, shape (p,).
+        Gamma: adaptation gain of each parameter, shape (5,).
+        Yr: Y' r, shape (5,).
     """
-    for p in range(theta_hat.shape[0]):
-        theta_hat[p] -= gain_s * Gamma[p] * Yr[p]
+    return (
+        theta_hat[0] - gain_s * Gamma[0] * Yr[0],
+        theta_hat[1] - gain_s * Gamma[1] * Yr[1],
+        theta_hat[2] - gain_s * Gamma[2] * Yr[2],
+        theta_hat[3] - gain_s * Gamma[3] * Yr[3],
+        theta_hat[4] - gain_s * Gamma[4] * Yr[4],
+    )
+
+
+@leaf
+def limited(torque: float, limit: float) -> float:
+    """Returns a torque held within +-limit, N m."""
+    return min(max(torque, -limit), limit)
 
 
 @leaf
 def torque(
-    Y: Array, theta_hat: Array, Kp: Array, Kd: Array, r: Array, ed: Array, limit: float, tau: Array
-) -> None:
-    """Writes tau = Y theta_hat - Kp r - Kd ed, Eq. (13), held within +-limit.
+    Y: tuple[Five, Five], theta_hat: Vector, Kp: Vector, Kd: Vector, r: Vector, ed: Vector, limit: float
+) -> Pair:
+    """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), N m, held within +-limit.
 
     Args:
-        Y: regressor Y(q, qd, -Lambda e, -Lambda ed), shape (n, p).
-        theta_hat: estimate, shape (p,).
-        Kp: shape (n,), N m s/rad.
-        Kd: shape (n,), N m s/rad.
-        r: shape (n,), rad/s.
-        ed: shape (n,), rad/s.
+        Y: regressor Y(q, qd, -Lambda e, -Lambda ed), two rows.
+        theta_hat: estimate, shape (5,).
+        Kp: shape (2,), N m s/rad.
+        Kd: shape (2,), N m s/rad.
+        r: shape (2,), rad/s.
+        ed: shape (2,), rad/s.
         limit: largest torque of a joint, N m.
-        tau: control torque, shape (n,), N m; written.
     """
-    for i in range(tau.shape[0]):
-        total = 0.0
-        for p in range(theta_hat.shape[0]):
-            total += Y[i, p] * theta_hat[p]
-        total -= Kp[i] * r[i] + Kd[i] * ed[i]
-        tau[i] = min(max(total, -limit), limit)
+    total_0 = total_1 = 0.0
+    for p in range(5):
+        total_0 += Y[0][p] * theta_hat[p]
+        total_1 += Y[1][p] * theta_hat[p]
+    total_0 -= Kp[0] * r[0] + Kd[0] * ed[0]
+    total_1 -= Kp[1] * r[1] + Kd[1] * ed[1]
+    return limited(total_0, limit), limited(total_1, limit)
 
 
 @leaf
-def project(theta_hat: Array, low: Array, high: Array) -> None:
-    """Holds every parameter within its box, shape (p,) each, in place.
+def held(value: float, low: float, high: float) -> float:
+    """Returns a number held within a box."""
+    if value < low:
+        return low
+    return high if value > high else value
+
+
+@leaf
+def project(theta_hat: Vector, low: Vector, high: Vector) -> Five:
+    """Returns every parameter held within its box, shape (5,) each.
 
     For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)' Gamma^-1 (theta_hat -
     theta) rise, so that V' <= 0 stands.
     """
-    for p in range(theta_hat.shape[0]):
-        if theta_hat[p] < low[p]:
-            theta_hat[p] = low[p]
-        elif theta_hat[p] > high[p]:
-            theta_hat[p] = high[p]
+    return (
+        held(theta_hat[0], low[0], high[0]),
+        held(theta_hat[1], low[1], high[1]),
+        held(theta_hat[2], low[2], high[2]),
+        held(theta_hat[3], low[3], high[3]),
+        held(theta_hat[4], low[4], high[4]),
+    )
 
 
 @leaf
 def damped_torque(
-    theta: Array,
+    theta: Vector,
     g: float,
-    K: Array,
-    d: Array,
-    Kd: Array,
-    k_f: Array,
-    q: Array,
-    qd: Array,
-    e: Array,
-    ed: Array,
-    felt: Array,
+    K: Vector,
+    d: Vector,
+    Kd: Vector,
+    k_f: Vector,
+    q: Vector,
+    qd: Vector,
+    e: Vector,
+    ed: Vector,
+    felt: Vector,
     limit: float,
-    tau: Array,
-) -> None:
-    """Writes tau = G(q) - K e - d qd - Kd ed + k_f felt, held within +-limit: the laws that know gravity.
+) -> Pair:
+    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, N m, within +-limit: the laws that know gravity.
 
     P+d has Kd = k_f = 0. For N sites with equal K and d per joint and one constant delay T its linearised
     loop is stable from d = abs(lambda_min(alpha)) K T on, for two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1
@@ -122,23 +140,18 @@ def damped_torque(
     Args:
         theta: the parameters that the law takes the arm to have, shape (5,).
         g: gravitational acceleration, m/s^2.
-        K: stiffness, shape (n,), N m/rad.
-        d: damping of the arm's own velocity, shape (n,), N m s/rad.
-        Kd: damping of the error's velocity, shape (n,), N m s/rad.
-        k_f: share of what the peers feel, shape (n,).
-        q: joint angles, shape (n,), rad.
-        qd: joint velocities, shape (n,), rad/s.
-        e: position error, shape (n,), rad.
-        ed: its derivative, shape (n,), rad/s.
-        felt: the torque on the peers' arms as it came, weighted by dominance, shape (n,), N m.
+        K: stiffness, shape (2,), N m/rad.
+        d: damping of the arm's own velocity, shape (2,), N m s/rad.
+        Kd: damping of the error's velocity, shape (2,), N m s/rad.
+        k_f: share of what the peers feel, shape (2,).
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
+        e: position error, shape (2,), rad.
+        ed: its derivative, shape (2,), rad/s.
+        felt: the torque on the peers' arms as it came, weighted by dominance, shape (2,), N m.
         limit: largest torque of a joint, N m.
-        tau: control torque, shape (n,), N m; written.
     """
-    gravity(theta, g, q, tau)
-    for i in range(tau.shape[0]):
-        total = tau[i] - K[i] * e[i] - d[i] * qd[i]
-        if Kd[i] != 0.0:
-            total -= Kd[i] * ed[i]
-        if k_f[i] != 0.0:
-            total += k_f[i] * felt[i]
-        tau[i] = min(max(total, -limit), limit)
+    G = gravity(theta, g, q)
+    total_0 = G[0] - K[0] * e[0] - d[0] * qd[0] - Kd[0] * ed[0] + k_f[0] * felt[0]
+    total_1 = G[1] - K[1] * e[1] - d[1] * qd[1] - Kd[1] * ed[1] + k_f[1] * felt[1]
+    return limited(total_0, limit), limited(total_1, limit)

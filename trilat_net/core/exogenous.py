@@ -13,9 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .arm import JOINTS, Array, tip, tip_jacobian
+from .arm import JOINTS, Array, elbow_and_tip, tip_jacobian
 from .delay import Row
 from .jit import leaf
+from .sines import sincos
+from .vectors import Pair, Vector
 
 
 class Acts(IntEnum):
@@ -109,38 +111,44 @@ def rows_of(actors: tuple[Actor, ...]) -> tuple[Actors, Table]:
 
 
 @leaf
-def minimum_jerk(t_s: float, start_s: float, end_s: float, way: Array) -> None:
-    """Writes how far a minimum-jerk move is: its share of the way, and the rate of that, 1/s.
+def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
+    """Returns how far a minimum-jerk move is: its share of the way, and the rate of that, 1/s.
 
     10 x^3 - 15 x^4 + 6 x^5 between start and end, after Flash and Hogan, "The coordination of arm
     movements", J. Neuroscience 5 (1985).
     """
     if t_s <= start_s:
-        way[0], way[1] = 0.0, 0.0
-    elif t_s >= end_s:
-        way[0], way[1] = 1.0, 0.0
-    else:
-        x = (t_s - start_s) / (end_s - start_s)
-        way[0] = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-        way[1] = 30.0 * x * x * (1.0 - x) * (1.0 - x) / (end_s - start_s)
+        return 0.0, 0.0
+    if t_s >= end_s:
+        return 1.0, 0.0
+    x = (t_s - start_s) / (end_s - start_s)
+    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x) / (end_s - start_s)
 
 
 @leaf
-def _spring(actor: Row, t_s: float, at: Array, speed: Array, work: Array, force: Array) -> None:
-    """Writes K (target - at) + B (its velocity - speed), per axis."""
-    minimum_jerk(t_s, actor.move_start_s, actor.move_end_s, work)
-    for i in range(at.shape[0]):
-        way = actor.b[i] - actor.a[i]
-        target = actor.a[i] + work[0] * way
-        force[i] = actor.K[i] * (target - at[i]) + actor.B[i] * (work[1] * way - speed[i])
+def _pulse(actor: Row, t_s: float) -> Pair:
+    """Returns peak * sin^2(pi (t - start) / (end - start))."""
+    s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
+    return actor.a[0] * (s * s), actor.a[1] * (s * s)
 
 
 @leaf
-def _tabled(actor: Row, t_s: float, table: Table, torque: Array) -> None:
-    """Adds a torque between its rows, linearly; nothing before the first and behind the last."""
+def _spring(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
+    """Returns K (target - at) + B (its velocity - speed), per axis."""
+    share, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+    way_0, way_1 = actor.b[0] - actor.a[0], actor.b[1] - actor.a[1]
+    return (
+        actor.K[0] * (actor.a[0] + share * way_0 - at[0]) + actor.B[0] * (rate * way_0 - speed[0]),
+        actor.K[1] * (actor.a[1] + share * way_1 - at[1]) + actor.B[1] * (rate * way_1 - speed[1]),
+    )
+
+
+@leaf
+def _tabled(actor: Row, t_s: float, table: Table) -> Pair:
+    """Returns a torque between its rows, linearly; nothing before the first and behind the last."""
     first, count = actor.table_first, actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
-        return
+        return 0.0, 0.0
     low, high = first, first + count - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -150,98 +158,81 @@ def _tabled(actor: Row, t_s: float, table: Table, torque: Array) -> None:
             high = middle
     span = table[high, 0] - table[low, 0]
     x = (t_s - table[low, 0]) / span if span > 0.0 else 0.0
-    for i in range(torque.shape[0]):
-        torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
+    return (
+        table[low, 1] + x * (table[high, 1] - table[low, 1]),
+        table[low, 2] + x * (table[high, 2] - table[low, 2]),
+    )
 
 
 @leaf
-def _in_the_plane(
-    actor: Row, t_s: float, q: Array, qd: Array, lengths: Array, work: Array, torque: Array
-) -> None:
-    """Adds J' F of a force at the tip: a hand's, or a wall's."""
-    at, speed, force = work[1], work[2], work[3]
-    J = work[4:6]
-    tip(lengths, q, at)
-    tip_jacobian(lengths, q, J)
-    for i in range(2):
-        speed[i] = J[i, 0] * qd[0] + J[i, 1] * qd[1]
-    if actor.acts == _TASK_HAND:
-        _spring(actor, t_s, at, speed, work[0], force)
-    else:
-        depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
-        outward = speed[0] * actor.b[0] + speed[1] * actor.b[1]
-        push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0) if depth > 0.0 else 0.0
-        for i in range(2):
-            force[i] = push * actor.b[i]
-    for i in range(torque.shape[0]):
-        torque[i] += J[0, i] * force[0] + J[1, i] * force[1]
+def _wall(actor: Row, at: Pair, speed: Pair) -> Pair:
+    """Returns the force of a wall on the tip, N: along its normal, and never a pull."""
+    depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
+    if not depth > 0.0:
+        return 0.0, 0.0
+    outward = speed[0] * actor.b[0] + speed[1] * actor.b[1]
+    push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0)
+    return push * actor.b[0], push * actor.b[1]
 
 
 @leaf
-def add_torque(
-    t_s: float, q: Array, qd: Array, lengths: Array, actor: Row, table: Table, work: Array, torque: Array
-) -> None:
-    """Adds what one actor does to the arm at time t, N m, ON it.
+def _in_the_plane(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> Pair:
+    """Returns J' F of a force at the tip: a hand's, or a wall's."""
+    _, at = elbow_and_tip(lengths, q)
+    x, y = tip_jacobian(lengths, q)
+    speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
+    force = _spring(actor, t_s, at, speed) if actor.acts == _TASK_HAND else _wall(actor, at, speed)
+    return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1]
+
+
+@leaf
+def torque_of(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: Table) -> Pair:
+    """Returns what one actor does to the arm at time t, N m, ON it.
 
     A pulse is peak * sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper,
     whose numbers are not printed.
 
     Args:
         t_s: time since the epoch, s.
-        q: joint angles, shape (n,), rad.
-        qd: joint velocities, shape (n,), rad/s.
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
         lengths: of the two links, m.
         actor: its row, dtype ACTOR.
         table: the site's recorded torques.
-        work: scratch, shape (6, 2).
-        torque: where the result is added, shape (n,).
     """
     if not actor.start_s <= t_s < actor.end_s:
-        return
+        return 0.0, 0.0
     if actor.acts == _PULSE:
-        height = math.sin(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s)) ** 2
-        for i in range(torque.shape[0]):
-            torque[i] += actor.a[i] * height
-    elif actor.acts == _HAND:
-        _spring(actor, t_s, q, qd, work[0], work[3])
-        for i in range(torque.shape[0]):
-            torque[i] += work[3, i]
-    elif actor.acts == _VISCOUS:
-        for i in range(torque.shape[0]):
-            torque[i] -= actor.B[i] * qd[i]
-    elif actor.acts == _RECORDED:
-        _tabled(actor, t_s, table, torque)
-    else:
-        _in_the_plane(actor, t_s, q, qd, lengths, work, torque)
+        return _pulse(actor, t_s)
+    if actor.acts == _HAND:
+        return _spring(actor, t_s, q, qd)
+    if actor.acts == _VISCOUS:
+        return -actor.B[0] * qd[0], -actor.B[1] * qd[1]
+    if actor.acts == _RECORDED:
+        return _tabled(actor, t_s, table)
+    return _in_the_plane(actor, t_s, q, qd, lengths)
 
 
 @leaf
 def torque_on_arm(
-    t_s: float,
-    q: Array,
-    qd: Array,
-    lengths: Array,
-    actors: Actors,
-    table: Table,
-    sampled: int,
-    work: Array,
-    torque: Array,
-) -> None:
-    """Writes what the actors do to the arm at time t, shape (n,), N m; -tau_x of Eq. (8).
+    t_s: float, q: Vector, qd: Vector, lengths: Vector, actors: Actors, table: Table, sampled: int
+) -> Pair:
+    """Returns what the actors do to the arm at time t, N m; -tau_x of Eq. (8).
 
     Args:
         t_s: time since the epoch, s.
-        q: joint angles, shape (n,), rad.
-        qd: joint velocities, shape (n,), rad/s.
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
         lengths: of the two links, m.
         actors: one row each, dtype ACTOR.
         table: the site's recorded torques.
         sampled: 1 for those that are held over a tick, 0 for the others.
-        work: scratch, shape (6, 2).
-        torque: where the result goes, shape (n,).
     """
-    torque[:] = 0.0
+    total_0 = total_1 = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
         if actor.sampled == sampled:
-            add_torque(t_s, q, qd, lengths, actor, table, work, torque)
+            torque = torque_of(t_s, q, qd, lengths, actor, table)
+            total_0 += torque[0]
+            total_1 += torque[1]
+    return total_0, total_1

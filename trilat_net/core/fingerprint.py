@@ -5,7 +5,6 @@ short run of two sites with random links; only there is a whole run executed aga
 """
 
 import hashlib
-import math
 from functools import cache
 
 import numpy as np
@@ -15,6 +14,7 @@ from .delay import Delay, Model
 from .exogenous import Actor, Acts
 from .jit import leaf
 from .setup import Gains, Law, LinkSetup, Scheme, SiteSetup
+from .sines import sincos
 from .site import Site
 from .tick import Arrival, Tick
 
@@ -25,8 +25,7 @@ _LINK = Model(kind=Delay.GAMMA, extra=2.7, scale=900.0, playout_us=2_000)
 @leaf
 def _sines(angles: Array, results: Array) -> None:
     for n in range(angles.shape[0]):
-        results[0, n] = math.sin(angles[n])
-        results[1, n] = math.cos(angles[n])
+        results[0, n], results[1, n] = sincos(angles[n])
 
 
 def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:

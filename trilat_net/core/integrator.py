@@ -3,87 +3,71 @@
 Law: operators and environments are asked in every stage; what is held over the period is constant.
 """
 
-from .arm import Array, forward_dynamics
+from .arm import forward_dynamics
 from .exogenous import Actors, Table, torque_on_arm
 from .jit import leaf
+from .vectors import Pair, Vector
 
-STAGE_ROWS = 14
-"""Rows of the work array of `advance`: stage angles, stage velocities, torque, four accelerations, the sum of
-velocities, and six for what acts on the arm."""
+
+@leaf
+def along(x: Vector, step_s: float, rate: Vector) -> Pair:
+    """Returns x + step * rate."""
+    return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
 
 
 @leaf
 def _acceleration(
     t_s: float,
-    q: Array,
-    qd: Array,
-    u: Array,
-    theta: Array,
+    q: Pair,
+    qd: Pair,
+    u: Vector,
+    theta: Vector,
     g: float,
-    lengths: Array,
-    actors: Actors,
+    lengths: Vector,
+    acts: Actors,
     table: Table,
-    work: Array,
-    qdd: Array,
-) -> None:
-    """Writes qdd at one stage, under the held u and what acts at that stage's time and state."""
-    total = work[2]
-    torque_on_arm(t_s, q, qd, lengths, actors, table, 0, work[8:14], total)
-    for i in range(u.shape[0]):
-        total[i] += u[i]
-    forward_dynamics(theta, g, q, qd, total, qdd)
+) -> Pair:
+    """Returns qdd at one stage, under the held u and what acts at that stage's time and state."""
+    on_arm = torque_on_arm(t_s, q, qd, lengths, acts, table, 0)
+    return forward_dynamics(theta, g, q, qd, (on_arm[0] + u[0], on_arm[1] + u[1]))
 
 
 @leaf
 def advance(
     t_s: float,
     h_s: float,
-    q: Array,
-    qd: Array,
-    u: Array,
-    theta: Array,
+    q: Vector,
+    qd: Vector,
+    u: Vector,
+    theta: Vector,
     g: float,
-    lengths: Array,
-    actors: Actors,
+    lengths: Vector,
+    acts: Actors,
     table: Table,
-    work: Array,
-) -> None:
-    """Advances q and qd in place by one period, Eq. (8).
+) -> tuple[Pair, Pair]:
+    """Returns q and qd one period later, Eq. (8).
 
     Args:
         t_s: time at the start of the period, s since the epoch.
         h_s: the period, s.
-        q: joint angles, shape (n,), rad; changed.
-        qd: joint velocities, shape (n,), rad/s; changed.
-        u: torque held over the period, control and sampled actors, shape (n,), N m.
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
+        u: torque held over the period, control and sampled actors, shape (2,), N m.
         theta: the arm's parameters, shape (5,).
         g: gravitational acceleration, m/s^2.
         lengths: of the two links, m.
-        actors: operators and environments, see `exogenous`.
+        acts: operators and environments, see `exogenous`.
         table: their recorded torques.
-        work: scratch, shape (STAGE_ROWS, n).
     """
-    joints = q.shape[0]
-    qs, vs = work[0], work[1]
-    a1, a2, a3, a4 = work[3], work[4], work[5], work[6]
-    v_sum = work[7]
-    half = 0.5 * h_s
-    _acceleration(t_s, q, qd, u, theta, g, lengths, actors, table, work, a1)
-    for i in range(joints):
-        qs[i] = q[i] + half * qd[i]
-        vs[i] = qd[i] + half * a1[i]
-        v_sum[i] = qd[i] + 2.0 * vs[i]
-    _acceleration(t_s + half, qs, vs, u, theta, g, lengths, actors, table, work, a2)
-    for i in range(joints):
-        qs[i] = q[i] + half * vs[i]
-        vs[i] = qd[i] + half * a2[i]
-        v_sum[i] += 2.0 * vs[i]
-    _acceleration(t_s + half, qs, vs, u, theta, g, lengths, actors, table, work, a3)
-    for i in range(joints):
-        qs[i] = q[i] + h_s * vs[i]
-        vs[i] = qd[i] + h_s * a3[i]
-        v_sum[i] += vs[i]
-    _acceleration(t_s + h_s, qs, vs, u, theta, g, lengths, actors, table, work, a4)
-    for i in range(joints):
-        q[i] += h_s / 6.0 * v_sum[i]
-        qd[i] += h_s / 6.0 * (a1[i] + 2.0 * a2[i] + 2.0 * a3[i] + a4[i])
+    half, sixth = 0.5 * h_s, h_s / 6.0
+    q1, v1 = (q[0], q[1]), (qd[0], qd[1])
+    a1 = _acceleration(t_s, q1, v1, u, theta, g, lengths, acts, table)
+    q2, v2 = along(q1, half, v1), along(v1, half, a1)
+    a2 = _acceleration(t_s + half, q2, v2, u, theta, g, lengths, acts, table)
+    q3, v3 = along(q1, half, v2), along(v1, half, a2)
+    a3 = _acceleration(t_s + half, q3, v3, u, theta, g, lengths, acts, table)
+    q4, v4 = along(q1, h_s, v3), along(v1, h_s, a3)
+    a4 = _acceleration(t_s + h_s, q4, v4, u, theta, g, lengths, acts, table)
+    v_sum = (v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0], v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1])
+    a_sum = (a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0], a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1])
+    return along(q1, sixth, v_sum), along(v1, sixth, a_sum)

@@ -55,13 +55,17 @@ def is_cached() -> bool:
     return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
 
 
+_OPTIONS: Any = {"_nrt": False}
+"""No leaf makes an array: none is counted, which would cost more than the arithmetic does."""
+
+
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
     if _CACHE is None:
-        return cast(Callable[P, R], numba.njit(function))
+        return cast(Callable[P, R], numba.njit(**_OPTIONS)(function))
     before = _config.CACHE_DIR
     _config.CACHE_DIR = str(_CACHE)
     try:
-        return cast(Callable[P, R], numba.njit(cache=True)(function))
+        return cast(Callable[P, R], numba.njit(cache=True, **_OPTIONS)(function))
     finally:
         _config.CACHE_DIR = before

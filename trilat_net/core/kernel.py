@@ -14,13 +14,14 @@ from .arm import JOINTS, PARAMETERS, Array, regressor
 from .delay import Points, Row
 from .exogenous import Actors, Table, torque_on_arm
 from .grid import tick_ns
-from .integrator import STAGE_ROWS, advance
+from .integrator import advance
 from .jit import leaf
 from .link import Rows, Ticks, accept, recall
 from .setup import Law, Scheme
 from .shares import follow_ramps
 from .stale import mind_stale_peers
 from .tick import Mode
+from .vectors import Pair, five, pair, put_five, put_pair
 
 _VECTOR = (JOINTS,)
 SITE = np.dtype(
@@ -71,13 +72,7 @@ SITE = np.dtype(
             ("e", "f8", _VECTOR),
             ("ed", "f8", _VECTOR),
             ("r", "f8", _VECTOR),
-            ("v", "f8", _VECTOR),
-            ("a", "f8", _VECTOR),
-            ("u", "f8", _VECTOR),
-            ("q_kept", "f8", _VECTOR),
-            ("qd_kept", "f8", _VECTOR),
             ("Y", "f8", (JOINTS, PARAMETERS)),
-            ("work", "f8", (STAGE_ROWS, JOINTS)),
         ],
     )
 )
@@ -100,18 +95,15 @@ def _reference(t_ns: int, site: Row, links: Rows, ramps: Array) -> None:
     """
     if site.ramps > 1:
         follow_ramps(t_ns, site.ramps, ramps, links)
-    site.q_followed[:] = site.q_des
-    site.q_des[:] = 0.0
-    site.qd_des[:] = 0.0
-    site.felt[:] = 0.0
-    for j in range(links.shape[0]):
-        link: Row = links[j]
-        for i in range(site.q_des.shape[0]):
-            site.q_des[i] += link.alpha * link.q[i]
-            site.qd_des[i] += link.alpha * link.qd[i]
-            site.felt[i] -= link.alpha * link.tau_x[i]
-            if link.alpha_rate != 0.0:
-                site.qd_des[i] += link.alpha_rate * link.q[i]
+    put_pair(site.q_followed, pair(site.q_des))
+    for i in range(JOINTS):
+        q_des = qd_des = felt = 0.0
+        for j in range(links.shape[0]):
+            link: Row = links[j]
+            q_des += link.alpha * link.q[i]
+            qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
+            felt -= link.alpha * link.tau_x[i]
+        site.q_des[i], site.qd_des[i], site.felt[i] = q_des, qd_des, felt
     mind_stale_peers(t_ns, site, links)
 
 
@@ -120,10 +112,10 @@ def _estimate(k: int, site: Row) -> None:
     """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
     if site.scheme == _DIGITAL or k == 0 or site.mode == _DIVERGED or site.law != _ADAPTIVE:
         return
-    half_s = 0.5 / site.rate_hz
-    for p in range(site.Yr.shape[0]):
-        site.theta_hat[p] -= half_s * site.Gamma[p] * (site.Yr_before[p] + site.Yr[p])
-    control.project(site.theta_hat, site.low, site.high)
+    a, b = site.Yr_before, site.Yr
+    both = (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4])
+    estimate = control.estimate(site.theta_hat, 0.5 / site.rate_hz, site.Gamma, both)
+    put_five(site.theta_hat, control.project(estimate, site.low, site.high))
 
 
 @leaf
@@ -131,40 +123,44 @@ def _torque(site: Row) -> None:
     """Stage 6: the torque of the site's law."""
     s = site
     if s.law == _ADAPTIVE:
-        control.torque(s.Y, s.theta_hat, s.Kp, s.Kd, s.r, s.ed, s.tau_limit, s.tau)
+        Y = (five(s.Y[0]), five(s.Y[1]))
+        put_pair(s.tau, control.torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, s.tau_limit))
     elif s.law != _OWN:
-        control.damped_torque(
-            s.known, s.g, s.K, s.d, s.Kd, s.k_f, s.q, s.qd, s.e, s.ed, s.felt, s.tau_limit, s.tau
+        put_pair(
+            s.tau,
+            control.damped_torque(
+                s.known, s.g, s.K, s.d, s.Kd, s.k_f, s.q, s.qd, s.e, s.ed, s.felt, s.tau_limit
+            ),
         )
 
 
 @leaf
 def _errors_and_regressor(site: Row) -> None:
     """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
-    control.errors(site.q, site.qd, site.q_des, site.qd_des, site.Lambda, site.e, site.ed, site.r)
-    for i in range(site.q.shape[0]):
-        site.v[i] = -site.Lambda[i] * site.e[i]
-        site.a[i] = -site.Lambda[i] * site.ed[i]
-    regressor(site.g, site.q, site.qd, site.v, site.a, site.Y)
-    control.regressor_transpose_times(site.Y, site.r, site.Yr)
+    q, qd, Lambda = pair(site.q), pair(site.qd), pair(site.Lambda)
+    e, ed, r = control.errors(q, qd, site.q_des, site.qd_des, Lambda)
+    v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
+    a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
+    Y = regressor(site.g, q, qd, v, a)
+    put_pair(site.e, e)
+    put_pair(site.ed, ed)
+    put_pair(site.r, r)
+    put_five(site.Y[0], Y[0])
+    put_five(site.Y[1], Y[1])
+    put_five(site.Yr, control.regressor_transpose_times(Y, r))
 
 
 @leaf
-def _finite(site: Row) -> bool:
+def _finite(q: Pair, qd: Pair) -> bool:
     """True while the arm's state is made of numbers that a record can hold."""
-    for i in range(site.q.shape[0]):
-        if not (math.isfinite(site.q[i]) and math.isfinite(site.qd[i])):
-            return False
-    return True
+    return math.isfinite(q[0]) and math.isfinite(q[1]) and math.isfinite(qd[0]) and math.isfinite(qd[1])
 
 
 @leaf
 def _within_limits(site: Row) -> bool:
     """True while every joint speed is within the divergence stop."""
-    for i in range(site.qd.shape[0]):
-        if not abs(site.qd[i]) <= site.qd_limit:
-            return False
-    return True
+    within: bool = abs(site.qd[0]) <= site.qd_limit and abs(site.qd[1]) <= site.qd_limit
+    return within
 
 
 @leaf
@@ -192,39 +188,44 @@ def _emit(site: Row, row: Array) -> None:
 @leaf
 def _feel(t_ns: int, site: Row, actors: Actors, table: Table) -> None:
     """Writes what acts on the arm now, and what of it is held over the tick."""
-    s, t_s, work = site, t_ns * 1e-9, site.work[8:14]
-    torque_on_arm(t_s, s.q, s.qd, s.lengths, actors, table, 1, work, s.held)
-    torque_on_arm(t_s, s.q, s.qd, s.lengths, actors, table, 0, work, s.on_arm)
-    for i in range(s.on_arm.shape[0]):
-        s.on_arm[i] += s.held[i]
+    t_s, q, qd, lengths = t_ns * 1e-9, pair(site.q), pair(site.qd), pair(site.lengths)
+    held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
+    now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
+    put_pair(site.held, held)
+    put_pair(site.on_arm, (now[0] + held[0], now[1] + held[1]))
+
+
+@leaf
+def _held_torque(k: int, site: Row, i: int) -> float:
+    """Returns what pushes a joint through the period: the torque at its middle, and what is held."""
+    torque: float = site.tau[i]
+    if site.scheme != _DIGITAL and k > 0:
+        torque = control.limited(1.5 * site.tau[i] - 0.5 * site.tau_before[i], site.tau_limit)
+    held: float = site.held[i]
+    return torque + held
 
 
 @leaf
 def _advance(k: int, site: Row, actors: Actors, table: Table) -> None:
     """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
-    h_s = 1.0 / site.rate_hz
-    for i in range(site.u.shape[0]):
-        if site.scheme == _DIGITAL or k == 0:
-            site.u[i] = site.tau[i]
+    s = site
+    h_s = 1.0 / s.rate_hz
+    if s.external == 0:
+        u = (_held_torque(k, s, 0), _held_torque(k, s, 1))
+        t_s = tick_ns(k, s.rate_hz) * 1e-9
+        q, qd = advance(
+            t_s, h_s, pair(s.q), pair(s.qd), u, five(s.theta), s.g, pair(s.lengths), actors, table
+        )
+        if _finite(q, qd):
+            put_pair(s.q, q)
+            put_pair(s.qd, qd)
         else:
-            ahead = 1.5 * site.tau[i] - 0.5 * site.tau_before[i]
-            site.u[i] = min(max(ahead, -site.tau_limit), site.tau_limit)
-        site.u[i] += site.held[i]
-    site.q_kept[:] = site.q
-    site.qd_kept[:] = site.qd
-    t_s = tick_ns(k, site.rate_hz) * 1e-9
-    if site.external == 0:
-        s = site
-        advance(t_s, h_s, s.q, s.qd, s.u, s.theta, s.g, s.lengths, actors, table, s.work)
-    if not _finite(site):
-        site.q[:] = site.q_kept
-        site.qd[:] = site.qd_kept
-        site.mode = _DIVERGED
-    if site.scheme == _DIGITAL and site.law == _ADAPTIVE:
-        control.estimate(site.theta_hat, h_s, site.Gamma, site.Yr)
-        control.project(site.theta_hat, site.low, site.high)
-    site.tau_before[:] = site.tau
-    site.Yr_before[:] = site.Yr
+            s.mode = _DIVERGED
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE:
+        estimate = control.estimate(s.theta_hat, h_s, s.Gamma, s.Yr)
+        put_five(s.theta_hat, control.project(estimate, s.low, s.high))
+    put_pair(s.tau_before, pair(s.tau))
+    put_five(s.Yr_before, five(s.Yr))
 
 
 @leaf

@@ -18,6 +18,7 @@ from .channel import LOST, foresee
 from .delay import LIMIT_US, Delay, Points, Row
 from .grid import NS_PER_S, first_tick_at, tick_ns
 from .jit import leaf
+from .vectors import pair, put_pair
 
 # One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and
 # qd are the peer's start pose, at rest (L7).
@@ -150,9 +151,9 @@ def accept(
         link.superseded += 1
         return
     slot.tick = tick
-    slot.q[:] = q
-    slot.qd[:] = qd
-    slot.tau_x[:] = tau_x
+    put_pair(slot.q, pair(q))
+    put_pair(slot.qd, pair(qd))
+    put_pair(slot.tau_x, pair(tau_x))
     if tick <= link.used:  # filed all the same: so that it is known when it comes again
         link.superseded += 1
         return
@@ -188,8 +189,8 @@ def recall(
     slot: Row = samples[newest % samples.shape[0]]
     if newest > link.used and slot.tick == newest:
         link.used = newest
-        link.q[:] = slot.q
-        link.qd[:] = slot.qd
-        link.tau_x[:] = slot.tau_x
+        put_pair(link.q, pair(slot.q))
+        put_pair(link.qd, pair(slot.qd))
+        put_pair(link.tau_x, pair(slot.tau_x))
     else:
         link.superseded += 1

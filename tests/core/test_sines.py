@@ -1,0 +1,47 @@
+"""Sine and cosine, against the platform's."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.core.sines import LARGEST_RAD, sincos
+
+
+@given(st.floats(-1e5, 1e5))
+def test_they_are_right_to_a_unit_in_the_last_place_of_one(x: float) -> None:
+    s, c = sincos(x)
+    assert abs(s - math.sin(x)) <= 2.3e-16
+    assert abs(c - math.cos(x)) <= 2.3e-16
+
+
+@given(st.floats(-LARGEST_RAD, LARGEST_RAD))
+def test_further_out_they_are_as_good_as_the_angle_is_known(x: float) -> None:
+    s, c = sincos(x)
+    assert abs(s - math.sin(x)) <= 2.3e-16 + math.ulp(x)
+    assert abs(c - math.cos(x)) <= 2.3e-16 + math.ulp(x)
+    assert s * s + c * c == pytest.approx(1.0, abs=1e-15)
+
+
+@given(st.floats(0, 1e5))
+def test_one_is_odd_and_the_other_even(x: float) -> None:
+    """Between the odd multiples of an eighth of a turn, where the rounding to a quarter is one-sided."""
+    if abs((x * 2 / math.pi) % 1.0 - 0.5) < 1e-9:
+        return
+    (s, c), (t, d) = sincos(x), sincos(-x)
+    assert (t, d) == (-s, c)
+
+
+def test_known_values() -> None:
+    assert sincos(0.0) == (0.0, 1.0)
+    s, c = sincos(math.pi / 6)
+    assert s == pytest.approx(0.5, abs=1e-16)
+    assert c == pytest.approx(math.sqrt(0.75), abs=2e-16)
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf, 2.0**31])
+def test_what_is_no_angle_has_none(x: float) -> None:
+    s, c = sincos(x)
+    assert math.isnan(s)
+    assert math.isnan(c)
