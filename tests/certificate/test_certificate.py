@@ -9,7 +9,7 @@ import pytest
 import trilat_net
 from tests.analysis import logs
 from trilat_net.certificate.certificate import NO_COMMON_TIME, NO_PERIOD, certify
-from trilat_net.certificate.growth import Motion
+from trilat_net.certificate.ending import Motion
 from trilat_net.certificate.premises import unjudged_spans
 from trilat_net.certificate.verdict import Finding
 from trilat_net.errors import LogError

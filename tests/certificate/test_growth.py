@@ -8,7 +8,8 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.certificate.growth import Motion, growth
+from trilat_net.certificate.ending import Motion
+from trilat_net.certificate.growth import growth
 from trilat_net.log.reader import Log
 
 

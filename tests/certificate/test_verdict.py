@@ -8,7 +8,7 @@ import pytest
 import trilat_net
 from tests.analysis import logs
 from trilat_net.certificate.certificate import Certificate, certify
-from trilat_net.certificate.growth import Motion
+from trilat_net.certificate.ending import Motion
 from trilat_net.certificate.verdict import Finding
 from trilat_net.log.reader import Log
 from trilat_net.net.wire import State

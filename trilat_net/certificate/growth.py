@@ -1,39 +1,22 @@
-"""What e and qd do at the end of a run, where no theorem speaks.
+"""What e and qd of a log do at its end, where no theorem speaks.
 
-Law: `analysis.envelope` decides, on the largest |e| and |qd| of every 50 ms, as `trilat test` does on e. A
-word says what the record shows and nothing of what follows: diverged is what passed a limit, growing what had
-not yet; converged is what has come to rest, decaying what had not yet; what shows no trend is undecided.
+Law: `ending` decides; what passed a limit has diverged, whatever else it does.
 """
 
-import math
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.envelope import Envelope, Trend, envelope
+from ..analysis.envelope import Envelope, Trend
 from ..analysis.happenings import diverged_at_s
 from ..analysis.quantities import SETTLED_RAD
 from ..core.arm import Array
+from ..core.grid import BUCKETS_PER_S
 from ..log.reader import Log, SiteLog
+from .ending import Motion, ending
 
-BUCKET_S = 0.05
-"""One largest value per so many seconds."""
-REST_RAD_S = 0.01
-"""Arms at whose end nothing is faster are at rest, rad/s."""
 LEAST_CROSSINGS = 6
 """Fewer changes of sign in the second half of a run show no period."""
-
-
-class Motion(StrEnum):
-    """What a run does at its end; the text is the word for people."""
-
-    CONVERGED = "converged"
-    DECAYS = "decaying"
-    BOUNDED = "bounded oscillation"
-    GROWS = "growing"
-    DIVERGED = "diverged"
-    UNDECIDED = "undecided (record longer)"
 
 
 class Growth(NamedTuple):
@@ -67,56 +50,24 @@ def growth(log: Log) -> Growth:
     """Returns what e and qd of a log's sites do; torn and empty logs are undecided."""
     parts = [log[site] for site in log.sites]
     absent = ", ".join(part.name for part in parts if not len(part))
-    error, speed = (_envelope(parts, field) for field in ("e", "qd"))
-    found = Growth(Motion.UNDECIDED, "", error, speed, _at_end(parts, "e"), _at_end(parts, "qd"))
+    end = ending([_maxima(part) for part in parts], _span_s(parts))
+    found = Growth(end.motion, "", *end[1:])
     stops = [at_s for part in parts if (at_s := diverged_at_s(part)) is not None]
     if stops:
         text = f"diverged at {min(stops):.4g} s: a joint passed its qd_limit_rad_s"
         return found._replace(motion=Motion.DIVERGED, text=text)
-    found = found._replace(motion=_motion(found, 0.5 * _span_s(parts)))
     return found._replace(text=f"undecided: no record of {absent}" if absent else _text(parts, found))
 
 
-def _motion(found: Growth, half_s: float) -> Motion:
-    """Returns what the two trends make together, seen over the second half of a run of twice `half_s`.
-
-    Errors that grow while no arm grows faster may be the start of a drift as well as what a hand has just
-    done: undecided. The other way round is growth: arms that swing in unison have no error.
-    """
-    error, speed = found.error.trend, found.speed.trend
-    if speed is Trend.GROWS:
-        return Motion.GROWS
-    if error is Trend.GROWS or Trend.UNDECIDED in (error, speed):
-        return Motion.UNDECIDED
-    if speed is Trend.STEADY:
-        return Motion.BOUNDED
-    slow = found.end_speed_rad_s <= REST_RAD_S
-    if (
-        error is Trend.STEADY
-    ):  # apart as before; what moves and hardly dies is a limit cycle, or as good as one
-        halves = found.speed.rate_per_s * half_s <= -math.log(2.0)
-        return Motion.CONVERGED if slow else Motion.DECAYS if halves else Motion.BOUNDED
-    return Motion.CONVERGED if slow and found.end_error_rad <= SETTLED_RAD else Motion.DECAYS
-
-
-def _envelope(parts: list[SiteLog], field: str) -> Envelope:
-    """Returns the trend of the largest value of all sites, over the buckets of which all have a record."""
-    maxima = [_maxima(part, getattr(part, field)) for part in parts]
-    count = min(map(len, maxima))
-    columns = np.array([values[:count] for values in maxima])
-    kept = np.flatnonzero((columns >= 0.0).all(axis=0))
-    t_s: Array = kept.astype(np.float64) * BUCKET_S
-    return envelope(t_s, columns[:, kept].max(axis=0))
-
-
-def _maxima(part: SiteLog, values: Array) -> Array:
-    """Returns the largest value of every bucket that is complete; -1 where a bucket has no record."""
+def _maxima(part: SiteLog) -> Array:
+    """Returns the largest |e| and |qd| of every bucket; -1 where a bucket has no record."""
     if not len(part):
-        return np.zeros(0)
-    bucket = np.floor(part.tick / (part.rate_hz * BUCKET_S) + 1e-6).astype(np.int64)
-    maxima = np.full(int(bucket[-1]) + 1, -1.0)
-    np.maximum.at(maxima, bucket, np.abs(values).max(axis=1))
-    return maxima[:-1]
+        return np.zeros((0, 2))
+    bucket = part.tick * BUCKETS_PER_S // part.rate_hz
+    maxima = np.full((int(bucket[-1]) + 1, 2), -1.0)
+    for column, values in enumerate((part.e, part.qd)):
+        np.maximum.at(maxima[:, column], bucket, np.abs(values).max(axis=1))
+    return maxima
 
 
 def _text(parts: list[SiteLog], found: Growth) -> str:
@@ -149,14 +100,6 @@ def _rate(found: Envelope) -> str:
 def _span_s(parts: list[SiteLog]) -> float:
     """Returns the longest time of which a site has records."""
     return max((float(p.tick[-1] - p.tick[0]) / p.rate_hz for p in parts if len(p)), default=0.0)
-
-
-def _at_end(parts: list[SiteLog], field: str) -> float:
-    """Returns the largest value of the last second."""
-    ends = [
-        np.abs(getattr(part, field)[part.tick > part.tick[-1] - part.rate_hz]) for part in parts if len(part)
-    ]
-    return max((float(end.max(initial=0.0)) for end in ends), default=0.0)
 
 
 def _frequency_hz(parts: list[SiteLog]) -> float | None:

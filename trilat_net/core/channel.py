@@ -75,9 +75,8 @@ def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, po
 
 
 @leaf
-def _due_ns(sample: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
+def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
     """Returns when a sample is due, ns since the epoch, or LOST."""
-    stamp_ns = tick_ns(sample, link.rate_hz)
     lost = _lost(sample, fresh, link, model)
     delay_us = _delay_us(sample, stamp_ns, fresh, link, model, points)
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
@@ -115,6 +114,6 @@ def foresee(sample: int, link: Row, models: Row, samples: Row, points: Points) -
         while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
             link.model += 1
             fresh = True
-        page: Row = samples[m % pages]
-        page.due_ns = _due_ns(m, fresh, link, models[link.model], points)
+        page: Row = samples[m & (pages - 1)]
+        page.due_ns = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
         link.foreseen = m

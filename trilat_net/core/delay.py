@@ -5,6 +5,7 @@ microseconds. Only AR1 looks at the sample before; it advances by index, not by 
 """
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -98,6 +99,27 @@ Row = Any
 Points = NDArray[np.int64]
 """A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay of -1 is a
 sample lost) and outages (first and last stamp, ns), one after the other."""
+
+
+def longest_us(models: Sequence[Model], traces: Sequence[Points | None]) -> int:
+    """Returns a delay that no sample of a link exceeds, us, play-out included.
+
+    Args:
+        models: what the link does.
+        traces: per model the points of its trace, or None.
+    """
+    reaches = []
+    for model, trace in zip(models, traces, strict=True):
+        bounded = {
+            Delay.CONSTANT: model.location,
+            Delay.UNIFORM: model.location + model.scale,
+            Delay.SINE: model.location + abs(model.scale),
+            Delay.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
+            Delay.MEASURED: 0.0,
+        }.get(Delay(model.kind), float(LIMIT_US))
+        reaches.append(max(math.ceil(bounded) + 1, model.playout_us))
+    return min(LIMIT_US, max(reaches))
+
 
 LOSS, DUPLICATE, DELAY, COPY = 0, 1, 2, 5
 """Purposes of draws; a delay takes up to three, see `standard_gamma`."""

@@ -6,6 +6,8 @@ Law (L1): tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanosecond
 from .jit import leaf
 
 NS_PER_S = 1_000_000_000
+BUCKETS_PER_S = 20
+"""Where a run is told by its largest values, it is by those of so many equal parts of each second."""
 
 
 @leaf

@@ -119,9 +119,9 @@ def _estimate(k: int, site: Row) -> None:
 
 
 @leaf
-def _torque(site: Row) -> None:
-    """Stage 6: the torque of the site's law."""
-    s = site
+def site_torque(site: Rows) -> None:
+    """Stage 6 of a tick: the torque of the site's law, unless that is somebody's own."""
+    s: Row = site[0]
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
         put_pair(s.tau, control.torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, s.tau_limit))
@@ -206,15 +206,14 @@ def _held_torque(k: int, site: Row, i: int) -> float:
 
 
 @leaf
-def _advance(k: int, site: Row, actors: Actors, table: Table) -> None:
+def _advance(k: int, t_ns: int, site: Row, actors: Actors, table: Table) -> None:
     """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
     s = site
     h_s = 1.0 / s.rate_hz
     if s.external == 0:
         u = (_held_torque(k, s, 0), _held_torque(k, s, 1))
-        t_s = tick_ns(k, s.rate_hz) * 1e-9
         q, qd = advance(
-            t_s, h_s, pair(s.q), pair(s.qd), u, five(s.theta), s.g, pair(s.lengths), actors, table
+            t_ns * 1e-9, h_s, pair(s.q), pair(s.qd), u, five(s.theta), s.g, pair(s.lengths), actors, table
         )
         if _finite(q, qd):
             put_pair(s.q, q)
@@ -251,8 +250,30 @@ def site_accept(
 
 
 @leaf
+def site_follow(
+    k: int,
+    t_ns: int,
+    site: Rows,
+    links: Rows,
+    models: Rows,
+    samples: Rows,
+    calendars: Ticks,
+    points: Points,
+    ramps: Array,
+) -> None:
+    """Stages 2 to 5 of a tick, with its arrivals in their links; arguments as in `site_tick`."""
+    s: Row = site[0]
+    for j in range(links.shape[0]):  # 2 recall
+        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
+    _reference(t_ns, s, links, ramps)  # 3 reference
+    _errors_and_regressor(s)  # 4 errors
+    _estimate(k, s)  # 5 estimate
+
+
+@leaf
 def site_look(
     k: int,
+    t_ns: int,
     count: int,
     site: Rows,
     links: Rows,
@@ -265,31 +286,26 @@ def site_look(
     forces: Array,
 ) -> None:
     """Stages 1 to 5 of a tick: what came in, the reference, the errors, the estimate; see `site_tick`."""
-    s: Row = site[0]
-    t_ns = tick_ns(k, s.rate_hz)
-    site_accept(k, count, site, links, models, samples, calendars, points, arrivals, forces)  # 1 accept
-    for j in range(links.shape[0]):  # 2 recall
-        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
-    _reference(t_ns, s, links, ramps)  # 3 reference
-    _errors_and_regressor(s)  # 4 errors
-    _estimate(k, s)  # 5 estimate
+    site_accept(k, count, site, links, models, samples, calendars, points, arrivals, forces)
+    site_follow(k, t_ns, site, links, models, samples, calendars, points, ramps)
 
 
 @leaf
-def site_act(k: int, site: Rows, actors: Actors, table: Table, row: Array) -> None:
+def site_act(k: int, t_ns: int, site: Rows, actors: Actors, table: Table, row: Array) -> None:
     """Stages 7 and 8 of a tick, with the torque in place: the record, and the way to the next tick."""
     s: Row = site[0]
-    _feel(tick_ns(k, s.rate_hz), s, actors, table)
+    _feel(t_ns, s, actors, table)
     if not _within_limits(s):
         s.mode = _DIVERGED
     _emit(s, row)  # 7 emit
     if s.mode != _DIVERGED:  # 8 advance
-        _advance(k, s, actors, table)
+        _advance(k, t_ns, s, actors, table)
 
 
 @leaf
 def site_tick(
     k: int,
+    t_ns: int,
     count: int,
     site: Rows,
     links: Rows,
@@ -308,6 +324,7 @@ def site_tick(
 
     Args:
         k: the tick.
+        t_ns: its time, ns since the epoch.
         count: how many rows of `arrivals` are filled.
         site: the site's state and constants, one row of dtype SITE, shape (1,).
         links: one row per peer, shape (P,), dtype LINK.
@@ -322,16 +339,17 @@ def site_tick(
         table: their recorded torques.
         row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
     """
-    site_look(k, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
-    _torque(site[0])  # 6 torque
-    site_act(k, site, actors, table, row)
+    site_look(k, t_ns, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
+    site_torque(site)  # 6 torque
+    site_act(k, t_ns, site, actors, table, row)
 
 
 @leaf
 def site_resume(k: int, site: Rows, actors: Actors, table: Table) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
     s: Row = site[0]
+    t_ns = tick_ns(k, s.rate_hz)
     _errors_and_regressor(s)
-    _feel(tick_ns(k, s.rate_hz), s, actors, table)
+    _feel(t_ns, s, actors, table)
     if s.mode != _DIVERGED:
-        _advance(k, s, actors, table)
+        _advance(k, t_ns, s, actors, table)

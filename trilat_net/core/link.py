@@ -54,8 +54,8 @@ LINK = np.dtype(
         ],
     )
 )
-# One page per sample: when the sample of that index is due, and the sample that waits there with its own
-# tick (-1: none) and the peer's joint state.
+# One page per sample, a power of two of them: when the sample of that index is due, and the sample that waits
+# there with its own tick (-1: none) and the peer's joint state.
 SAMPLE = np.dtype(
     (
         np.record,
@@ -93,10 +93,18 @@ def release_tick(tick: int, link: Row, models: Rows, samples: Rows, points: Poin
     """
     foresee(tick, link, models, samples, points)
     pages = samples.shape[0]
-    page: Row = samples[tick % pages]
+    page: Row = samples[tick & (pages - 1)]
     if page.due_ns == LOST or tick <= link.foreseen - pages:
         return LOST
     return first_tick_at(max(page.due_ns, tick_ns(tick, link.rate_hz) + 1), rate_hz)
+
+
+@leaf
+def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
+    """True where a sample's stamp lies further ahead of tick k than any may; none such is ever foreseen."""
+    if tick // peer_rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1:  # a hostile tick must not overflow the rest
+        return True
+    return tick_ns(tick, peer_rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS
 
 
 @leaf
@@ -129,12 +137,10 @@ def accept(
         points: the site's traces and outages.
     """
     link.accepted += 1
-    # whole seconds first: a hostile tick must not overflow the arithmetic that comes after
-    far_ahead = tick // link.rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1
-    if tick < 0 or far_ahead or tick_ns(tick, link.rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS:
+    if tick < 0 or (tick > link.foreseen and _far_ahead(k, rate_hz, tick, link.rate_hz)):
         link.refused += 1
         return
-    slot: Row = samples[tick % samples.shape[0]]
+    slot: Row = samples[tick & (samples.shape[0] - 1)]
     if slot.tick == tick:
         link.duplicate += 1
         return
@@ -157,7 +163,7 @@ def accept(
     if tick <= link.used:  # filed all the same: so that it is known when it comes again
         link.superseded += 1
         return
-    page = release % calendar.shape[0]
+    page = release & (calendar.shape[0] - 1)
     if calendar[page] >= 0:
         link.superseded += 1
     calendar[page] = max(calendar[page], tick)
@@ -180,13 +186,14 @@ def recall(
         calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
         points: the site's traces and outages.
     """
-    foresee(k * link.rate_hz // rate_hz, link, models, samples, points)
-    page = k % calendar.shape[0]
+    same = link.rate_hz == rate_hz
+    foresee(k if same else k * link.rate_hz // rate_hz, link, models, samples, points)
+    page = k & (calendar.shape[0] - 1)
     newest = calendar[page]
     if newest < 0:
         return
     calendar[page] = -1
-    slot: Row = samples[newest % samples.shape[0]]
+    slot: Row = samples[newest & (samples.shape[0] - 1)]
     if newest > link.used and slot.tick == newest:
         link.used = newest
         put_pair(link.q, pair(slot.q))

@@ -45,7 +45,7 @@ def sincos(x: float) -> tuple[float, float]:
     c = c * z - 1.38888888888730564116e-3
     c = c * z + 4.16666666666665929218e-2
     c = 1.0 - 0.5 * z + z * z * c
-    turn = int(quarter) % 4
+    turn = int(quarter) & 3
     if turn == 0:
         return s, c
     if turn == 1:

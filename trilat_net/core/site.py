@@ -14,15 +14,14 @@ import numpy as np
 
 from .arm import JOINTS
 from .channel import LOST
-from .delay import MODEL, Delay, Model, Row
-from .exogenous import rows_of
+from .delay import Delay, Model, Row
 from .grid import NS_PER_S
-from .kernel import ARRIVAL, ROW_FLOATS, SITE, site_accept, site_act, site_look, site_resume, site_tick
-from .link import LINK, SAMPLE, calendar_pages, release_tick
+from .kernel import ARRIVAL, ROW_FLOATS, site_accept, site_act, site_look, site_resume, site_tick
+from .link import release_tick
 from .own import Facts, Now, OwnLaw, asked, recalled
-from .setup import Law, LinkSetup, SiteSetup
-from .shares import RAMP_COLUMNS
-from .tick import MAX_ARRIVALS, Arrival, Command, LinkCounts, Mode, Output, Ramp, Tick
+from .setup import SiteSetup
+from .tables import add_ramp, tables_of
+from .tick import MAX_ARRIVALS, Arrival, Command, LinkCounts, Mode, Output, Tick
 
 _ARRIVAL_LAYOUT = struct.Struct(f"<qq{2 * JOINTS}d")
 _PACK_ARRIVAL, _PACK_ARRIVAL_SIZE = _ARRIVAL_LAYOUT.pack_into, _ARRIVAL_LAYOUT.size
@@ -51,8 +50,11 @@ class Site:
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
         self._external = setup.external
-        self._site = np.zeros(1, SITE)
-        self._actors, self._table = rows_of(setup.actors)
+        tables = tables_of(setup, MAX_COMMANDS)
+        self._tables = tables
+        self._site, self._links, self._models = tables.site, tables.links, tables.models
+        self._samples, self._calendars, self._points = tables.samples, tables.calendars, tables.points
+        self._ramps, self._actors, self._table = tables.ramps, tables.actors, tables.table
         self._row = np.zeros(ROW_FLOATS)
         self._arrivals = np.zeros(MAX_ARRIVALS, ARRIVAL)
         self._arrival_bytes = self._arrivals.view(np.uint8).data
@@ -60,65 +62,6 @@ class Site:
         self._force_bytes = self._forces.view(np.uint8).reshape(-1).data
         self._own = None if setup.own is None else setup.own(_facts(setup))
         self._reflects = any(setup.gains.k_f) or self._own is not None
-        self._fill(setup)
-        self._connect(setup.links)
-        self._share(setup)
-
-    def _fill(self, setup: SiteSetup) -> None:
-        s: Row = self._site[0]
-        s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, int(setup.scheme), int(setup.gains.law), _RUN
-        s.g, s.tau_limit, s.qd_limit = setup.g_m_s2, setup.tau_limit_nm, setup.qd_limit_rad_s
-        s.external = int(setup.external)
-        rule = setup.on_stale
-        s.on_stale, s.stale_ns, s.return_ns = int(rule.action), rule.age_ns, rule.return_ns
-        s.lengths = setup.lengths_m
-        s.theta = setup.theta
-        gains = setup.gains
-        for name in gains._fields[1:]:
-            if name != "theta_hat0":
-                s[name] = getattr(gains, name)
-        s.q, s.qd = setup.q0, setup.qd0
-        s.theta_hat = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
-
-    def _connect(self, links: Sequence[LinkSetup]) -> None:
-        peers = len(links)
-        pages = max(calendar_pages(max(link.rate_hz, self.rate_hz)) for link in links)
-        self._links = np.zeros(peers, LINK)
-        self._samples = np.zeros((peers, pages), SAMPLE)
-        self._samples["tick"] = -1
-        self._calendars = np.full((peers, pages), -1, dtype=np.int64)
-        self._models = np.zeros((peers, max(len(link.models) for link in links) + MAX_COMMANDS), MODEL)
-        tables = [trace for link in links for trace in link.traces if trace is not None]
-        outages = [outage for link in links for outage in link.outages]
-        self._points = np.array(
-            [pair for table in tables for pair in table] + outages, dtype=np.int64
-        ).reshape(-1, 2)
-        trace_first, outage_first = 0, sum(map(len, tables))
-        row: Row
-        for row, models, link in zip(self._links, self._models, links, strict=True):
-            row.alpha, row.rate_hz, row.key = link.alpha, link.rate_hz, link.key
-            row.used, row.foreseen, row.q = -1, -1, link.q0
-            row.outage_first, row.outage_count = outage_first, len(link.outages)
-            outage_first += len(link.outages)
-            row.models = len(link.models)
-            for n, (model, trace) in enumerate(zip(link.models, link.traces, strict=True)):
-                count = 0 if trace is None else len(trace)
-                models[n] = model._replace(trace_first=trace_first, trace_count=count)
-                trace_first += count
-
-    def _share(self, setup: SiteSetup) -> None:
-        self._ramps = np.zeros((1 + len(setup.ramps) + MAX_COMMANDS, RAMP_COLUMNS + len(setup.links)))
-        self._ramps[0, RAMP_COLUMNS:] = [link.alpha for link in setup.links]
-        self._site[0].ramps = 1
-        for ramp in setup.ramps:
-            self._add_ramp(ramp)
-
-    def _add_ramp(self, ramp: Ramp) -> None:
-        count = int(self._site[0].ramps)
-        place = 1 + int(np.searchsorted(self._ramps[1:count, 0], ramp.start_ns, side="right"))
-        self._ramps[place + 1 : count + 1] = self._ramps[place:count].copy()
-        self._ramps[place] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
-        self._site[0].ramps = count + 1
 
     def _add_model(self, peer: int, model: Model) -> None:
         link: Row = self._links[peer]
@@ -143,7 +86,7 @@ class Site:
         if command.ramp is not None:
             if self._site[0].ramps >= len(self._ramps):
                 raise ValueError(f"a run takes at most {MAX_COMMANDS} changes of its shares")
-            self._add_ramp(command.ramp)
+            add_ramp(self._tables, command.ramp)
 
     def step(self, tick: Tick) -> Output:
         """Computes one tick and returns its record.
@@ -161,8 +104,10 @@ class Site:
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
             s.q, s.qd = tick.measured
+        t_ns = tick.k * NS_PER_S // self.rate_hz
         looked = (
             tick.k,
+            t_ns,
             len(tick.arrivals),
             self._site,
             self._links,
@@ -180,13 +125,13 @@ class Site:
         else:
             site_look(*looked)
             own = self._ask(self._own, tick.k)
-            site_act(tick.k, self._site, self._actors, self._table, self._row)
+            site_act(tick.k, t_ns, self._site, self._actors, self._table, self._row)
         row = self._row.tolist()
         n = JOINTS
         mode = self._site["mode"].item()
         return Output(
             tick.k,
-            tick.k * NS_PER_S // self.rate_hz,
+            t_ns,
             _MODES[mode],
             row[:n],
             row[n : 2 * n],

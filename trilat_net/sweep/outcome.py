@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import msgspec
 
-from ..certificate.growth import Motion
+from ..certificate.ending import Motion
 
 
 class Verdict(StrEnum):
