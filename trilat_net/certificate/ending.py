@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.envelope import Envelope, Trend, envelope
+from ..analysis.envelope import FLOOR_RAD, Envelope, Trend, envelope
 from ..analysis.quantities import SETTLED_RAD
 from ..core.arm import Array
 from ..core.grid import BUCKETS_PER_S
@@ -77,6 +77,8 @@ def _motion(found: Ending, half_s: float) -> Motion:
     done: undecided. The other way round is growth: arms that swing in unison have no error.
     """
     error, speed = found.error.trend, found.speed.trend
+    if found.end_speed_rad_s <= FLOOR_RAD and speed is not Trend.GROWS:  # too still for a trend
+        speed = Trend.DECAYS
     if speed is Trend.GROWS:
         return Motion.GROWS
     if error is Trend.GROWS or Trend.UNDECIDED in (error, speed):

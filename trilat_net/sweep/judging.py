@@ -11,6 +11,9 @@ from ..scenario import Scenario, parse
 from ..sim.fused import FusedRun, check_fuses
 from .outcome import VERDICT_OF, Outcome
 
+FLAT = 0.02
+"""An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
+
 
 def check_sweepable(scenario: Scenario) -> None:
     """Refuses what cannot be run without a network, or not fast.
@@ -24,8 +27,8 @@ def check_sweepable(scenario: Scenario) -> None:
 def judge(text: str, longest_s: float) -> Outcome:
     """Runs a cell in virtual time and returns what became of it.
 
-    A run that is undecided when its time is over goes on for as long again, and so on; its numbers are those
-    of one run.
+    A run that has not made itself plain when its time is over (see `plain`) goes on for as long again, and so
+    on; its numbers are those of one run.
 
     Args:
         text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
@@ -36,11 +39,29 @@ def judge(text: str, longest_s: float) -> Outcome:
     ends_s = scenario.duration_s
     run.advance(ends_s)
     extended = 0
-    while (outcome := _outcome(run, extended)).motion is Motion.UNDECIDED and ends_s < longest_s:
+    while not plain(outcome := _outcome(run, extended)) and ends_s < longest_s:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
     return outcome
+
+
+def plain(outcome: Outcome) -> bool:
+    """True where a longer run would hardly be called something else.
+
+    That is: it left its limits; or it came to rest; or over its second half the largest speed at least
+    doubled, or halved; or neither that nor the largest error changed by more than `FLAT`. Near the edge of
+    stability a finite run looks steady whatever it does later.
+    """
+    if outcome.motion in (Motion.DIVERGED, Motion.CONVERGED):
+        return True
+    error, speed = (
+        abs(rate_per_s or 0.0) * 0.5 * outcome.ran_s
+        for rate_per_s in (outcome.error_rate_per_s, outcome.speed_rate_per_s)
+    )
+    if outcome.motion in (Motion.GROWS, Motion.DECAYS):
+        return speed >= math.log(2.0)
+    return outcome.motion is Motion.BOUNDED and max(error, speed) <= FLAT
 
 
 def _outcome(run: FusedRun, extended: int) -> Outcome:

@@ -1,0 +1,50 @@
+"""The tables of a run are no larger than its delays need, and never smaller."""
+
+import numpy as np
+import pytest
+
+from tests.core.channels import channel, due
+from tests.core.kinds import KINDS, POINTS
+from trilat_net.core.channel import LOST
+from trilat_net.core.delay import LIMIT_US, longest_us
+from trilat_net.core.link import calendar_pages
+from trilat_net.core.tables import stacked, tables_of
+from trilat_net.scenario import load
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
+    model = KINDS[name]
+    traces = [POINTS if name == "trace" else None]
+    due_ns = due(channel([model], 3, points=POINTS), 5000)
+    kept = due_ns != LOST
+    delay_us = (due_ns[kept] - np.arange(5000)[kept] * 1_000_000) / 1000
+    longest = longest_us([model], traces)
+    assert delay_us.max() <= longest <= LIMIT_US
+
+
+def test_known_delays_take_few_pages_and_unbounded_ones_all() -> None:
+    def pages(**changes: object) -> int:
+        scenario = load("free", {key.replace("__", "."): value for key, value in changes.items()})
+        return stacked([scenario.setup(name) for name in scenario.names]).samples.shape[2]
+
+    assert pages(link__delay_ms=200.0) == 256
+    assert pages(link__delay_ms=0.0) <= 16
+    assert (
+        10_000
+        < pages(link__model="gamma", link__delay_ms=20.0, link__deviation_ms=5.0)
+        <= calendar_pages(1000)
+    )
+
+
+def test_stacked_tables_hold_each_site_s_own() -> None:
+    scenario = load("windup")
+    setups = [scenario.setup(name) for name in scenario.names]
+    whole = stacked(setups)
+    for n, setup in enumerate(setups):
+        own = tables_of(setup)
+        assert whole.site[n].tobytes() == own.site.tobytes()
+        assert whole.links[n].tobytes() == own.links.tobytes()
+        assert whole.ramps[n].tobytes() == own.ramps.tobytes()
+        mine = whole.actors[n][whole.actors[n]["sampled"] != 2]
+        assert mine.tobytes() == own.actors.tobytes()
