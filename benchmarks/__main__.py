@@ -7,6 +7,7 @@ from . import (
     clocks,
     crashes,
     endurance,
+    fused,
     links,
     machine,
     presets,
@@ -18,7 +19,13 @@ from . import (
     writer,
 )
 
-BENCHMARKS = {"tick": tick.run, "links": links.run, "virtual": virtual.run, "writer": writer.run}
+BENCHMARKS = {
+    "tick": tick.run,
+    "links": links.run,
+    "virtual": virtual.run,
+    "fused": fused.run,
+    "writer": writer.run,
+}
 LONG = {
     "analysis": analysis.run,
     "clocks": clocks.run,

@@ -60,6 +60,7 @@ class DelayEquations:
     q0: Array
     hands: Callable[[float], Array]
     edges_s: list[float] = field(default_factory=list)
+    tolerance: float = 1e-11
     starts: list[float] = field(default_factory=list)
     pieces: list[Callable[[float], Array]] = field(default_factory=list)
 
@@ -91,7 +92,8 @@ class DelayEquations:
         cuts = sorted({round(float(t), 9) for t in [*steps, *self.edges_s, end_s] if 0 < t <= end_s})
         x, t = self.past(-1.0).ravel(), 0.0
         for cut in cuts:
-            done = solve_ivp(self.rate, (t, cut), x, "DOP853", rtol=1e-11, atol=1e-12, dense_output=True)
+            accuracy = {"rtol": self.tolerance, "atol": 0.1 * self.tolerance}
+            done = solve_ivp(self.rate, (t, cut), x, "DOP853", dense_output=True, **accuracy)
             assert done.success
             self.starts.append(t)
             self.pieces.append(done.sol)

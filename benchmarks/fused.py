@@ -1,0 +1,82 @@
+"""One scenario by the fused kernel, by the per-tick driver and by SciPy; then many, on all cores.
+
+SciPy solves the same delay-differential equations by DOP853 and the method of steps, written for the tests
+from the paper alone; its rate is NumPy over all sites at once.
+"""
+
+import dataclasses
+import time
+
+import numpy as np
+
+from tests.theory.delay_equations import equations
+from trilat_net.scenario import load
+from trilat_net.sim import virtual
+from trilat_net.sim.fused import FusedRun
+from trilat_net.sweep.judging import judge
+from trilat_net.workers import cores, deaf, workers
+
+from .stopwatch import best_s
+
+CELLS = 400
+"""Enough for some seconds on every core."""
+ASKED = 10_000
+
+
+def run() -> list[str]:
+    scenario = load("free", {"duration_s": 20.0})
+    real_s = scenario.duration_s
+
+    def fused() -> FusedRun:
+        whole = FusedRun(scenario)
+        whole.advance(real_s)
+        return whole
+
+    def per_tick() -> np.ndarray:
+        last = {s.site.name: s.output.q for s in virtual.run(scenario)}
+        return np.array([last[name] for name in scenario.names])
+
+    fused_s = best_s(fused, 40)
+    per_tick_s = best_s(per_tick, 3)
+    whole = fused()
+    same = np.array_equal(whole.records[:, :2], per_tick())
+    lines = [
+        f"free, {real_s:g} s, three sites at 1 kHz, on one core; best of some runs:",
+        f"  fused kernel: {real_s / fused_s:.0f} x real time, "
+        f"{1e9 * fused_s / (3e3 * real_s):.0f} ns a site tick",
+        f"  per-tick driver, no log: {real_s / per_tick_s:.1f} x real time; "
+        f"fused is {per_tick_s / fused_s:.0f} times as fast; last poses equal bit for bit: {'yes' if same else 'NO'}",
+    ]
+    for tolerance in (1e-5, 1e-11):
+        problem = dataclasses.replace(equations(scenario), tolerance=tolerance, starts=[], pieces=[])
+        begun = time.perf_counter()
+        states = problem.solve(real_s).at(np.array([real_s - 1e-3]))
+        scipy_s = time.perf_counter() - begun
+        apart = np.abs(states[:, 0, :2] - whole.records[:, :2]).max()
+        lines.append(
+            f"  SciPy DOP853, rtol {tolerance:g}: {real_s / scipy_s:.1f} x real time; fused is "
+            f"{scipy_s / fused_s:.0f} times as fast; last poses {apart:.1e} rad apart"
+        )
+    return [*lines, *_on_all_cores(real_s)]
+
+
+def _on_all_cores(real_s: float) -> list[str]:
+    """Judges many cells, each with gains of its own, in as many processes as there are cores."""
+    texts = [
+        load("free", {"duration_s": real_s, "control.Kd": 2.0 + 2.0 * n / CELLS}).text for n in range(CELLS)
+    ]
+    count = cores()
+    with workers(count) as pool:
+        with deaf():
+            list(pool.map(judge, texts[:count], [0.0] * count))  # begins the processes
+        begun = time.perf_counter()
+        with deaf():
+            outcomes = list(pool.map(judge, texts, [0.0] * CELLS, chunksize=8))
+        wall_s = time.perf_counter() - begun
+    words = sorted({str(outcome.verdict) for outcome in outcomes})
+    speed = CELLS * real_s / wall_s / count
+    return [
+        f"{CELLS} cells of it, each with another Kd, judged on {count} cores: {wall_s:.1f} s, "
+        f"{speed:.0f} x real time per core ({', '.join(words)})",
+        f"  {ASKED} cells would take {wall_s * ASKED / CELLS / 60.0:.1f} min (bar: <= 4 min on 2 cores)",
+    ]
