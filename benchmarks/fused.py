@@ -45,7 +45,8 @@ def run() -> list[str]:
         f"  fused kernel: {real_s / fused_s:.0f} x real time, "
         f"{1e9 * fused_s / (3e3 * real_s):.0f} ns a site tick",
         f"  per-tick driver, no log: {real_s / per_tick_s:.1f} x real time; "
-        f"fused is {per_tick_s / fused_s:.0f} times as fast; last poses equal bit for bit: {'yes' if same else 'NO'}",
+        f"fused is {per_tick_s / fused_s:.0f} times as fast; "
+        f"last poses equal bit for bit: {'yes' if same else 'NO'}",
     ]
     for tolerance in (1e-5, 1e-11):
         problem = dataclasses.replace(equations(scenario), tolerance=tolerance, starts=[], pieces=[])
