@@ -14,6 +14,7 @@ COMMANDS = [
     ["router"],
     ["sim"],
     ["test"],
+    ["sweep"],
     ["rerun"],
     ["verify"],
     ["report"],
@@ -64,7 +65,11 @@ def test_these_are_all_the_commands() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [c for c in COMMANDS if c[-1] in ("demo", "site", "sim", "test", "show", "check") and c[0] != "log"],
+    [
+        c
+        for c in COMMANDS
+        if c[-1] in ("demo", "site", "sim", "test", "sweep", "show", "check") and c[0] != "log"
+    ],
 )
 def test_every_command_that_takes_a_scenario_takes_overrides(command: list[str]) -> None:
     assert "--set" in printed(*command, "--help")

@@ -4,6 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -160,6 +161,37 @@ def test_what_to_do_about_a_stale_peer() -> None:
 
 def test_an_override_below_a_value_is_refused() -> None:
     assert refused(["seed.x=1"]).path == "seed"
+
+
+def test_an_override_reaches_into_lists_by_number() -> None:
+    wall = load("contact").sites["s"].environment[0]
+    stiff = load("contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"])
+    assert stiff.sites["s"].environment == (msgspec.structs.replace(wall, stiffness_n_m=500.0),)
+    assert stiff.sites["s"].q0_rad == (load("contact").sites["s"].q0_rad[0], 0.5)
+    assert stiff.sites["m"].hands == load("contact").sites["m"].hands
+    resolved = load(load("contact"), {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5})
+    assert resolved == stiff
+    given: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
+    override(given, ["a.0.b.1=5", "a.1.c=6"])
+    assert given == {"a": [{"b": [1, 5]}, {"c": 6}]}
+
+
+@pytest.mark.parametrize(
+    ("key", "path", "problem"),
+    [
+        ("sites.s.environment.1.stiffness_n_m", "sites.s.environment.1", "it has 1, counted from 0"),
+        ("sites.s.environment.-1.stiffness_n_m", "sites.s.environment.-1", "it has 1, counted from 0"),
+        ("sites.s.environment.wall.stiffness_n_m", "sites.s.environment.wall", "it has 1, counted from 0"),
+        ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "it has none"),
+        ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "it has 2, counted from 0"),
+        ("sites.s.q0_rad.0.x", "sites.s.q0_rad.0", "is a value, not a table"),
+        ("sites.s.environment.0.stiffnes_n_m", "sites.s.environment[0].stiffnes_n_m", "'stiffness_n_m'"),
+    ],
+)
+def test_an_entry_that_is_not_in_a_list_is_refused(key: str, path: str, problem: str) -> None:
+    found = refused([f"{key}=1"], shipped_text("contact"))
+    assert found.path == path
+    assert problem in found.problem
 
 
 def test_a_number_counts_for_every_joint_and_every_parameter() -> None:

@@ -74,6 +74,13 @@ def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
     assert msgspec.structs.replace(found, extended=0) == whole
 
 
+def test_a_slow_trend_of_a_run_with_chance_in_it_decides_nothing() -> None:
+    """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
+    found = judged(load("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}), longest_s=160.0)
+    assert (found.motion, found.verdict) == (Motion.DECAYS, Verdict.UNDECIDED)
+    assert found.end_speed_rad_s > 5.0
+
+
 def test_it_is_never_extended_beyond_what_was_asked() -> None:
     scenario = load("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
     found = judged(scenario, longest_s=10.0)

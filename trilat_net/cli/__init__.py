@@ -20,6 +20,7 @@ from . import (
     changes,
     comparisons,
     figures,
+    linears,
     log,
     logs,
     metering,
@@ -29,6 +30,7 @@ from . import (
     routers,
     scenarios,
     sessions,
+    sweeps,
     trials,
 )
 from .options import err
@@ -73,6 +75,8 @@ app.add_typer(replays.app)
 app.add_typer(reruns.app)
 app.add_typer(log.app, name="log")
 app.add_typer(trials.app)
+app.add_typer(sweeps.app)
+app.add_typer(linears.app)
 app.add_typer(scenarios.app, name="scenario")
 app.add_typer(changes.app, name="set")
 

@@ -62,15 +62,27 @@ def load(source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[
             return parse(source.text, source.name, spread(source, _pairs(overrides))) if overrides else source
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
+    text, folder = written_text(source)
+    return parse(text, str(source), overrides, folder)
+
+
+def written_text(source: str | Path) -> tuple[str, Path]:
+    """Returns a scenario as its author wrote it, and the folder where files lie that it names.
+
+    Args:
+        source: a shipped name, or a path.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
     name = str(source)
-    if isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name:
-        try:
-            text = Path(source).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not UTF-8 text"
-            raise ScenarioError(f"cannot be read: {reason}", source=name) from None
-        return parse(text, name, overrides, Path(source).parent)
-    return parse(shipped_text(name), name, overrides)
+    if not (isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name):
+        return shipped_text(name), Path()
+    try:
+        return Path(source).read_text(encoding="utf-8"), Path(source).parent
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ScenarioError(f"cannot be read: {reason}", source=name) from None
 
 
 def site_named(scenario: Scenario, name: str) -> SiteSpec:
@@ -161,7 +173,8 @@ def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> Non
 
     Args:
         tables: as read from TOML.
-        overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word. One
+        overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word. A number
+            means what stands there in a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. One
             that names a kind (a link's model or preset, a law) replaces what the table said besides.
     """
     pairs = _pairs(overrides)
@@ -172,16 +185,44 @@ def override(tables: Table, overrides: Mapping[str, Any] | Sequence[str]) -> Non
         if len(folders) > 1 and folders[0] == "sites" and isinstance(sites, dict) and folders[1] not in sites:
             hint = nearest(folders[1], list(sites)) or f"; its sites are {', '.join(sites)}"
             raise ScenarioError(f"no such site{hint}", path=key)
-        table = tables
-        for depth, folder in enumerate(folders):
-            entry = table.setdefault(folder, {})
-            if not isinstance(entry, dict):
-                raise ScenarioError("is a value, not a table", path=".".join(folders[: depth + 1]))
-            table = entry
+        table = _reached(tables, folders, last)
+        if isinstance(table, list):
+            table[_place(table, last, key)] = value
+            continue
         if last in _KINDS:  # what the file says is of another kind
             for other in [k for k in table if ".".join([*folders, k]) not in overridden]:
                 del table[other]
         table[last] = value
+
+
+def _reached(tables: Table, folders: Sequence[str], last: str) -> Table | list[Any]:
+    """Returns the table or list that dotted keys lead to; tables that are not there are made.
+
+    Args:
+        tables: where to begin.
+        folders: keys of tables, and numbers of what stands in a list.
+        last: the key that will be sought in it.
+    """
+    reached: Any = tables
+    for depth, name in enumerate(folders):
+        path = ".".join(folders[: depth + 1])
+        if isinstance(reached, list):
+            entry = reached[_place(reached, name, path)]
+        else:
+            after = (*folders, last)[depth + 1]
+            entry = reached.setdefault(name, [] if after.isdecimal() else {})
+        if not isinstance(entry, dict | list):
+            raise ScenarioError("is a value, not a table", path=path)
+        reached = entry
+    return reached  # type: ignore[no-any-return]
+
+
+def _place(entries: list[Any], name: str, path: str) -> int:
+    """Returns the place in a list that a part of a key means."""
+    if not name.isdecimal() or int(name) >= len(entries):
+        counted = f"it has {len(entries)}, counted from 0" if entries else "it has none"
+        raise ScenarioError(f"no such entry: {counted}", path=path)
+    return int(name)
 
 
 def _pairs(overrides: Mapping[str, Any] | Sequence[str]) -> list[tuple[str, Any]]:

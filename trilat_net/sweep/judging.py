@@ -5,11 +5,13 @@ Law: the word is that of the certificate, on the same numbers: a log of the same
 
 import math
 
+import msgspec
+
 from ..analysis.quantities import SETTLED_RAD
 from ..certificate.ending import Motion, ending
 from ..scenario import Scenario, parse
 from ..sim.fused import FusedRun, check_fuses
-from .outcome import VERDICT_OF, Outcome
+from .outcome import VERDICT_OF, Outcome, Verdict
 
 FLAT = 0.02
 """An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
@@ -28,7 +30,8 @@ def judge(text: str, longest_s: float) -> Outcome:
     """Runs a cell in virtual time and returns what became of it.
 
     A run that has not made itself plain when its time is over (see `plain`) goes on for as long again, and so
-    on; its numbers are those of one run.
+    on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for a
+    trend of a run in which anything is drawn: such errors wander, and a slow trend is chance.
 
     Args:
         text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
@@ -43,25 +46,28 @@ def judge(text: str, longest_s: float) -> Outcome:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
-    return outcome
+    wanders = scenario.random and outcome.motion in (Motion.GROWS, Motion.DECAYS) and not plain(outcome)
+    return msgspec.structs.replace(outcome, verdict=Verdict.UNDECIDED) if wanders else outcome
 
 
 def plain(outcome: Outcome) -> bool:
     """True where a longer run would hardly be called something else.
 
-    That is: it left its limits; or it came to rest; or over its second half the largest speed at least
-    doubled, or halved; or neither that nor the largest error changed by more than `FLAT`. Near the edge of
+    That is: it left its limits; or it came to rest; or over its second half the largest speed doubled, or
+    that and the largest error halved, at least; or neither changed by more than `FLAT`. Near the edge of
     stability a finite run looks steady whatever it does later.
     """
     if outcome.motion in (Motion.DIVERGED, Motion.CONVERGED):
         return True
     error, speed = (
-        abs(rate_per_s or 0.0) * 0.5 * outcome.ran_s
+        (rate_per_s or 0.0) * 0.5 * outcome.ran_s
         for rate_per_s in (outcome.error_rate_per_s, outcome.speed_rate_per_s)
     )
-    if outcome.motion in (Motion.GROWS, Motion.DECAYS):
+    if outcome.motion is Motion.GROWS:
         return speed >= math.log(2.0)
-    return outcome.motion is Motion.BOUNDED and max(error, speed) <= FLAT
+    if outcome.motion is Motion.DECAYS:
+        return max(error, speed) <= -math.log(2.0)
+    return outcome.motion is Motion.BOUNDED and max(abs(error), abs(speed)) <= FLAT
 
 
 def _outcome(run: FusedRun, extended: int) -> Outcome:

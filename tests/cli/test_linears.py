@@ -1,0 +1,77 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from .running import trilat
+
+AT = ("--pose", "0.07,0.23")
+
+
+def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
+    printed = trilat("linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path).succeeds()
+    for text in ("all sites at (0.0700, 0.2300) rad", "re 1/s", "what moves", "q1 of m1, m2, s", "unstable:"):
+        assert text in printed
+    assert "stable for common delays up to" in printed
+    assert "2 roots are zero by structure" in printed
+
+
+def test_a_negative_pose_is_a_pose(tmp_path: Path) -> None:
+    printed = trilat("linear", "free", "--pose=-0.1,0.3", cwd=tmp_path).succeeds()
+    assert "all sites at (-0.1000, 0.3000) rad" in printed
+
+
+def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
+    over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
+    printed = trilat("linear", "p_d_margin", *AT, *over, cwd=tmp_path).succeeds()
+    assert "control.d from 0.1 to 3: stable from 0.96" in printed
+    assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in printed
+
+
+def test_json_has_all(tmp_path: Path) -> None:
+    over = ("--over", "control.d=0.5:2")
+    told = json.loads(trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds())
+    assert told["verdict"] == "stable"
+    assert len(told["continuous"]["roots"]) == 6
+    (edge,) = told["edges"]["control.d"]
+    assert edge["stable_above"] is True
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_a_figure_is_the_same_file_every_time(kind: str, tmp_path: Path) -> None:
+    files = []
+    for name in ("one", "two"):
+        trilat("linear", "p_d_margin", *AT, "--figure", f"{name}.{kind}", cwd=tmp_path).succeeds()
+        files.append((tmp_path / f"{name}.{kind}").read_bytes())
+    assert files[0] == files[1]
+
+
+REFUSED = {
+    "no scenario": (["papre"], ["papre", "did you mean 'paper'"]),
+    "a pose with letters": (["free", "--pose", "up"], ["--pose is two angles in rad", "'up'"]),
+    "a pose of three": (["free", "--pose", "1,2,3"], ["--pose", "1,2,3"]),
+    "no roots": (["free", "--roots", "0"], ["--roots", "1 to 60"]),
+    "a range without a colon": (["free", "--over", "control.Kd=5"], ["--over reads KEY=LOW:HIGH"]),
+    "a range the wrong way round": (
+        ["free", *AT, "--over", "control.Kd=5:1"],
+        ["from a value to a larger one"],
+    ),
+    "a key that is none": (["free", *AT, "--over", "control.Kq=1:5"], ["control.Kq", "did you mean"]),
+    "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".png, .svg, .pdf"]),
+    "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),
+    "a measured link": (["free", "--set", "link.model=measured"], ["links.", "nobody knows its delay"]),
+    "an arm outside": (["free", "--set", "sites.s.plant=external"], ["sites.s.plant", "simulated"]),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> None:
+    arguments, facts = REFUSED[kind]
+    trilat("linear", *arguments, cwd=tmp_path).refuses(*facts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "map.png").write_text("precious")
+    trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses("map.png", "exists", "--force")
+    assert (tmp_path / "map.png").read_text() == "precious"

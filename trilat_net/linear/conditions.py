@@ -1,0 +1,188 @@
+"""What holds at the end of a run: who is at the arms, who follows whom, and how old what they follow is.
+
+Law: a linear loop has one set of numbers, those in force at the end; whatever was before, or is random, is
+said in a note. What nobody can know beforehand is refused.
+"""
+
+import math
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from ..core.arm import Array
+from ..core.exogenous import Actor, Acts
+from ..core.setup import SiteSetup, Stale
+from ..errors import ScenarioError
+from ..scenario import Scenario
+from ..scenario.link import LinkBase
+from ..scenario.own_law import Own
+from ..scenario.timeline import later_links
+from .age import Age, age_of
+from .field import Rates, rates
+from .matrices import Numbers
+
+
+class Conditions(NamedTuple):
+    """What the linear loop is made of.
+
+    Attributes:
+        sites: what they are built from, in scenario order; their actors are those in force.
+        alpha: who follows whom, shape (N, N), Eq. (6).
+        age_s: how old the sample of j that i uses is, shape (N, N), s; 0 where it uses none.
+        notes: what is to be said of all that.
+    """
+
+    sites: tuple[SiteSetup, ...]
+    alpha: Array
+    age_s: Array
+    notes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites, in order."""
+        return tuple(site.name for site in self.sites)
+
+    def rates(self, i: int, x: Numbers) -> Rates:
+        """Returns the rates of a site, see `field.rates`."""
+        return rates(self.sites[i], x)
+
+
+def conditions(scenario: Scenario) -> Conditions:
+    """Returns what holds at the end of a run.
+
+    Args:
+        scenario: the experiment.
+
+    Raises:
+        ScenarioError: a law is from outside, an arm is outside, or a link is measured.
+    """
+    _refuse(scenario)
+    notes: list[str] = []
+    sites = tuple(_site(scenario, name, notes) for name in scenario.names)
+    alpha = _shares(scenario, sites, notes)
+    age_s = np.zeros_like(alpha)
+    for i, j in zip(*np.nonzero(alpha), strict=True):
+        age_s[i, j] = _age_s(scenario, scenario.names[j], scenario.names[i], notes)
+    if any(site.on_stale.action is not Stale.USE for site in sites):
+        notes.append("rules for stale peers are left out: no peer counts as stale")
+    return Conditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)))
+
+
+def _refuse(scenario: Scenario) -> None:
+    for name, spec in scenario.sites.items():
+        if isinstance(spec.control, Own):
+            raise ScenarioError(
+                f"{spec.control.code} is a law from outside, whose equations nobody here knows; linearised "
+                "are adaptive, adaptive_box, p_d, pd_d and p_f",
+                path=f"sites.{name}.control.law",
+                source=scenario.name,
+            )
+    for name in scenario.external:
+        raise ScenarioError(
+            "is external: nobody here knows the equations of that arm; simulate it with plant = 'simulated'",
+            path=f"sites.{name}.plant",
+            source=scenario.name,
+        )
+
+
+def link_at_end(scenario: Scenario, name: str) -> LinkBase:
+    """Returns what a link is at the end of a run."""
+    end_ns = round(scenario.duration_s * 1e9)
+    link: LinkBase = scenario.links[name]
+    for from_ns, later in later_links(scenario.timeline, name):
+        link = later if from_ns <= end_ns else link
+    return link
+
+
+def _age_s(scenario: Scenario, peer: str, site: str, notes: list[str]) -> float:
+    """Returns how old the samples of a link are, on average, when they are used, s."""
+    name = f"{peer}->{site}"
+    link = link_at_end(scenario, name)
+    if link.measured:
+        raise ScenarioError(
+            "is 'measured': nobody knows its delay beforehand; give a model, as in link.model = 'constant'",
+            path=f"links.{name}.model",
+            source=scenario.name,
+        )
+    if link != scenario.links[name]:
+        notes.append(f"link {name} changes during the run: taken as it is at the end, {link.describe()}")
+    age: Age = age_of(scenario, peer, site, link)
+    if age.most_s - age.least_s > 0.0:
+        notes.append(
+            f"link {name}: the age in use varies, {1e3 * age.least_s:.4g} to {1e3 * age.most_s:.4g} ms; "
+            f"linearised at its mean, {1e3 * age.mean_s:.4g} ms; what the variation does is not in here"
+        )
+    elif link.loss or link.outages_s:
+        notes.append(f"link {name}: what it loses is not in here")
+    return age.mean_s
+
+
+def _shares(scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]) -> Array:
+    """Returns the dominance matrix as it is at the end of the run."""
+    alpha = scenario.alpha.copy()
+    end_ns = round(scenario.duration_s * 1e9)
+    for i, site in enumerate(sites):
+        peers = [scenario.names.index(link.peer) for link in site.links]
+        for ramp in site.ramps:
+            if ramp.start_ns > end_ns:
+                continue
+            whole = ramp.end_ns <= end_ns
+            way = 1.0 if whole else (end_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
+            alpha[i, peers] += way * (np.array(ramp.alpha) - alpha[i, peers])
+            notes.append(f"the shares of {site.name} change during the run: taken as they are at the end")
+    return alpha
+
+
+def _site(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
+    """Returns a site with the actors that are in force at the end."""
+    setup = scenario.setup(name)
+    end_s = scenario.duration_s
+    present = [actor for actor in setup.actors if _present(actor, end_s)]
+    hands = [actor for actor in present if actor.acts in (Acts.HAND, Acts.TASK_HAND)]
+    if any(hand.move_end_s > end_s for hand in hands):
+        notes.append(f"a hand of {name} still moves at the end: taken to be where it moves to")
+    scripted = [actor for actor in present if actor.acts in (Acts.PULSE, Acts.RECORDED)]
+    still = [actor._replace(a=_torque_at(actor, end_s)) for actor in scripted]
+    if any(any(actor.a) for actor in still):
+        notes.append(f"a scripted torque acts on {name} at the end: taken to stay as it is then")
+    return setup._replace(actors=tuple(actor for actor in present if actor not in scripted) + tuple(still))
+
+
+def _present(actor: Actor, t_s: float) -> bool:
+    return actor.start_s <= t_s < actor.end_s
+
+
+def _torque_at(actor: Actor, t_s: float) -> tuple[float, ...]:
+    """Returns what a script does at a time, N m."""
+    if actor.table is None:
+        x = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
+        return tuple(peak * math.sin(math.pi * x) ** 2 for peak in actor.a)
+    t, *torques = actor.table.T
+    return tuple(float(np.interp(t_s, t, torque, left=0.0, right=0.0)) for torque in torques)
+
+
+def staying(scenario: Scenario, duration_s: float) -> Scenario:
+    """Returns the same experiment gone on for longer, with nothing new after its end.
+
+    Args:
+        scenario: the experiment.
+        duration_s: for how long, s.
+    """
+    end_s = scenario.duration_s
+
+    def on(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+        begun = [actor for actor in actors if getattr(actor, "start_s", 0.0) <= end_s]
+        return tuple(
+            msgspec.structs.replace(actor, end_s=1e9)
+            if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
+            else actor
+            for actor in begun
+        )
+
+    sites = {
+        name: msgspec.structs.replace(spec, hands=on(spec.hands), environment=on(spec.environment))
+        for name, spec in scenario.sites.items()
+    }
+    timeline = tuple(change for change in scenario.timeline if change.at_s <= end_s)
+    return msgspec.structs.replace(scenario, sites=sites, timeline=timeline, duration_s=duration_s)

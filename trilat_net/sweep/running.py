@@ -1,0 +1,228 @@
+"""Runs a sweep on all cores: what is not done yet, and no more.
+
+Law: results are a function of the plan; neither the number of processes, nor the order in which they end, nor
+how often the sweep was interrupted enters them. A run that is in the journal is never made again.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from itertools import islice
+from typing import NamedTuple
+
+from ..errors import RunFailed, UsageError
+from ..net.clock import SystemClock
+from ..workers import cores, deaf, workers
+from . import judging
+from .cell import Entry, Task, run_cell
+from .folder import Folder
+from .journal import Journal
+from .place import PLACES, places, places_parquet
+from .plan import Plan
+from .table import Results, parquet, polars, rows_of, write_whole
+
+MOST_RUNS = 1_000_000
+MOST_S = 86_400.0
+"""A sweep of more, or one that would take longer, is asked about first."""
+_PROBES = 7
+_PROBING_S = 3.0
+"""So many runs tell how long all will take; fewer, once that has taken so long."""
+_WAITING = 2
+"""So many runs are under way or wait, per process: enough that none is idle."""
+
+Told = Callable[[int, int], None]
+Map = Callable[[Iterable[Task]], Iterator[Entry]]
+
+
+class Estimate(NamedTuple):
+    """How long a sweep will take, by a few of its runs, which are done then.
+
+    Attributes:
+        runs: how many there are at most, those that are done left out.
+        seconds: how long they will take on the processes that were asked for.
+        entries: the runs that were made.
+    """
+
+    runs: int
+    seconds: float
+    entries: list[Entry]
+
+
+class Speed(NamedTuple):
+    """How fast a sweep went, this time.
+
+    Attributes:
+        runs: how many were made.
+        simulated_s: how much time of the experiment that was.
+        wall_s: how long it took.
+        jobs: by how many processes.
+    """
+
+    runs: int
+    simulated_s: float
+    wall_s: float
+    jobs: int
+
+    @property
+    def times_real_time(self) -> float:
+        """Simulated seconds per second of one process."""
+        return self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
+
+
+class Swept(NamedTuple):
+    """A sweep that has come to its end.
+
+    Attributes:
+        results: what came of it.
+        folder: where it is.
+        speed: of what was run this time.
+    """
+
+    results: Results
+    folder: Folder
+    speed: Speed
+
+
+def estimate(asked: Plan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None) -> Estimate:
+    """Returns how long a sweep will take, by its first and last run and some between.
+
+    Args:
+        asked: the sweep.
+        done: cells and seeds that are done already.
+        jobs: in how many processes; None for one per core.
+    """
+    known = set(done)
+    places = dict.fromkeys(n * (asked.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
+    probes = [asked.task(n, asked.seeds[0]) for n in places if (n, asked.seeds[0]) not in known]
+    if not probes:
+        return Estimate(asked.cells * len(asked.seeds) - len(known), 0.0, [])
+    first = probes[0]
+    brief_s = min(1.0, asked.base.duration_s)
+    warm = asked.written.scenario(*first.overrides, f"duration_s={brief_s!r}")
+    judging.judge(warm.text, brief_s)  # compiles, once for all processes
+    clock = SystemClock()
+    began_ns = clock.monotonic_ns()
+    entries: list[Entry] = []
+    took_s = 0.0
+    for task in probes:
+        if took_s < _PROBING_S:
+            entries.append(run_cell(task))
+            took_s = (clock.monotonic_ns() - began_ns) * 1e-9
+    seeds = len(asked.seeds) if any(entry.random for entry in entries) else 1
+    left = max(len(entries), asked.cells * seeds - len(known))
+    return Estimate(left, took_s / len(entries) * left / min(jobs or cores(), left), entries)
+
+
+def refuse_enormous(asked: Plan, expected: Estimate, jobs: int | None = None) -> None:
+    """Refuses a sweep of very many runs, or of more than a day.
+
+    Raises:
+        UsageError: it is one; says how many runs, and how long they would take.
+    """
+    if expected.runs <= MOST_RUNS and expected.seconds <= MOST_S:
+        return
+    sizes = " x ".join(str(count) for count in asked.shape if count > 1)
+    seeds = f", {len(asked.seeds)} seeds each" if len(asked.seeds) > 1 else ""
+    raise UsageError(
+        f"{asked.cells} cells ({sizes}{seeds}) would take about {spoken(expected.seconds)} on "
+        f"{jobs or cores()} cores; larger steps make it fewer, --yes runs it all the same"
+    )
+
+
+def spoken(seconds: float) -> str:
+    """Returns a time as people say it."""
+    for unit, size, from_s in (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0)):
+        if seconds >= from_s:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{max(1, round(seconds))} s"
+
+
+def run(
+    folder: Folder,
+    jobs: int | None = None,
+    progress: Told = lambda _done, _total: None,
+    known: Iterable[Entry] = (),
+) -> Swept:
+    """Runs what is left of a sweep, writes its results, and returns them.
+
+    Args:
+        folder: of the sweep; what its journal has is not run again.
+        jobs: in how many processes; None for one per core.
+        progress: told how many runs are done, and how many there are as far as is known.
+        known: runs that were made already, for an estimate.
+
+    Raises:
+        ScenarioError: a cell cannot run; says which. What is done is kept.
+        RunFailed: a process was ended by somebody. What is done is kept.
+        UsageError: polars is not installed.
+    """
+    polars()
+    asked = folder.plan
+    clock = SystemClock()
+    with folder.journal() as journal:
+        for entry in known:
+            journal.add(entry)
+        before, began_ns = set(journal.done), clock.monotonic_ns()
+        left = asked.cells * len(asked.seeds) - len(before)
+        count = max(1, min(jobs or cores(), left))
+        with _crew(count if left else 1) as crew:
+            _run_cells(asked, journal, crew, progress)
+        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        made = [entry for key, entry in journal.done.items() if key not in before]
+        rows = rows_of(asked, list(journal.done.values()))
+    results = Results(asked, rows)
+    if len(asked.seeds) > 1:
+        write_whole(folder.path / PLACES, places_parquet(asked, places(results)))
+    write_whole(folder.results, parquet(asked, rows, folder.facts))
+    speed = Speed(len(made), sum(entry.outcome.ran_s for entry in made), wall_s, count)
+    return Swept(results, folder, speed)
+
+
+def _run_cells(asked: Plan, journal: Journal, crew: Map, progress: Told) -> None:
+    """Runs the first seed of every cell, then the others of those in which anything is random."""
+    first, *others = asked.seeds
+
+    def total() -> int:
+        random = sum(entry.random for (_, seed), entry in journal.done.items() if seed == first)
+        return asked.cells + random * len(others)
+
+    def make(runs: Iterable[tuple[int, int]], count: int) -> None:
+        for entry in crew(asked.task(*key) for key in runs if key not in journal.done):
+            journal.add(entry)
+            progress(len(journal.done), count)
+
+    make(((number, first) for number in range(asked.cells)), asked.cells)
+    again = [number for number in range(asked.cells) if others and journal.done[number, first].random]
+    make(((number, seed) for number in again for seed in others), total())
+
+
+@contextmanager
+def _crew(jobs: int) -> Iterator[Map]:
+    """Yields what makes runs, as they end; one process is this one."""
+    if jobs <= 1:
+        yield lambda tasks: map(run_cell, tasks)
+        return
+    with workers(jobs) as pool:
+        yield lambda tasks: _made(pool, iter(tasks), jobs * (1 + _WAITING))
+
+
+def _made(pool: ProcessPoolExecutor, tasks: Iterator[Task], most: int) -> Iterator[Entry]:
+    """Yields runs as they end; so many are under way or wait at a time, however many there are."""
+    under_way: set[Future[Entry]] = set()
+    try:
+        with deaf():  # here the processes begin
+            under_way |= {pool.submit(run_cell, task) for task in islice(tasks, 1)}
+        while True:
+            under_way |= {pool.submit(run_cell, task) for task in islice(tasks, most - len(under_way))}
+            if not under_way:
+                return
+            ended, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            for future in ended:
+                yield future.result()
+    except BrokenProcessPool:
+        raise RunFailed(
+            "a process of the sweep was ended, or could not begin; what is done is kept: go on with "
+            "--resume, perhaps with --jobs 1"
+        ) from None
