@@ -15,6 +15,7 @@ COMMANDS = [
     ["sim"],
     ["test"],
     ["sweep"],
+    ["linear"],
     ["rerun"],
     ["verify"],
     ["report"],

@@ -32,7 +32,7 @@ def test_hands_that_have_let_go_are_not_there_and_those_that_hold_are() -> None:
 def test_what_varies_is_said_with_its_mean() -> None:
     found = conditions(load("jitter", {"duration_s": 5.0}))
     assert found.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
-    assert any("linearised at its mean" in note for note in found.notes)
+    assert any("linearised at the mean of each" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,13 @@ import pytest
 
 from tests.linear.loops import RODS
 from tests.virtual_runs import trajectories
+from trilat_net.core.grid import BUCKETS_PER_S
 from trilat_net.linear import analyse, linearised, rest_of
 from trilat_net.linear.margin import with_common_delay
+from trilat_net.linear.rest import rest_near
 from trilat_net.linear.roots import spectrum
 from trilat_net.scenario import load
+from trilat_net.sim.fused import FusedRun
 
 POSE = (-0.1236, 0.3373)
 
@@ -88,3 +91,28 @@ def test_a_run_decays_as_its_rightmost_root_says() -> None:
     slope, _ = np.polyfit(half_s * np.arange(len(peaks)), np.log(peaks), 1)
     assert slope == pytest.approx(root.s.real, rel=0.01)
     assert math.pi / half_s == pytest.approx(root.s.imag, rel=2e-3)
+
+
+def test_a_rest_with_wrong_estimates_can_be_unstable_and_the_run_leaves_it_for_another() -> None:
+    """The theorem says that every run settles, not that every rest is stable.
+
+    The estimates of a run without delay, at 100 ms: a small swing grows as its root says, the estimates move
+    with it, and it dies away.
+    """
+    scenario = load("paper", {"link.delay_ms": 0.0})
+    rest = rest_of(scenario)
+    begun: dict[str, object] = {"link.delay_ms": 100.0, "duration_s": 400.0}
+    for i, name in enumerate(scenario.names):
+        off = 1e-4 * (i - 1) * np.array([1.0, -0.5])
+        begun[f"sites.{name}.hands"] = []
+        begun[f"sites.{name}.q0_rad"] = (rest.q.mean(axis=0) + off).tolist()
+        begun[f"sites.{name}.control.theta_hat0"] = rest.theta_hat[i].tolist()
+    late = load("paper", begun)
+    root = spectrum(linearised(late, rest_near(late, rest)), 1).roots[0].s
+    run = FusedRun(late)
+    run.advance(late.duration_s)
+    speeds = np.max([site[:, 1] for site in run.maxima], axis=0)
+    at = {t_s: speeds[(t_s - 1) * BUCKETS_PER_S : t_s * BUCKETS_PER_S].max() for t_s in (60, 100, 200, 400)}
+    assert root.real > 0.02
+    assert math.log(at[100] / at[60]) / 40.0 == pytest.approx(root.real, rel=0.05)
+    assert at[400] < 0.2 * at[200]

@@ -1,6 +1,7 @@
 """The command of linear analysis: linear."""
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,9 +15,19 @@ from .options import ForceOption, ScenarioArgument, SetOption, out
 
 if TYPE_CHECKING:
     from ..linear import Analysis, Edge
+    from ..ports.section import PortSection
     from ..scenario import Scenario
 
 app = typer.Typer()
+
+
+class Plate(StrEnum):
+    """What `--draw` draws."""
+
+    ROOTS = "roots"
+    IMPEDANCE = "impedance"
+    PASSIVITY = "passivity"
+
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 _KINDS = ("png", "svg", "pdf")
@@ -38,32 +49,42 @@ def linear(
         list[str] | None,
         typer.Option("--over", metavar="KEY=LOW:HIGH", help="Say where stability changes; repeatable."),
     ] = None,
+    ports: Annotated[
+        bool, typer.Option("--ports/--no-ports", help="What hands feel, and whether it is passive there.")
+    ] = True,
     picture: Annotated[
-        Path | None, typer.Option("--figure", metavar="FILE", help="Draw the roots: .png, .svg or .pdf.")
+        Path | None, typer.Option("--figure", metavar="FILE", help="Draw it: .png, .svg or .pdf.")
     ] = None,
+    what: Annotated[
+        Plate, typer.Option("--draw", help="What is drawn: roots, what hands feel, or passivity.")
+    ] = Plate.ROOTS,
     force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")] = False,
 ) -> None:
-    """Says how small motions about the resting pose grow or die: roots, delay margin, edges of stability.
+    """Says how small motions about the resting pose grow or die, and what hands feel of each other.
 
-    The loop is linearised with its delays; docs/linear.md defines every word. Exit code 0 whatever the
-    verdict.
+    The loop is linearised with its delays: roots, delay margin, edges of stability (docs/linear.md); then,
+    with hands and environments off, passivity, Llewellyn's criterion, impedance and Z-width (docs/ports.md).
+    Exit code 0 whatever the verdict.
     """
     if picture is not None:
         _check_picture(picture, force=force)
     spans = [_range(text) for text in over or []]
     from ..linear import analyse, edges
+    from ..ports.section import port_section
 
     found = analyse(scenario, overrides or [], pose=_pose(pose), roots=roots)
     lines = {key: list(edges(found.scenario, key, low, high, found.rest)) for key, low, high in spans}
+    wanted = ports or (picture is not None and what is not Plate.ROOTS)
+    section = port_section(found.scenario, found.rest) if wanted else None
     if picture is not None:
-        from ..linear.figure import write_root_map
-
-        write_root_map(found, picture)
+        _draw(found, section, what, picture)
     if as_json:
-        _print_json(found, lines)
+        _print_json(found, lines, section)
         return
     _show(found)
+    if ports and section is not None:
+        _show_ports(section)
     for (key, low, high), line in zip(spans, lines.values(), strict=True):
         out.print(escape(_edge_words(key, low, high, line, found.scenario)), soft_wrap=True)
     if picture is not None:
@@ -102,10 +123,24 @@ def _check_picture(path: Path, *, force: bool) -> None:
         raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
-def _print_json(found: "Analysis", lines: "dict[str, list[Edge]]") -> None:
+def _draw(found: "Analysis", section: "PortSection | None", what: Plate, path: Path) -> None:
+    """Writes a figure."""
+    from ..linear.figure import root_map, write_figure
+    from ..ports.figure import impedance_figure, passivity_figure
+
+    if section is None or what is Plate.ROOTS:
+        write_figure(lambda: root_map(found), path)
+        return
+    drawn = impedance_figure if what is Plate.IMPEDANCE else passivity_figure
+    write_figure(lambda: drawn(section), path)
+
+
+def _print_json(found: "Analysis", lines: "dict[str, list[Edge]]", section: "PortSection | None") -> None:
     from ..linear.facts import facts
+    from ..ports.words import port_facts
 
     told = facts(found)
+    told["ports"] = None if section is None else port_facts(section)
     told["edges"] = {key: [one._asdict() for one in line] for key, line in lines.items()}
     typer.echo(json.dumps(told, indent=2, ensure_ascii=False, allow_nan=False))
 
@@ -129,6 +164,14 @@ def _show(found: "Analysis") -> None:
     out.print(escape(words.margin_line(found)), soft_wrap=True)
     for note in found.notes:
         out.print(f"note: {escape(note)}", soft_wrap=True)
+
+
+def _show_ports(section: "PortSection") -> None:
+    """Prints what there is to say of the ports."""
+    from ..ports.words import port_lines
+
+    for line in port_lines(section):
+        out.print(escape(line), soft_wrap=True)
 
 
 def _edge_words(key: str, low: float, high: float, line: "list[Edge]", scenario: "Scenario") -> str:

@@ -62,8 +62,13 @@ def conditions(scenario: Scenario) -> Conditions:
     sites = tuple(_site(scenario, name, notes) for name in scenario.names)
     alpha = _shares(scenario, sites, notes)
     age_s = np.zeros_like(alpha)
-    for i, j in zip(*np.nonzero(alpha), strict=True):
-        age_s[i, j] = _age_s(scenario, scenario.names[j], scenario.names[i], notes)
+    found = {
+        (i, j): _age(scenario, scenario.names[j], scenario.names[i], notes)
+        for i, j in zip(*np.nonzero(alpha), strict=True)
+    }
+    for (i, j), age in found.items():
+        age_s[i, j] = age.mean_s
+    notes += _varying([age for age in found.values() if age.most_s > age.least_s])
     if any(site.on_stale.action is not Stale.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
     return Conditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)))
@@ -95,8 +100,8 @@ def link_at_end(scenario: Scenario, name: str) -> LinkBase:
     return link
 
 
-def _age_s(scenario: Scenario, peer: str, site: str, notes: list[str]) -> float:
-    """Returns how old the samples of a link are, on average, when they are used, s."""
+def _age(scenario: Scenario, peer: str, site: str, notes: list[str]) -> Age:
+    """Returns how old the samples of a link are when they are used."""
     name = f"{peer}->{site}"
     link = link_at_end(scenario, name)
     if link.measured:
@@ -107,15 +112,21 @@ def _age_s(scenario: Scenario, peer: str, site: str, notes: list[str]) -> float:
         )
     if link != scenario.links[name]:
         notes.append(f"link {name} changes during the run: taken as it is at the end, {link.describe()}")
-    age: Age = age_of(scenario, peer, site, link)
-    if age.most_s - age.least_s > 0.0:
-        notes.append(
-            f"link {name}: the age in use varies, {1e3 * age.least_s:.4g} to {1e3 * age.most_s:.4g} ms; "
-            f"linearised at its mean, {1e3 * age.mean_s:.4g} ms; what the variation does is not in here"
-        )
-    elif link.loss or link.outages_s:
-        notes.append(f"link {name}: what it loses is not in here")
-    return age.mean_s
+    if link.outages_s:
+        notes.append(f"the outages of link {name} are not in here")
+    return age_of(scenario, peer, site, link)
+
+
+def _varying(ages: list[Age]) -> list[str]:
+    """Returns what is to be said of links whose samples are not always equally old."""
+    if not ages:
+        return []
+    least, most = 1e3 * min(age.least_s for age in ages), 1e3 * max(age.most_s for age in ages)
+    links = "one link" if len(ages) == 1 else f"{len(ages)} links"
+    return [
+        f"the age of the samples in use varies on {links}, {least:.4g} to {most:.4g} ms: linearised at the "
+        "mean of each; what the variation itself does is not in here"
+    ]
 
 
 def _shares(scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]) -> Array:

@@ -47,9 +47,9 @@ def nearest(now: Conditions, rest: Rest) -> Rest:
         if np.abs(left).max() <= ENOUGH:
             break
         loop = loop_of(now, rest)
-        still = [n for n, name in enumerate(loop.names) if ".qd" not in name]
+        free = _free(loop)
         step = np.zeros(len(loop.names))
-        step[still] = np.linalg.lstsq(settled(loop)[:, still], -left, rcond=_FLAT)[0]
+        step[free] = np.linalg.lstsq(settled(loop)[:, free], -left, rcond=_FLAT)[0]
         share = min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), _LARGEST_STEP))
         tried, after = rest, left
         for _ in range(_HALVINGS):  # a wall met on the way turns the next step
@@ -62,6 +62,16 @@ def nearest(now: Conditions, rest: Rest) -> Rest:
             break
         rest, left = tried, after
     return rest._replace(residual=float(np.abs(left).max()))
+
+
+def _free(loop: Loop) -> list[int]:
+    """Returns the states that an equilibrium may be moved along.
+
+    Velocities are zero, and what nothing moves (an estimate without a gain, one held at an end of its box)
+    stays where the run has it.
+    """
+    movers = np.hstack([loop.A, *(delayed.A for delayed in loop.delayed)])
+    return [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(movers[n])]
 
 
 def settled(loop: Loop) -> Array:

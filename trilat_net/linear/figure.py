@@ -3,6 +3,7 @@
 Law: every root that was found is drawn, conjugate ones too; the imaginary axis is the edge of stability.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,15 @@ KINDS = tuple(_UNDATED)
 _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
 
 
-def write_root_map(found: Analysis, path: Path) -> None:
-    """Writes the map of an analysis as a file, the same bytes every time.
+def write_figure(drawn: Callable[[], Figure], path: Path) -> None:
+    """Writes a figure as a file, the same bytes every time.
 
     Args:
-        found: the analysis.
+        drawn: draws it.
         path: where to, ending in one of `KINDS`.
     """
     with mpl.rc_context(_RC):
-        root_map(found).savefig(path, dpi=style.DPI, metadata=_UNDATED[path.suffix.lower()])
+        drawn().savefig(path, dpi=style.DPI, metadata=_UNDATED[path.suffix.lower()])
 
 
 def root_map(found: Analysis) -> Figure:

@@ -26,6 +26,8 @@ from .threads import one_thread
 
 MOST_S = 10.0
 """Longer delays no link has."""
+_SHOWN = 3
+"""Ranges of delays that are told one by one."""
 _POINTS = 600
 _LOWEST = 1e-4
 """The lowest frequency, as a share of the highest at which anything can cross."""
@@ -82,7 +84,8 @@ class Margin(NamedTuple):
         texts = [_span_words(span) for span in self.spans]
         if texts == [""]:
             return f"stable for every common delay up to {MOST_S:g} s"
-        return "stable for common delays " + " and ".join(texts)
+        more = f", and in {len(texts) - _SHOWN} more ranges" if len(texts) > _SHOWN else ""
+        return f"stable for common delays {', '.join(texts[:_SHOWN])}{more}"
 
 
 def _span_words(span: Span) -> str:

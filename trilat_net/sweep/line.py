@@ -17,8 +17,6 @@ from .plane import Side
 
 At = Callable[[float, float], Scenario]
 """The scenario of a panel at (x, y)."""
-Growths = Callable[[Sequence[Scenario]], tuple[list[float], list[str]]]
-"""The real parts of the rightmost roots of a column's scenarios, and why some have none."""
 
 _TOLERANCE = 1e-6
 _MOST = 60
@@ -50,7 +48,7 @@ class Line(NamedTuple):
         return bool((known > 0.0).any() and (known <= 0.0).any())
 
     def crossings(self, column: int, y: Side) -> list[float]:
-        """Returns where it crosses a column, from below: in the right cell, and straight between its places."""
+        """Returns where it crosses a column, from below; between two places as if it went straight."""
         spare, values = self.spare[:, column], y.values
         found = []
         for n in range(len(values) - 1):
@@ -78,15 +76,15 @@ def closed_form(at: At, x: Side, y: Side) -> Line | None:
 
 
 def linear(columns: Sequence[tuple[list[float], list[str]]]) -> tuple[Line | None, list[str]]:
-    """Returns the line of the linear analysis, and why places lack it.
+    """Returns the line of the linear analysis, and what is to be known of it.
 
     Args:
-        columns: per value of the x axis the real parts of the rightmost roots, 1/s, and reasons.
+        columns: per value of the x axis the real parts of the rightmost roots, 1/s, and remarks.
     """
     spare = -np.array([growths for growths, _ in columns]).T
-    reasons = list(dict.fromkeys(why for _, some in columns for why in some))
+    remarks = list(dict.fromkeys(remark for _, some in columns for remark in some))
     line = Line(LINEAR, LINEAR, _ABOUT, np.where(np.isinf(spare), np.nan, spare), 1)
-    return line if line.there else None, [f"no linear analysis: {why}" for why in reasons]
+    return line if line.there else None, remarks
 
 
 def met(condition: Callable[[float], Criterion | None], low: float, high: float) -> float | None:

@@ -12,39 +12,56 @@ from ..core.setup import Scheme
 from ..errors import ScenarioError
 from ..linear import Rest, edge, rest_of
 from ..linear.conditions import conditions
+from ..linear.field import adapts
 from ..linear.loop import loop_of
 from ..linear.rest import knows_gravity, predicted_rest, rest_near
 from ..linear.roots import spectrum
 from ..linear.sampled import sampled_spectrum
 from ..scenario import Scenario
 
+LEARNING = (
+    "the linear analysis of a law that learns is about the mean start pose, with estimates that are the "
+    "truth: where a run rests follows from all that happened before"
+)
+
 
 def growths(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:
     """Returns the real part of the rightmost root of some scenarios beside each other, 1/s.
-
-    Where the first rests is found once, and moved along.
 
     Args:
         scenarios: each a small step from the one before.
 
     Returns:
-        The real parts, NaN where there is no linear loop, and why that is, each reason once.
+        The real parts, NaN where there is no linear loop; and what is to be known of them, once each.
     """
     rest: Rest | None = None
     found: list[float] = []
-    reasons: dict[str, None] = {}
+    remarks: dict[str, None] = {}
     for scenario in scenarios:
         try:
-            if rest is None:
-                known = knows_gravity(conditions(scenario))
-                rest = predicted_rest(scenario) if known else rest_of(scenario)
-            else:
-                rest = rest_near(scenario, rest)
+            rest, remark = _rest(scenario, rest)
             found.append(_growth(scenario, rest))
         except ScenarioError as error:
-            reasons[error.problem] = None
+            remark = f"no linear analysis: {error.problem}"
             found.append(float("nan"))
-    return found, list(reasons)
+        if remark:
+            remarks[remark] = None
+    return found, list(remarks)
+
+
+def _rest(scenario: Scenario, before: Rest | None) -> tuple[Rest, str]:
+    """Returns what a scenario is linearised about, and what is to be known of it.
+
+    What rests by itself wherever it is, is looked at where it comes to by its linear loop; arms that somebody
+    holds, where a run of the first scenario of them ends, and from there on at the next equilibrium.
+    """
+    now = conditions(scenario)
+    if knows_gravity(now):
+        return predicted_rest(scenario), ""
+    if any(map(adapts, now.sites)) and not any(site.actors for site in now.sites):
+        first, second = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0).tolist()
+        return rest_of(scenario, (first, second)), LEARNING
+    return (rest_of(scenario) if before is None else rest_near(scenario, before)), ""
 
 
 def _growth(scenario: Scenario, rest: Rest) -> float:

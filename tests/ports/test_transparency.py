@@ -3,11 +3,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.linear.networks import Network, Wire, pair
+from tests.ports.networks import Network, Wire, pair
 from trilat_net.errors import UsageError
-from trilat_net.linear.load import CLAMPED, FREE, Load
-from trilat_net.linear.port import on_axis
-from trilat_net.linear.transparency import Felt, felt, transmitted
+from trilat_net.ports.load import CLAMPED, FREE, Load
+from trilat_net.ports.port import on_axis
+from trilat_net.ports.transparency import Felt, felt, transmitted
 
 W = np.geomspace(1e-2, 1e2, 41)
 S = 1j * W

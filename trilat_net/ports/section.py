@@ -11,11 +11,13 @@ import numpy as np
 
 from ..core.arm import Array
 from ..errors import UsageError
+from ..linear.conditions import Conditions, conditions
+from ..linear.loop import Loop, Rest
+from ..linear.roots import spectrum
 from ..scenario import Scenario
 from .absolute import left_at, llewellyn, llewellyn_rounding, weighed
-from .conditions import Conditions, conditions
+from .curve import HIGH_HZ, LOW_HZ, Dips, dips, grid, refined, remembered, resolved_hz
 from .load import CLAMPED, loaded
-from .loop import Loop, Rest
 from .passivity import ROUNDING, Passivity, passivity
 from .port import (
     Complex,
@@ -32,8 +34,6 @@ from .port import (
     sites,
     transfer,
 )
-from .port_curve import HIGH_HZ, LOW_HZ, Dips, dips, grid, refined, remembered, resolved_hz
-from .roots import spectrum
 from .teleoperator import proof_output, proof_weights, teleoperator
 from .transparency import Felt, felt
 

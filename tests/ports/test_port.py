@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.linear.networks import Network, Wire, pair
+from tests.ports.networks import Network, Wire, pair
 from trilat_net.errors import RuntimeFault
-from trilat_net.linear.port import (
+from trilat_net.ports.port import (
     Output,
     admittance,
     axes,

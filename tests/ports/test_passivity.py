@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.linear.networks import Network, Wire, pair
-from trilat_net.linear.passivity import Passivity, least_eigenvalue, passivity, weighted
-from trilat_net.linear.port import admittance, longest_s
-from trilat_net.linear.port_curve import grid, refined
+from tests.ports.networks import Network, Wire, pair
+from trilat_net.ports.curve import grid, refined
+from trilat_net.ports.passivity import Passivity, least_eigenvalue, passivity, weighted
+from trilat_net.ports.port import admittance, longest_s
 
 POSITIVE = st.floats(0.1, 10.0)
 OR_NONE = st.just(0.0) | POSITIVE

@@ -1,7 +1,7 @@
 import json
 
-from tests.linear.test_port_section import section_of
-from trilat_net.linear.port_words import port_facts, port_lines
+from tests.ports.test_section import section_of
+from trilat_net.ports.words import port_facts, port_lines
 
 
 def test_what_is_passive_is_said_in_a_word_each() -> None:
@@ -9,7 +9,7 @@ def test_what_is_passive_is_said_in_a_word_each() -> None:
     assert lines[0].startswith("Ports of m, s, hands and environments off, 0.001-100 Hz")
     assert "evidence, no proof" in lines[0]
     assert "  hands passive in qd: passive" in lines
-    assert "    Llewellyn, m and s, joint 1: holds" in lines
+    assert "    Llewellyn, every pair and joint: holds (2 two-ports)" in lines
     assert not any(" r = " in line for line in lines)
     assert sum("Z-width" in line for line in lines) == 2
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from ..core.arm import Array
 from ..errors import UsageError
+from ..linear.loop import Loop
 from .load import CLAMPED, FREE, Load, loaded
-from .loop import Loop
 from .port import Complex, admittance, inverse, ports_of, sites
 
 BAND_HZ = (0.1, 10.0)

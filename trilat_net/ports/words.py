@@ -6,9 +6,9 @@ Law: every answer stands with its number, its unit and its frequency; the grid i
 import math
 from typing import Any
 
+from .curve import Dips, Span
 from .passivity import Passivity
-from .port_curve import Dips, Span
-from .port_section import PortSection, TwoPort
+from .section import PortSection, TwoPort
 from .transparency import Felt
 
 _AT_HZ = 1.0
@@ -42,7 +42,7 @@ def port_lines(section: PortSection) -> list[str]:
             f"  hands passive in r = qd + Lambda e, as the proof asks: {_proof(section, section.proof)}"
         )
     lines.append(f"  any passive hands in qd, best weights: {_absolute(section)}")
-    lines += [f"    Llewellyn, {_two_port(one)}" for one in section.two_ports]
+    lines += [f"    Llewellyn, {text}" for text in _two_ports(section)]
     if section.clamped_verdict == "unstable":
         lines.append(
             f"  with {section.felt[0].of} clamped the loop is unstable: nothing steady is felt of it"
@@ -85,11 +85,19 @@ def _absolute(section: PortSection) -> str:
     return f"{can} it unstable {_spans(dips.below)}; margin {dips.least:.3g} at {dips.least_hz:.3g} Hz"
 
 
+def _two_ports(section: PortSection) -> list[str]:
+    """Returns where it fails, and for how many it holds."""
+    failing = [one for one in section.two_ports if one.dips.below]
+    holding = len(section.two_ports) - len(failing)
+    third = ", the third site free or clamped" if any(one.clamped for one in section.two_ports) else ""
+    every = f"every pair and joint{third}" if not failing else "the others"
+    counted = [f"{every}: holds ({holding} two-ports)"] if holding else []
+    return [*map(_two_port, failing), *counted]
+
+
 def _two_port(one: TwoPort) -> str:
     third = f", {one.clamped} clamped" if one.clamped else ""
     where = f"{one.sites[0]} and {one.sites[1]}{third}, joint {one.joint}"
-    if not one.dips.below:
-        return f"{where}: holds"
     return (
         f"{where}: fails {_spans(one.dips.below)}; least {one.dips.least:.3g} at {one.dips.least_hz:.3g} Hz"
     )

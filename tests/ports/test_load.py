@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.linear.networks import Network, Wire, pair
+from tests.ports.networks import Network, Wire, pair
 from trilat_net.errors import UsageError
-from trilat_net.linear.absolute import left_at
-from trilat_net.linear.load import CLAMPED, FREE, Load, loaded
 from trilat_net.linear.loop import Loop
-from trilat_net.linear.port import admittance, inverse
+from trilat_net.ports.absolute import left_at
+from trilat_net.ports.load import CLAMPED, FREE, Load, loaded
+from trilat_net.ports.port import admittance, inverse
 
 W = np.geomspace(1e-2, 1e2, 41)
 POSITIVE = st.floats(0.1, 10.0)

@@ -3,9 +3,9 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from tests.linear.test_port_section import section_of
+from tests.ports.test_section import section_of
 from trilat_net.analysis.form import REPORT, Form, printed
-from trilat_net.linear.port_figure import impedance_figure, passivity_figure
+from trilat_net.ports.figure import impedance_figure, passivity_figure
 
 
 @pytest.mark.parametrize("form", [REPORT, printed(3.5)])

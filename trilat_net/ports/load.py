@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.arm import Array
 from ..errors import UsageError
-from .loop import Delayed, Loop
+from ..linear.loop import Delayed, Loop
 from .port import ports_of, sites
 
 

@@ -14,9 +14,9 @@ from matplotlib.ticker import MultipleLocator
 from ..analysis import style
 from ..analysis.form import REPORT, Form
 from ..core.arm import Array
+from .curve import Dips
 from .port import Complex
-from .port_curve import Dips
-from .port_section import PortSection
+from .section import PortSection
 from .transparency import Felt
 
 _CLAMPED: tuple[int, tuple[float, float]] = (0, (4.0, 1.6))

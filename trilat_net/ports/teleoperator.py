@@ -10,8 +10,8 @@ from ..certificate.weights import weights
 from ..core.arm import JOINTS, Array
 from ..core.exogenous import Actor, Acts
 from ..core.setup import Law
-from .conditions import Conditions
-from .loop import Loop, Rest, arguments, loop_of
+from ..linear.conditions import Conditions
+from ..linear.loop import Loop, Rest, arguments, loop_of
 from .port import Output
 
 

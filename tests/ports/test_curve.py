@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.linear.networks import Array, Network, pair
-from trilat_net.linear.port import admittance
-from trilat_net.linear.port_curve import dips, grid, refined, remembered, resolved_hz
+from tests.ports.networks import Array, Network, pair
+from trilat_net.ports.curve import dips, grid, refined, remembered, resolved_hz
+from trilat_net.ports.port import admittance
 
 HZ = 2.0 * np.pi
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.arm import Array
 from ..errors import RuntimeFault
-from .loop import Loop
+from ..linear.loop import Loop
 
 Complex = NDArray[np.complex128]
 Response = Callable[[Array], Complex]

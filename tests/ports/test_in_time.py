@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.linear.networks import Array, Complex
+from tests.ports.networks import Array, Complex
 from tests.virtual_runs import trajectories
 from trilat_net.linear.conditions import conditions
-from trilat_net.linear.load import Load, loaded
-from trilat_net.linear.port import admittance
 from trilat_net.linear.rest import rest_of
-from trilat_net.linear.teleoperator import teleoperator
+from trilat_net.ports.load import Load, loaded
+from trilat_net.ports.port import admittance
+from trilat_net.ports.teleoperator import teleoperator
 from trilat_net.scenario import load
 
 POSE = (-0.6, 1.8)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.linear.port_section import PortSection, port_section
 from trilat_net.linear.rest import rest_of
+from trilat_net.ports.section import PortSection, port_section
 from trilat_net.scenario import load
 
 POSE = (-0.6, 1.8)

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from trilat_net.linear.conditions import Conditions, conditions
-from trilat_net.linear.load import CLAMPED, Load, loaded
 from trilat_net.linear.loop import Loop, Rest, linearised
-from trilat_net.linear.passivity import Passivity, passivity
-from trilat_net.linear.port import admittance, longest_s, on_axis, ports_of, site_of, sites, transfer
-from trilat_net.linear.port_curve import grid, refined
 from trilat_net.linear.rest import rest_of
-from trilat_net.linear.teleoperator import hands_off, proof_output, proof_weights, teleoperator
+from trilat_net.ports.curve import grid, refined
+from trilat_net.ports.load import CLAMPED, Load, loaded
+from trilat_net.ports.passivity import Passivity, passivity
+from trilat_net.ports.port import admittance, longest_s, on_axis, ports_of, site_of, sites, transfer
+from trilat_net.ports.teleoperator import hands_off, proof_output, proof_weights, teleoperator
 from trilat_net.scenario import Scenario, load
 
 BARE: dict[str, Any] = {"sites.m1.hands": [], "sites.m2.hands": [], "sites.s.hands": [], "timeline": []}

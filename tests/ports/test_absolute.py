@@ -5,11 +5,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from tests.linear.networks import Complex, Network, Wire, pair
-from trilat_net.linear.absolute import MOST, left_at, llewellyn, llewellyn_rounding, weighed
-from trilat_net.linear.passivity import least_eigenvalue, weighted
-from trilat_net.linear.port import admittance, inverse
-from trilat_net.linear.port_curve import Dips, dips, grid
+from tests.ports.networks import Complex, Network, Wire, pair
+from trilat_net.ports.absolute import MOST, left_at, llewellyn, llewellyn_rounding, weighed
+from trilat_net.ports.curve import Dips, dips, grid
+from trilat_net.ports.passivity import least_eigenvalue, weighted
+from trilat_net.ports.port import admittance, inverse
 
 POSITIVE = st.floats(0.1, 10.0)
 SEEDS = st.integers(0, 2**32 - 1)

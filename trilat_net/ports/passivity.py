@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.arm import Array
+from .curve import Dips, dips
 from .port import Complex, Response, inverse
-from .port_curve import Dips, dips
 
 ROUNDING = 1e-8
 """Of the answer's size: eigenvalues that are negative by less are zero but for rounding."""
