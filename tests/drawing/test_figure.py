@@ -13,8 +13,9 @@ from tests.analysis import logs
 from tests.drawing.layout import misplaced
 from trilat_net.analysis import figures
 from trilat_net.analysis.form import COLUMN_IN, PAGE_IN, printed
+from trilat_net.analysis.printing import FORMATS, write
 from trilat_net.drawing import contact
-from trilat_net.drawing.figure import FORMATS, figure, shown, write, write_figures
+from trilat_net.drawing.figure import figure, shown, write_figures
 from trilat_net.drawing.plates import PLATES
 from trilat_net.errors import UsageError
 
@@ -43,7 +44,7 @@ def drawn(name, width_in):
 
 def pdf_of(name, folder, width_in=COLUMN_IN):
     path = folder / f"{name}.pdf"
-    write(drawn(name, width_in), path, printed(width_in))
+    write(drawn(name, width_in), path, printed(width_in).dpi)
     return path.read_bytes()
 
 
@@ -97,7 +98,7 @@ def test_a_pdf_is_one_page_of_the_width_with_its_fonts_and_no_date(name, tmp_pat
 def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
     first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
     for path in (first, second):
-        write(figure(walled(), "contact"), path, printed(COLUMN_IN))
+        write(figure(walled(), "contact"), path, printed(COLUMN_IN).dpi)
     assert first.read_bytes() == second.read_bytes()
 
 

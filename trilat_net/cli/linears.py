@@ -30,7 +30,6 @@ class Plate(StrEnum):
 
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
-_KINDS = ("png", "svg", "pdf")
 _WORDS = "what moves"
 
 
@@ -115,8 +114,10 @@ def _range(text: str) -> tuple[str, float, float]:
 
 
 def _check_picture(path: Path, *, force: bool) -> None:
-    if path.suffix.lstrip(".").lower() not in _KINDS:
-        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(_KINDS)}")
+    from ..analysis.printing import FORMATS
+
+    if path.suffix.lstrip(".").lower() not in FORMATS:
+        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FORMATS)}")
     if path.exists() and not force:
         raise UsageError(f"{path}: exists; choose another name, or use --force")
     if not path.parent.is_dir():
@@ -125,14 +126,16 @@ def _check_picture(path: Path, *, force: bool) -> None:
 
 def _draw(found: "Analysis", section: "PortSection | None", what: Plate, path: Path) -> None:
     """Writes a figure."""
-    from ..linear.figure import root_map, write_figure
+    from ..analysis import style
+    from ..analysis.printing import write
+    from ..linear.figure import root_map
     from ..ports.figure import impedance_figure, passivity_figure
 
     if section is None or what is Plate.ROOTS:
-        write_figure(lambda: root_map(found), path)
+        write(root_map(found), path, style.DPI)
         return
     drawn = impedance_figure if what is Plate.IMPEDANCE else passivity_figure
-    write_figure(lambda: drawn(section), path)
+    write(drawn(section), path, style.DPI)
 
 
 def _print_json(found: "Analysis", lines: "dict[str, list[Edge]]", section: "PortSection | None") -> None:

@@ -2,27 +2,21 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-Law: the same log gives the same bytes: no date is in a file, and fonts are embedded whole glyphs (TrueType).
+Law: the same log gives the same bytes.
 """
 
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from ..analysis.form import COLUMN_IN, Form, printed
+from ..analysis.printing import FORMATS, write
 from ..errors import UsageError
 from ..log.chunks import Progress
 from ..log.reader import Log
 from .plates import PLATES
-
-FORMATS = ("pdf", "png", "svg")
-
-_RC: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "trilat-net"}
-_UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "png": {}, "svg": {"Date": None}}
 
 
 def figure(log: Log, name: str, width_in: float = COLUMN_IN) -> Figure:
@@ -42,19 +36,6 @@ def figure(log: Log, name: str, width_in: float = COLUMN_IN) -> Figure:
 def shown(log: Log) -> list[str]:
     """Returns the names of the figures for which a log has something to show."""
     return [name for name, plate in PLATES.items() if not plate.absent(log)]
-
-
-def write(drawn: Figure, path: Path, form: Form) -> None:
-    """Writes a figure; the suffix says how: .pdf, .png or .svg.
-
-    Args:
-        drawn: the figure.
-        path: where to.
-        form: what it was drawn for.
-    """
-    kind = path.suffix.removeprefix(".")
-    with mpl.rc_context(_RC):
-        drawn.savefig(path, format=kind, dpi=form.dpi, metadata=_UNDATED[kind])
 
 
 def write_figures(
@@ -96,7 +77,7 @@ def write_figures(
             progress(n, len(paths))
         drawn = PLATES[name].draw(log, form)
         for path in each:
-            write(drawn, path, form)
+            write(drawn, path, form.dpi)
     return [path for each in paths.values() for path in each]
 
 

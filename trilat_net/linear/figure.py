@@ -3,11 +3,8 @@
 Law: every root that was found is drawn, conjugate ones too; the imaginary axis is the edge of stability.
 """
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,22 +15,7 @@ from .spectrum import Spectrum
 
 WIDTH_IN = 3.5
 _HEIGHT_IN = 3.0
-_RC: Any = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "trilat-net"}
-_UNDATED: Any = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""What would make two files of one figure differ."""
-KINDS = tuple(_UNDATED)
 _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
-
-
-def write_figure(drawn: Callable[[], Figure], path: Path) -> None:
-    """Writes a figure as a file, the same bytes every time.
-
-    Args:
-        drawn: draws it.
-        path: where to, ending in one of `KINDS`.
-    """
-    with mpl.rc_context(_RC):
-        drawn().savefig(path, dpi=style.DPI, metadata=_UNDATED[path.suffix.lower()])
 
 
 def root_map(found: Analysis) -> Figure:
