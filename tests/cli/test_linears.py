@@ -57,7 +57,7 @@ REFUSED = {
         ["from a value to a larger one"],
     ),
     "a key that is none": (["free", *AT, "--over", "control.Kq=1:5"], ["control.Kq", "did you mean"]),
-    "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".png, .svg, .pdf"]),
+    "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),
     "a measured link": (["free", "--set", "link.model=measured"], ["links.", "nobody knows its delay"]),
     "an arm outside": (["free", "--set", "sites.s.plant=external"], ["sites.s.plant", "simulated"]),
