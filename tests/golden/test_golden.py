@@ -2,7 +2,8 @@
 
 `v1.mcap` is 0.4 s of `asymmetric` in virtual time, with shorter delays so that samples come into use;
 `v2.mcap` has random links, a loss in bursts, an outage, a stale peer, and changes of a link and of shares;
-`v3.mcap` is the same experiment, with numbered events and views.
+`v3.mcap` is the same experiment, with numbered events and views; `v3-own-sines.mcap` is that again, made with
+the sine and cosine that the program has had since: on its arithmetic whole runs are compared.
 """
 
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trilat_net.core.fingerprint import fingerprint
 from trilat_net.experiment import compare_with_virtual, open_log, simulate, verify
 from trilat_net.replay.difference import TOLERANCE
 
@@ -37,5 +39,10 @@ def test_a_golden_log_is_what_virtual_time_gives_today(path: Path) -> None:
     assert not compare_with_virtual(log).late
 
 
+def test_only_the_newest_has_the_arithmetic_of_today() -> None:
+    same = [path.stem for path in GOLDEN if open_log(path).session["fingerprint"] == fingerprint()]
+    assert same == ["v3-own-sines"]
+
+
 def test_every_released_version_has_one() -> None:
-    assert [path.stem for path in GOLDEN] == ["v1", "v2", "v3"]
+    assert {path.stem for path in GOLDEN} == {"v1", "v2", "v3", "v3-own-sines"}

@@ -74,7 +74,7 @@ def test_the_linear_line_is_where_nothing_grows() -> None:
 
 def test_a_column_may_be_crossed_again_and_again() -> None:
     side = Side("y", (0.0, 1.0, 2.0, 3.0), "y")
-    line, _ = linear([([-1.0, 1.0, 3.0, -1.0], [])])
+    line, _ = linear([([-1.0, 1.0, 3.0, -1.0], [])] * 2)
     assert line is not None
     assert line.crossings(0, side) == [0.5, 2.75]
 
@@ -92,3 +92,8 @@ def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> N
     assert line is None
     assert remarks == why
     assert linear([([-1.0, -2.0], []), ([-1.0, -3.0], [])]) == (None, [])
+
+
+def test_a_condition_that_speaks_of_one_row_only_has_no_line() -> None:
+    lossy = Side("link.loss", (0.0, 0.1, 0.2), "loss")
+    assert closed_form(lambda x, y: load(P_D, {"link.delay_ms": x, "link.loss": y}), DELAY, lossy) is None

@@ -74,8 +74,7 @@ def test_the_programs_regressor_is_that_of_the_energies() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         q, qd, qdd = rng.normal(size=(3, 2))
-        Y = np.zeros((2, 5))
-        regressor(9.81, q, qd, qd, qdd, Y)
+        Y = np.array(regressor(9.81, q, qd, qd, qdd))
         assert Y @ parameters(links) == pytest.approx(exact(q, qd, qdd).ravel(), abs=1e-12)
 
 
@@ -85,9 +84,7 @@ def test_five_parameters_are_four_where_the_length_is_known() -> None:
     theta = theta_24(n, n["m2"] * n["lc2"])
     assert sp.simplify(theta[1] - n["l1"] * theta[4]) == 0
     rng = np.random.default_rng(2)
-    Y = np.zeros((40, 2, 5))
-    for row in Y:
-        regressor(9.81, *rng.normal(size=(4, 2)), row)
+    Y = np.array([regressor(9.81, *rng.normal(size=(4, 2))) for _ in range(40)])
     stacked = Y.reshape(-1, 5)
     four = np.delete(np.eye(5), 1, axis=1)
     four[1, 3] = 0.7  # theta_2 from theta_5, l1 = 0.7 m

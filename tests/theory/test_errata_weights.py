@@ -127,11 +127,9 @@ def test_a_wall_that_is_passive_at_its_contact_gives_energy_to_v() -> None:
     """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda e'tau_h > 0."""
     wall = Actor(Acts.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
     rows, table = rows_of((wall,))
-    lengths, work, torque = np.ones(2), np.zeros((6, 2)), np.zeros(2)
 
     def push(q: Any) -> Any:
-        torque_on_arm(0.0, q, np.zeros(2), lengths, rows, table, 0, work, torque)
-        return torque.copy()
+        return np.array(torque_on_arm(0.0, q, np.zeros(2), np.ones(2), rows, table, 0))
 
     turns = np.linspace(0.0, 2 * np.pi, 4001)
     path = np.array([-0.5, 1.85]) + 0.2 * np.stack([np.cos(turns), np.sin(2 * turns)], axis=1)

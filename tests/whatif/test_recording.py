@@ -92,7 +92,9 @@ def test_an_older_log_becomes_one_of_this_version() -> None:
     for name in again.before.sites:
         for ours, theirs in zip(again.after[name].states, again.before[name].states, strict=True):
             assert (ours.v, theirs.v) == (3, 2)
-            assert (ours.q, ours.tau, ours.rx, ours.cmd) == (theirs.q, theirs.tau, theirs.rx, theirs.cmd)
+            assert (ours.rx, ours.cmd) == (theirs.rx, theirs.cmd)
+            for mine, old in ((ours.q, theirs.q), (ours.tau, theirs.tau)):  # its sines were another library's
+                assert mine == (pytest.approx(old, abs=1e-9) if name == "m2" else old)
     assert verify(again.after).passed
     assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))
 
