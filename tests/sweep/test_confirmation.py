@@ -125,12 +125,14 @@ def test_few_cells_are_all_there_are() -> None:
     assert len({row["cell"] for row in found}) == len(found) < 25
 
 
-def test_undecided_cells_are_no_edge_and_are_not_run() -> None:
+def test_undecided_cells_are_not_run_and_the_edge_is_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> Verdict:
         return Verdict.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
 
-    with pytest.raises(UsageError, match="no two neighbours"):
-        beside_edges([row for row in rows(band) if row[KEYS[0]] == 200], KEYS, 1)
+    found = beside_edges(list(rows(band)), KEYS, 3)
+    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
+    with pytest.raises(UsageError, match="no edge"):
+        beside_edges(list(rows(lambda *_: Verdict.UNDECIDED)), KEYS, 1)
 
 
 def test_another_seed_or_law_is_no_neighbour() -> None:
@@ -147,12 +149,16 @@ def lasting(row: Row, ran_s: Callable[[Row], float]) -> Row:
     return {**row, "ran_s": ran_s(row)}
 
 
-def test_long_cells_are_passed_over() -> None:
-    late = [lasting(row, lambda row: 160.0 if row[KEYS[0]] > 200 else 20.0) for row in rows()]
-    found = beside_edges(late, KEYS, 10)
-    assert found
-    assert max(row[KEYS[0]] for row in found) == 200
-    with pytest.raises(UsageError, match="ran longer than 60 s"):
+def test_long_cells_are_passed_over_for_the_next_ones() -> None:
+    """Stable cells right at the edge ran long: those a step further are taken."""
+    edge = {row["cell"] for row in beside_edges(list(rows()), KEYS, 4)}
+    late = [
+        lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0) for row in rows()
+    ]
+    found = [row for row in beside_edges(late, KEYS, 2) if stable(row)]
+    assert len(found) == 2
+    assert all(row["ran_s"] == 20.0 for row in found)
+    with pytest.raises(UsageError, match="stable side of an edge ran longer than 60 s"):
         beside_edges([lasting(row, lambda _: 160.0) for row in rows()], KEYS, 10)
 
 

@@ -23,29 +23,28 @@ _LINES = 10
 """So many lines say how far a sweep is, where there is no terminal for a bar."""
 
 
-def sweep(asked: "Plan", output: Path | None, jobs: int | None, *, yes: bool) -> None:
+def sweep(asked: "Plan", output: Path | None, jobs: int | None, *, yes: bool) -> "Swept":
     """Runs a sweep, or goes on with it where its folder holds it."""
     from ..sweep.folder import PLAN, new_folder
     from ..sweep.running import estimate, refuse_enormous
 
     if output is not None and (output / PLAN).exists():
-        _go_on(new_folder(asked, output), jobs, yes=yes)
-        return
+        return _go_on(new_folder(asked, output), jobs, yes=yes)
     _announce(asked)
     expected = estimate(asked, jobs=jobs)
     if not yes:
         refuse_enormous(asked, expected, jobs)
-    _run(new_folder(asked, output), jobs, expected.seconds, expected.entries)
+    return _run(new_folder(asked, output), jobs, expected.seconds, expected.entries)
 
 
-def resume(path: Path, jobs: int | None, *, yes: bool) -> None:
+def resume(path: Path, jobs: int | None, *, yes: bool) -> "Swept":
     """Goes on with a sweep that was interrupted."""
     from ..sweep import old_folder
 
-    _go_on(old_folder(path), jobs, yes=yes)
+    return _go_on(old_folder(path), jobs, yes=yes)
 
 
-def _go_on(folder: "Folder", jobs: int | None, *, yes: bool) -> None:
+def _go_on(folder: "Folder", jobs: int | None, *, yes: bool) -> "Swept":
     """Runs what is left of a sweep."""
     from ..sweep.running import estimate, refuse_enormous
 
@@ -56,7 +55,7 @@ def _go_on(folder: "Folder", jobs: int | None, *, yes: bool) -> None:
     expected = estimate(folder.plan, done, jobs)
     if not yes:
         refuse_enormous(folder.plan, expected, jobs)
-    _run(folder, jobs, expected.seconds, expected.entries)
+    return _run(folder, jobs, expected.seconds, expected.entries)
 
 
 def _announce(asked: "Plan") -> None:
@@ -66,7 +65,7 @@ def _announce(asked: "Plan") -> None:
         out.print(escape(line), soft_wrap=True)
 
 
-def _run(folder: "Folder", jobs: int | None, seconds: float, known: "Sequence[Entry]") -> None:
+def _run(folder: "Folder", jobs: int | None, seconds: float, known: "Sequence[Entry]") -> "Swept":
     """Runs a sweep in its folder and shows what came of it; Ctrl-C says how to go on."""
     from ..sweep import run
     from ..sweep.running import spoken
@@ -86,6 +85,7 @@ def _run(folder: "Folder", jobs: int | None, seconds: float, known: "Sequence[En
     if not (known or swept.speed.runs):
         out.print("nothing was left to run")
     _show(swept)
+    return swept
 
 
 @contextmanager
@@ -99,12 +99,13 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
     from ..sweep.running import spoken
 
     clock = SystemClock()
-    began_ns, first, said = clock.monotonic_ns(), -1, 0
+    began_ns, first, said = -1, 0, 0
 
     def line(done: int, total: int) -> None:
-        nonlocal first, said
-        first = done - 1 if first < 0 else first
-        if done == total or done * _LINES // total <= said:
+        nonlocal began_ns, first, said
+        if began_ns < 0:  # not before: processes that begin take seconds, and none later
+            began_ns, first = clock.monotonic_ns(), done
+        if done == total or done == first or done * _LINES // total <= said:
             return
         said = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import UsageError
-from . import sweeping
+from . import maps, sweeping
+from .maps import ConfirmOption, MapOption, MarginOption, ToleranceOption, WidthOption
 from .options import DurationOption, SetOption
 from .trials import parsed_seeds
 
@@ -19,6 +20,7 @@ app = typer.Typer()
 
 @app.command(
     epilog="Example: trilat sweep p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1\n\n"
+    "Example: trilat sweep p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3\n\n"
     "Example: trilat sweep runs/sweep-p_d_margin-001 --cell 17"
 )
 def sweep(
@@ -77,6 +79,11 @@ def sweep(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Run it though it is enormous.")] = False,
     overrides: SetOption = None,
+    mapped: MapOption = False,
+    width: WidthOption = None,
+    margin: MarginOption = None,
+    tolerance: ToleranceOption = None,
+    confirm: ConfirmOption = None,
 ) -> None:
     """Runs a scenario over a plane of its keys, in virtual time on all cores, and says what is stable.
 
@@ -93,23 +100,36 @@ def sweep(
         "--longest": longest,
         "--set": overrides,
     }
+    maps.refuse_contradictions(mapped, width, margin, tolerance, confirm, cell)
     if cell is not None or resume is not None or _is_results(scenario):
         _refuse_more({**asking, "-o": output}.items(), "is of the sweep already: leave it out")
+        _refuse_more([("--margin", margin)], "is of a scenario, and searches anew: name that")
+    elif confirm is not None:
+        raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
     if resume is not None:
         if scenario is not None or cell is not None:
             raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
-        sweeping.resume(resume, jobs, yes=yes)
+        swept = sweeping.resume(resume, jobs, yes=yes)
+        maps.draw_if(mapped, swept.results, swept.folder.path, width, jobs)
     elif cell is not None:
         if scenario is None:
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
         sweeping.show_cell(Path(scenario), cell)
     elif scenario is not None and _is_results(scenario):
-        sweeping.show_results(Path(scenario))
+        if mapped or confirm is not None:
+            maps.of_results(Path(scenario), width, confirm, jobs)
+        else:
+            sweeping.show_results(Path(scenario))
+    elif scenario is not None and margin is not None:
+        axes = [*(over or []), maps.range_axis(margin)]
+        asked = _asked(scenario, axes, seeds, law, duration, longest, overrides)
+        maps.find_margins(asked, margin, tolerance, output, jobs)
     else:
         if scenario is None or not (over or law or seeds):
             raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
         asked = _asked(scenario, over, seeds, law, duration, longest, overrides)
-        sweeping.sweep(asked, output, jobs, yes=yes)
+        swept = sweeping.sweep(asked, output, jobs, yes=yes)
+        maps.draw_if(mapped, swept.results, swept.folder.path, width, jobs)
 
 
 def _asked(

@@ -72,8 +72,9 @@ def beside_edges(
 ) -> list[Row]:
     """Returns cells beside edges: so many on the stable side and so many on the other.
 
-    A cell is beside an edge when one of its neighbours along an axis was decided the other way. Of more cells
-    than are asked for, those are taken that are spread most evenly along the edge.
+    How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
+    other way. The nearest are taken whose runs were short enough; of more than are asked for, those that are
+    spread most evenly along the edge.
 
     Args:
         rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
@@ -87,23 +88,22 @@ def beside_edges(
     if count < 1:
         raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
     places, order = _places(rows, axes)
-    sides: dict[bool, list[Row]] = {True: [], False: []}
-    passed = 0
-    for place, row in places.items():
-        stable = Verdict(row["verdict"]).stable
-        if stable is None or not any(
-            _differs(places, near, stable) for near in _neighbours(place, len(axes))
-        ):
-            continue
-        if row["ran_s"] > longest_s:
-            passed += 1
-        else:
-            sides[stable].append(row)
-    if not passed and not any(sides.values()):
-        raise UsageError("no two neighbours have different verdicts: there is no edge to confirm")
-    if not any(sides.values()):
-        raise UsageError(f"all {passed} cells beside an edge ran longer than {longest_s:g} s")
-    return [row for side in (True, False) for row in _spread(sides[side], order, count)]
+    away = _steps_away(places, len(axes))
+    if not away:
+        raise UsageError("no two cells along an axis were decided differently: there is no edge to confirm")
+    chosen = []
+    for side in (True, False):
+        ours = {
+            place: steps for place, steps in away.items() if Verdict(places[place]["verdict"]).stable is side
+        }
+        brief = [place for place in ours if places[place]["ran_s"] <= longest_s]
+        if not brief:
+            word = "stable" if side else "other"
+            raise UsageError(f"every cell on the {word} side of an edge ran longer than {longest_s:g} s")
+        farthest = sorted(ours[place] for place in brief)[min(count, len(brief)) - 1]
+        near = [places[place] for place in brief if ours[place] <= farthest]
+        chosen += _spread(near, order, count)
+    return chosen
 
 
 def confirm(row: Row, run: Runner, longest_s: float = LONGEST_S) -> Confirmed:
@@ -170,14 +170,21 @@ def _sortable(value: Any) -> tuple[bool, Any]:
     return isinstance(value, str), value
 
 
-def _neighbours(place: Place, axes: int) -> list[Place]:
-    """Returns the places one step away along one axis."""
-    return [(*place[:n], place[n] + step, *place[n + 1 :]) for n in range(axes) for step in (-1, 1)]
-
-
-def _differs(places: Mapping[Place, Row], near: Place, stable: bool) -> bool:
-    """Whether a neighbour is there and was decided the other way."""
-    return near in places and Verdict(places[near]["verdict"]).stable is (not stable)
+def _steps_away(places: Mapping[Place, Row], axes: int) -> dict[Place, int]:
+    """Returns of decided places how many steps along an axis the first one is that was decided otherwise."""
+    stable = {place: Verdict(row["verdict"]).stable for place, row in places.items()}
+    lines: dict[Place, list[Place]] = {}
+    for place, side in stable.items():
+        if side is not None:
+            for n in range(axes):
+                lines.setdefault((n, *place[:n], *place[n + 1 :]), []).append(place)
+    away: dict[Place, int] = {}
+    for (n, *_), line in lines.items():
+        for place in line:
+            others = [abs(one[n] - place[n]) for one in line if stable[one] is not stable[place]]
+            if others:
+                away[place] = min(min(others), away.get(place, min(others)))
+    return away
 
 
 def _spread(rows: Sequence[Row], order: Callable[[Row], Place], count: int) -> list[Row]:

@@ -59,7 +59,7 @@ def _damped(scenario: Scenario) -> Criterion | None:
             return None
         K.append(law.K[0])
         d.append(law.d[0])
-    source = "P+d, linearised: enough for every inertia, and asked for by the largest"
+    source = "P+d: sufficient whatever the arms weigh, and necessary where they are heavy: K T² << M"
     if len(laws) == 2:
         excess = 2.0 * np.sqrt(d[0] * d[1]) - sum(delays_s) * np.sqrt(K[0] * K[1])
         symbol = r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$"

@@ -2,8 +2,8 @@
 
 Law: a place is drawn by its verdicts and by nothing else, each over just the cell that it stands for; lines
 lie on top and are named in the legend. Where places have several runs, the colour is the share of stable ones
-among the decided; a place with undecided runs is hatched. Cells are pixels
-wherever the rest is lines: viewers show seams between shapes that touch.
+among the decided; where half or more are undecided it is hatched. Cells are
+pixels also where the rest is lines: viewers show seams between shapes that touch.
 
 The classes differ in lightness, so that they stay apart in grey print and for the colour blind.
 """
@@ -73,7 +73,11 @@ def map_figure(plane: Plane, lines: Sequence[Sequence[Line]], form: Form) -> Fig
             axes.set_axis_off()
         for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
             _draw_panel(axes, plane, panel, drawn)
-            _entitle(axes, panel.title, round(_LETTERS_PER_IN * form.width_in / columns))
+            _entitle(
+                axes,
+                panel.title,
+                round((form.width_in - 0.6 * (plane.seeds > 1)) * _LETTERS_PER_IN / columns),
+            )
         for n, axes in enumerate(grid[: len(plane.panels)]):
             _scale(axes, plane)
             axes.tick_params(labelleft=n % columns == 0 and bool(plane.y.key))
@@ -108,7 +112,7 @@ def _draw_panel(axes: Axes, plane: Plane, panel: Panel, lines: Sequence[Line]) -
     axes.grid(visible=False)
     axes.set_facecolor("#f4f4f4")  # where nothing has run
     ran = panel.runs > 0
-    undecided = panel.counts[:, :, VERDICTS.index(Verdict.UNDECIDED)] > 0
+    undecided = _undecided(panel)
     if plane.seeds > 1:
         shown = np.ma.masked_invalid(panel.share)
         axes.pcolormesh(x, y, shown, cmap=_shares(), vmin=0.0, vmax=1.0, rasterized=True)
@@ -145,6 +149,11 @@ def _extended(rows: Array) -> Array:
     first, last = 1.5 * rows[0] - 0.5 * rows[1], 1.5 * rows[-1] - 0.5 * rows[-2]
     extended: Array = np.concatenate([first[np.newaxis], rows, last[np.newaxis]])
     return extended
+
+
+def _undecided(panel: Panel) -> Any:
+    """Returns where half of the runs or more are undecided, shape (y, x)."""
+    return (panel.runs > 0) & (2 * panel.counts[:, :, VERDICTS.index(Verdict.UNDECIDED)] >= panel.runs)
 
 
 def _entitle(axes: Axes, text: str, letters: int) -> None:
@@ -223,13 +232,16 @@ def _draw_legend(figure: Figure, plane: Plane, lines: Sequence[Sequence[Line]]) 
     counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
     handles: list[Any] = []
     for n, verdict in enumerate(VERDICTS):
-        if not counts[n] or (plane.seeds > 1 and verdict is not Verdict.UNDECIDED):
+        if verdict is Verdict.UNDECIDED:
+            if not any(_undecided(panel).any() for panel in plane.panels):
+                continue
+        elif not counts[n] or plane.seeds > 1:
             continue
         look: Any = {"facecolor": COLOURS[verdict], "edgecolor": "#6b6b6b"}
         if verdict is Verdict.UNDECIDED:
             look = {**_HATCHED}
         look["linewidth"] = 0.5
-        word = "undecided runs" if plane.seeds > 1 else verdict.value
+        word = "half or more undecided" if plane.seeds > 1 else verdict.value
         handles.append(Patch(label=word, **look))
     named = {line.label: line for some in lines for line in some}
     handles += [Line2D([], [], label=text, **_LOOKS[line.rank % len(_LOOKS)]) for text, line in named.items()]

@@ -46,28 +46,35 @@ def judge(text: str, longest_s: float) -> Outcome:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
-    wanders = scenario.random and outcome.motion in (Motion.GROWS, Motion.DECAYS) and not plain(outcome)
+    wanders = scenario.random and outcome.motion in (Motion.GROWS, Motion.DECAYS) and not _pronounced(outcome)
     return msgspec.structs.replace(outcome, verdict=Verdict.UNDECIDED) if wanders else outcome
 
 
 def plain(outcome: Outcome) -> bool:
     """True where a longer run would hardly be called something else.
 
-    That is: it left its limits; or it came to rest; or over its second half the largest speed doubled, or
-    that and the largest error halved, at least; or neither changed by more than `FLAT`. Near the edge of
-    stability a finite run looks steady whatever it does later.
+    That is: it left its limits; or it came to rest; or it grows, and the largest speed at least doubled over
+    the second half; or neither that nor the largest error changed by more than `FLAT`. Near the edge of
+    stability a finite run looks steady whatever it does later, and what decays may hide what grows slowly
+    until it is gone.
     """
-    if outcome.motion in (Motion.DIVERGED, Motion.CONVERGED):
-        return True
-    error, speed = (
-        (rate_per_s or 0.0) * 0.5 * outcome.ran_s
-        for rate_per_s in (outcome.error_rate_per_s, outcome.speed_rate_per_s)
-    )
+    if outcome.motion is Motion.BOUNDED:
+        return max(map(abs, _changes(outcome))) <= FLAT
     if outcome.motion is Motion.GROWS:
-        return speed >= math.log(2.0)
-    if outcome.motion is Motion.DECAYS:
-        return max(error, speed) <= -math.log(2.0)
-    return outcome.motion is Motion.BOUNDED and max(abs(error), abs(speed)) <= FLAT
+        return _pronounced(outcome)
+    return outcome.motion in (Motion.DIVERGED, Motion.CONVERGED)
+
+
+def _pronounced(outcome: Outcome) -> bool:
+    """True where over the second half the largest speed doubled, or that and the largest error halved."""
+    error, speed = _changes(outcome)
+    return speed >= math.log(2.0) or max(error, speed) <= -math.log(2.0)
+
+
+def _changes(outcome: Outcome) -> tuple[float, float]:
+    """Returns by how much the logarithms of the largest |e| and |qd| change over the second half."""
+    half_s = 0.5 * outcome.ran_s
+    return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
 
 
 def _outcome(run: FusedRun, extended: int) -> Outcome:

@@ -18,6 +18,8 @@ from .plane import Side
 At = Callable[[float, float], Scenario]
 """The scenario of a panel at (x, y)."""
 
+_PAIR = ((None, -1), (1, None))
+"""All places but the last along an axis, and all but the first."""
 _TOLERANCE = 1e-6
 _MOST = 60
 LINEAR = "linear analysis"
@@ -43,9 +45,10 @@ class Line(NamedTuple):
 
     @property
     def there(self) -> bool:
-        """Whether it goes through the map."""
-        known = self.spare[np.isfinite(self.spare)]
-        return bool((known > 0.0).any() and (known <= 0.0).any())
+        """Whether it goes through the map: between four places that theory speaks of, some on either side."""
+        corners = np.array([self.spare[a:b, c:d] for a, b in _PAIR for c, d in _PAIR])
+        stable = (corners > 0.0).sum(axis=0)
+        return bool((np.isfinite(corners).all(axis=0) & (stable > 0) & (stable < len(corners))).any())
 
     def crossings(self, column: int, y: Side) -> list[float]:
         """Returns where it crosses a column, from below; between two places as if it went straight."""

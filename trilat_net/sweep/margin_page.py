@@ -34,7 +34,7 @@ def table(asked: Plan, within: Range, found: Sequence[Found]) -> Grid:
         place = [_text(value) for value in one.cell.values] + ([one.cell.law] if asked.laws else [])
         place += [str(one.seed)] if seeds else []
         for span in one.margin.spans or (None,):
-            cells = [*place, *_told(one.margin, span), *_beside(span, one.linear)]
+            cells = [*place, *_told(one.margin, span), *_beside(span, _near(one, span))]
             cells += _beside(span, one.closed) if closed else []
             rows.append((*cells, str(one.margin.runs)))
     return Grid(tuple(heads), rows)
@@ -52,7 +52,7 @@ def page(asked: Plan, within: Range, found: Sequence[Found]) -> str:
     remarks = dict.fromkeys(one.remark for one in found if one.remark)
     parts = [f"# {asked.base.title or asked.base.name}: margin", f"```sh\n{command}\n```"]
     parts.append(table(asked, within, found).markdown())
-    parts += [f"No linear analysis: {remark}." for remark in remarks]
+    parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
     islands = sum(len(one.margin.spans) > 1 for one in found)
     if islands:
         parts.append(
@@ -86,7 +86,7 @@ def facts(asked: Plan, within: Range, found: Sequence[Found]) -> dict[str, Any]:
                 "stable_everywhere": one.margin.stable,
                 "undecided": one.margin.undecided,
                 "runs": one.margin.runs,
-                "linear": one.linear,
+                "linear": list(one.linear),
                 "closed_form": one.closed,
                 "remark": one.remark,
             }
@@ -117,6 +117,13 @@ def _told(margin: Margin, span: Span | None) -> list[str]:
         f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}",
         "below" if span.stable_below else "above",
     ]
+
+
+def _near(one: Found, span: Span | None) -> float | None:
+    """Returns the linear edge that is next to a measured one; the lowest where nothing was measured."""
+    if not one.linear:
+        return None
+    return one.linear[0] if span is None else min(one.linear, key=lambda edge: abs(edge - span.middle))
 
 
 def _beside(span: Span | None, value: float | None) -> list[str]:

@@ -4,7 +4,7 @@ Law: a place is a function of its scenario, its seed and the range; places are s
 whatever process, and come back in their order.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from .criterion import criterion
 from .line import met
 from .margin import TOLERANCE, Margin, margin
 from .plan import Plan
-from .root import crossing
+from .root import crossings
 
 
 class Range(NamedTuple):
@@ -47,6 +47,10 @@ class Search(NamedTuple):
     range: Range
 
 
+Told = tuple[Margin, tuple[float, ...], str, float | None]
+"""Margin, linear edges, what is to be known of them, edge in closed form."""
+
+
 class Found(NamedTuple):
     """One place that was searched.
 
@@ -54,17 +58,17 @@ class Found(NamedTuple):
         cell: the place; its values lie along the axes.
         seed: of its runs.
         margin: what the runs show.
-        linear: where the linear analysis has its edge; None where it has none in the range.
-        closed: the same of the condition in closed form.
-        remark: why the linear analysis says nothing; "" where it does.
+        linear: where the linear analysis has edges in the range, from below.
+        remark: what is to be known of those, or "".
+        closed: where the condition in closed form has its edge; None where it has none in the range.
     """
 
     cell: Cell
     seed: int
     margin: Margin
-    linear: float | None
-    closed: float | None
+    linear: tuple[float, ...]
     remark: str
+    closed: float | None
 
 
 def search_range(asked: str, tolerance: float = TOLERANCE) -> Range:
@@ -79,7 +83,9 @@ def search_range(asked: str, tolerance: float = TOLERANCE) -> Range:
         found = Range(key.strip(), float(low), float(high), tolerance)
     except ValueError:
         raise UsageError(f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {asked!r}") from None
-    if not colon or not found.key or not found.low < found.high < float("inf"):
+    if not 0.0 < tolerance < 1.0:
+        raise UsageError(f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}")
+    if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
         raise UsageError(
             f"--margin reads KEY=FROM:TO with FROM below TO, as in control.d=0.2:3, not {asked!r}"
         )
@@ -95,7 +101,7 @@ def margins(
     asked: Plan,
     within: Range,
     jobs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[Found]:
     """Returns the edges of every place of a plan and every seed.
 
@@ -114,16 +120,23 @@ def margins(
         Search(asked.written, cell.overrides[:-1], seed, asked.longest_s, within) for cell, seed in places
     ]
     found: dict[int, Found] = {}
-    with workers(min(jobs or cores(), len(searches))) as pool:
+    for n, told in _searched(searches, min(jobs or cores(), len(searches))):
+        cell, seed = places[n]
+        found[n] = Found(cell._replace(values=cell.values[:-1]), seed, *told)
+        progress(len(found), len(searches))
+    return [found[n] for n in range(len(searches))]
+
+
+def _searched(searches: Sequence[Search], jobs: int) -> Iterator[tuple[int, Told]]:
+    """Yields what the search of each place found, as they end; one process is this one."""
+    if jobs <= 1:
+        yield from enumerate(map(search, searches))
+        return
+    with workers(jobs) as pool:
         with deaf():
             order = {pool.submit(search, one): n for n, one in enumerate(searches)}
         for done in as_completed(order):
-            n = order[done]
-            cell, seed = places[n]
-            found[n] = Found(cell._replace(values=cell.values[:-1]), seed, *done.result())
-            if progress is not None:
-                progress(len(found), len(searches))
-    return [found[n] for n in range(len(searches))]
+            yield order[done], done.result()
 
 
 def _seeds(asked: Plan, cell: Cell) -> Sequence[int]:
@@ -131,7 +144,7 @@ def _seeds(asked: Plan, cell: Cell) -> Sequence[int]:
     return asked.seeds if asked.written.scenario(*cell.overrides).random else asked.seeds[:1]
 
 
-def search(one: Search) -> tuple[Margin, float | None, float | None, str]:
+def search(one: Search) -> Told:
     """Searches one place, and asks theory for the same.
 
     Raises:
@@ -148,11 +161,7 @@ def search(one: Search) -> tuple[Margin, float | None, float | None, str]:
     whole = not _fractions(at, within)
     found = margin(stable, within.low, within.high, within.tolerance, whole=whole)
     closed = met(lambda value: criterion(at(value)), within.low, within.high)
-    try:
-        linear = crossing(at(within.high), within.key, within.low, within.high)
-    except ScenarioError as error:
-        return found, None, closed, error.problem
-    return found, linear, closed, ""
+    return found, *crossings(at(within.high), within.key, within.low, within.high), closed
 
 
 def _fractions(at: Callable[[float], Scenario], within: Range) -> bool:

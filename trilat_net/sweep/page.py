@@ -6,10 +6,8 @@ same bytes.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
-
+from ..analysis import printing
 from ..analysis.form import COLUMN_IN, printed
 from .chart import Chart
 from .edge import Edge, edges
@@ -18,7 +16,6 @@ from .grid import Grid
 from .line import Line
 from .plane import VERDICTS, Panel, Plane
 
-_RC: Any = {"svg.fonttype": "path", "svg.hashsalt": "trilat-net"}
 _DPI = 300
 
 
@@ -37,9 +34,8 @@ def write(chart: Chart, folder: Path, width_in: float = COLUMN_IN, name: str = "
     form = printed(width_in)
     figure = map_figure(chart.plane, chart.lines, form)
     paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "md")]
-    with mpl.rc_context(_RC):
-        figure.savefig(paths[0], format="png", dpi=_DPI)
-        figure.savefig(paths[1], format="svg", dpi=_DPI, metadata={"Date": None})
+    for path in paths[:2]:
+        printing.write(figure, path, _DPI)
     paths[2].write_text(page(chart, paths[0].name), encoding="utf-8")
     return paths
 

@@ -100,4 +100,7 @@ def speed_line(speed: Speed) -> str:
 def next_commands(folder: Path) -> list[str]:
     """Returns what can be done with the results."""
     where = shlex.quote(str(folder))
-    return [f"trilat sweep {where} --cell 0      # the command that makes a log of a cell"]
+    return [
+        f"trilat sweep {where} --cell 0      # the command that makes a log of a cell",
+        f"trilat sweep {where} --map         # its map, with the lines of theory",
+    ]

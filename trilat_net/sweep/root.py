@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.setup import Scheme
 from ..errors import ScenarioError
-from ..linear import Rest, edge, rest_of
+from ..linear import Rest, edges, rest_of
 from ..linear.conditions import conditions
 from ..linear.field import adapts
 from ..linear.loop import loop_of
@@ -52,16 +52,16 @@ def growths(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:
 def _rest(scenario: Scenario, before: Rest | None) -> tuple[Rest, str]:
     """Returns what a scenario is linearised about, and what is to be known of it.
 
-    What rests by itself wherever it is, is looked at where it comes to by its linear loop; arms that somebody
-    holds, where a run of the first scenario of them ends, and from there on at the next equilibrium.
+    The first of some scenarios: where it comes to rest by its linear loop, or where a run of it ends if
+    somebody is at the arms. The others: at the equilibrium next to that of the one before.
     """
     now = conditions(scenario)
-    if knows_gravity(now):
-        return predicted_rest(scenario), ""
     if any(map(adapts, now.sites)) and not any(site.actors for site in now.sites):
         first, second = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0).tolist()
         return rest_of(scenario, (first, second)), LEARNING
-    return (rest_of(scenario) if before is None else rest_near(scenario, before)), ""
+    if before is not None:
+        return rest_near(scenario, before), ""
+    return (predicted_rest(scenario) if knows_gravity(now) else rest_of(scenario)), ""
 
 
 def _growth(scenario: Scenario, rest: Rest) -> float:
@@ -75,17 +75,20 @@ def _growth(scenario: Scenario, rest: Rest) -> float:
     return -np.inf if found.rightmost is None else found.rightmost.s.real
 
 
-def crossing(scenario: Scenario, key: str, low: float, high: float) -> float | None:
-    """Returns the lowest value of a key at which the rightmost root crosses the imaginary axis, or None.
+def crossings(scenario: Scenario, key: str, low: float, high: float) -> tuple[tuple[float, ...], str]:
+    """Returns the values of a key at which the rightmost root crosses the imaginary axis, from below.
 
     Args:
-        scenario: the experiment; the key's own value does not count.
+        scenario: the experiment; the key's own value says what is linearised about.
         key: dotted, of a number.
         low: from.
         high: to.
 
-    Raises:
-        ScenarioError: it has no linear loop; says why.
+    Returns:
+        The values, none where the linear analysis says nothing; and what is to be known of them, or "".
     """
-    found = edge(scenario, key, low, high)
-    return None if found is None else found.value
+    try:
+        rest, remark = _rest(scenario, None)
+        return tuple(one.value for one in edges(scenario, key, low, high, rest)), remark
+    except ScenarioError as error:
+        return (), f"no linear analysis: {error.problem}"
