@@ -69,9 +69,9 @@ def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
     slow = growth(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
     fast = growth(trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0}))
     assert slow.motion is Motion.BOUNDED
-    assert slow.end_speed_rad_s > 0.5
+    assert slow.end.end_speed_rad_s > 0.5
     assert fast.motion is Motion.DECAYS
-    assert fast.end_speed_rad_s < 0.1
+    assert fast.end.end_speed_rad_s < 0.1
 
 
 def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:

@@ -40,8 +40,11 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
     found, expected = judged(scenario), growth(log)
     assert found.motion is expected.motion
     assert found.verdict is VERDICT_OF[expected.motion]
-    assert (found.end_error_rad, found.end_speed_rad_s) == (expected.end_error_rad, expected.end_speed_rad_s)
-    rate = expected.error.rate_per_s
+    assert (found.end_error_rad, found.end_speed_rad_s) == (
+        expected.end.end_error_rad,
+        expected.end.end_speed_rad_s,
+    )
+    rate = expected.end.error.rate_per_s
     assert found.error_rate_per_s == (None if math.isnan(rate) else rate)
     assert found.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
 

@@ -31,10 +31,10 @@ def facts(certificate: Certificate) -> Facts:
         "growth": {
             "motion": grown.motion.name.lower(),
             "text": grown.text,
-            "error_rate_per_s": _known(grown.error.rate_per_s),
-            "speed_rate_per_s": _known(grown.speed.rate_per_s),
-            "end_error_rad": grown.end_error_rad,
-            "end_speed_rad_s": grown.end_speed_rad_s,
+            "error_rate_per_s": _known(grown.end.error.rate_per_s),
+            "speed_rate_per_s": _known(grown.end.speed.rate_per_s),
+            "end_error_rad": grown.end.end_error_rad,
+            "end_speed_rad_s": grown.end.end_speed_rad_s,
         },
         "functional": None if certificate.balance is None else _functional(certificate, certificate.balance),
     }

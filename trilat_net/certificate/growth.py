@@ -13,30 +13,27 @@ from ..analysis.quantities import SETTLED_RAD
 from ..core.arm import Array
 from ..core.grid import BUCKETS_PER_S
 from ..log.reader import Log, SiteLog
-from .ending import Motion, ending
+from .ending import Ending, Motion, ending
 
 LEAST_CROSSINGS = 6
 """Fewer changes of sign in the second half of a run show no period."""
 
 
 class Growth(NamedTuple):
-    """The end of a run.
+    """The end of a log's run.
 
     Attributes:
-        motion: what it does.
+        end: what it does.
         text: the same with its numbers.
-        error: the trend of the largest |e|.
-        speed: the trend of the largest |qd|.
-        end_error_rad: the largest |e| of the last second.
-        end_speed_rad_s: the largest |qd| of the last second.
     """
 
-    motion: Motion
+    end: Ending
     text: str
-    error: Envelope
-    speed: Envelope
-    end_error_rad: float
-    end_speed_rad_s: float
+
+    @property
+    def motion(self) -> Motion:
+        """What it does, in a word."""
+        return self.end.motion
 
     @property
     def grows(self) -> bool | None:
@@ -51,12 +48,11 @@ def growth(log: Log) -> Growth:
     parts = [log[site] for site in log.sites]
     absent = ", ".join(part.name for part in parts if not len(part))
     end = ending([_maxima(part) for part in parts], _span_s(parts))
-    found = Growth(end.motion, "", *end[1:])
     stops = [at_s for part in parts if (at_s := diverged_at_s(part)) is not None]
     if stops:
         text = f"diverged at {min(stops):.4g} s: a joint passed its qd_limit_rad_s"
-        return found._replace(motion=Motion.DIVERGED, text=text)
-    return found._replace(text=f"undecided: no record of {absent}" if absent else _text(parts, found))
+        return Growth(end._replace(motion=Motion.DIVERGED), text)
+    return Growth(end, f"undecided: no record of {absent}" if absent else _text(parts, end))
 
 
 def _maxima(part: SiteLog) -> Array:
@@ -70,7 +66,7 @@ def _maxima(part: SiteLog) -> Array:
     return maxima
 
 
-def _text(parts: list[SiteLog], found: Growth) -> str:
+def _text(parts: list[SiteLog], found: Ending) -> str:
     motion, error, speed = found.motion, found.error, found.speed
     ends = f"|e| {found.end_error_rad:.3g} rad and |qd| {found.end_speed_rad_s:.3g} rad/s in the last second"
     if motion is Motion.CONVERGED and found.end_error_rad > SETTLED_RAD:

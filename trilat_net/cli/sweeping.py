@@ -105,7 +105,7 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
         nonlocal began_ns, first, said
         if began_ns < 0:  # not before: processes that begin take seconds, and none later
             began_ns, first = clock.monotonic_ns(), done
-        if done == total or done == first or done * _LINES // total <= said:
+        if done in (total, first) or done * _LINES // total <= said:
             return
         said = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
