@@ -60,9 +60,9 @@ bench: $(VENV)/dev.stamp
 
 lock:
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		pyproject.toml --group build -o requirements/runtime.lock
+		pyproject.toml --extra frames --group build -o requirements/runtime.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		pyproject.toml --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
+		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -135,7 +135,8 @@ def damped_torque(
 
     P+d has Kd = k_f = 0. For N sites with equal K and d per joint and one constant delay T its linearised
     loop is stable from d = abs(lambda_min(alpha)) K T on, whatever the masses, for two sites with 4 d_1 d_2 >
-    (T_1 + T_2)^2 K_1 K_2. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the slave, d and k_f at the master.
+    (T_1 + T_2)^2 K_1 K_2. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the slave, d and
+    k_f at the master.
 
     Args:
         theta: the parameters that the law takes the arm to have, shape (5,).
