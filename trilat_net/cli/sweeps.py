@@ -120,14 +120,14 @@ def sweep(
             maps.of_results(Path(scenario), width, confirm, jobs)
         else:
             sweeping.show_results(Path(scenario))
-    elif scenario is not None and margin is not None:
-        axes = [*(over or []), maps.range_axis(margin)]
-        asked = _asked(scenario, axes, seeds, law, duration, longest, overrides)
-        maps.find_margins(asked, margin, tolerance, output, jobs)
+    elif scenario is None or not (over or law or seeds or margin):
+        raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
-        if scenario is None or not (over or law or seeds):
-            raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
-        asked = _asked(scenario, over, seeds, law, duration, longest, overrides)
+        axes = [*(over or []), *([] if margin is None else [maps.range_axis(margin)])]
+        asked = _asked(scenario, axes, seeds, law, duration, longest, overrides)
+        if margin is not None:
+            maps.find_margins(asked, margin, tolerance, output, jobs)
+            return
         swept = sweeping.sweep(asked, output, jobs, yes=yes)
         maps.draw_if(mapped, swept.results, swept.folder.path, width, jobs)
 
@@ -164,10 +164,13 @@ def chosen_seeds(text: str | None) -> int | list[int]:
 
 
 def _is_results(source: str | None) -> bool:
-    """Returns whether a source is the results of a sweep and no scenario."""
+    """Returns whether a source is the results of a sweep; what is called as a shipped scenario is that."""
+    from ..scenario import shipped
     from ..sweep.folder import PLAN
 
-    return source is not None and (source.endswith(".parquet") or (Path(source) / PLAN).exists())
+    if source is None or source in shipped():
+        return False
+    return source.endswith(".parquet") or (Path(source) / PLAN).exists()
 
 
 def _refuse_more(options: Iterable[tuple[str, object]], why: str) -> None:

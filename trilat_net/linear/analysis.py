@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.setup import Scheme
 from ..errors import UsageError
 from ..scenario import Scenario, load
 from .conditions import Conditions, conditions
 from .loop import Loop, Rest, loop_of
 from .margin import Margin, margin
 from .rest import rest_of
+from .rightmost import digital
 from .roots import spectrum
 from .sampled import rate_of, sampled_spectrum
 from .spectrum import Root, Spectrum
@@ -64,7 +64,7 @@ class Analysis:
     @property
     def digital(self) -> bool:
         """True where the controllers are plain digital ones, which the continuous loop only approximates."""
-        return self.scenario.scheme == Scheme.DIGITAL.name.lower()
+        return digital(self.scenario)
 
     def as_computed(self, root: Root) -> Root | None:
         """Returns the sampled root next to a continuous one, where they differ by more than `APART`."""

@@ -11,16 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.arm import Array
-from ..core.setup import Scheme
 from ..errors import UsageError
 from ..scenario import Scenario, load
 from .conditions import Conditions, conditions
 from .equilibrium import residual_of
-from .loop import Rest, loop_of
-from .pencil import Complex
+from .loop import Rest
 from .rest import RESTS, knows_gravity, predicted_rest, rest_near, rest_of
-from .roots import spectrum
-from .sampled import sampled_spectrum
+from .rightmost import digital, rightmost
 from .spectrum import Root
 
 POINTS = 24
@@ -118,7 +115,7 @@ class _Line:
 
     def __init__(self, scenario: Scenario, key: str, rest: Rest | None, sampled: bool | None) -> None:
         self._scenario, self._key = scenario, key
-        self._sampled = scenario.scheme == Scheme.DIGITAL.name.lower() if sampled is None else sampled
+        self._sampled = digital(scenario) if sampled is None else sampled
         self._rest = rest or _first_rest(scenario)
         self._root: Root | None = None
 
@@ -127,12 +124,7 @@ class _Line:
         scenario = load(self._scenario, {self._key: round(value) if _whole(self._key) else value})
         now = conditions(scenario)
         self._rest = _moved(scenario, now, self._rest)
-        found = None
-        if self._sampled:
-            found = sampled_spectrum(now, self._rest, _near(now, self._rest), 1)
-        if found is None:
-            found = spectrum(loop_of(now, self._rest), 1)
-        self._root = found.rightmost
+        self._root = rightmost(now, self._rest, sampled=self._sampled)
         return -np.inf if self._root is None else self._root.s.real
 
     def closed(self, left: tuple[float, float], right: tuple[float, float]) -> Edge:
@@ -166,11 +158,6 @@ class _Line:
             else:
                 high, weights = middle, [0.5 * weights[0], value]
         return low, high
-
-
-def _near(now: Conditions, rest: Rest) -> Complex:
-    """Returns the continuous roots, for Newton to begin from."""
-    return np.array([root.s for root in spectrum(loop_of(now, rest), 4).roots])
 
 
 def _first_rest(scenario: Scenario) -> Rest:

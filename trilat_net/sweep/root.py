@@ -8,15 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.setup import Scheme
 from ..errors import ScenarioError
 from ..linear import Rest, edges, rest_of
 from ..linear.conditions import conditions
 from ..linear.field import adapts
-from ..linear.loop import loop_of
 from ..linear.rest import knows_gravity, predicted_rest, rest_near
-from ..linear.roots import spectrum
-from ..linear.sampled import sampled_spectrum
+from ..linear.rightmost import digital, rightmost
 from ..scenario import Scenario
 
 LEARNING = (
@@ -66,13 +63,8 @@ def _rest(scenario: Scenario, before: Rest | None) -> tuple[Rest, str]:
 
 def _growth(scenario: Scenario, rest: Rest) -> float:
     """Returns the real part of the rightmost root about a rest, 1/s; -infinity where nothing moves."""
-    now = conditions(scenario)
-    digital = scenario.scheme == Scheme.DIGITAL.name.lower()
-    found = spectrum(loop_of(now, rest), 4 if digital else 1)
-    if digital:
-        near = np.array([root.s for root in found.roots], dtype=np.complex128)
-        found = sampled_spectrum(now, rest, near, 1) or found
-    return -np.inf if found.rightmost is None else found.rightmost.s.real
+    found = rightmost(conditions(scenario), rest, sampled=digital(scenario))
+    return -np.inf if found is None else found.s.real
 
 
 def crossings(scenario: Scenario, key: str, low: float, high: float) -> tuple[tuple[float, ...], str]:
