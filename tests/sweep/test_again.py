@@ -38,8 +38,8 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: Results, t
         assert done.code == (0 if outcome.diverged_s is None else 1), done
         log = open_log(tmp_path / words[-1])
         seen = growth(log)
-        assert seen.end_error_rad == outcome.end_error_rad
-        assert seen.end_speed_rad_s == outcome.end_speed_rad_s
+        assert seen.end.end_error_rad == outcome.end_error_rad
+        assert seen.end.end_speed_rad_s == outcome.end_speed_rad_s
         assert VERDICT_OF[seen.motion] is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
@@ -61,7 +61,7 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(results: Results, 
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
     words = shlex.split(found.command)
     trilat(*words[1:], cwd=tmp_path)
-    assert growth(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad == row["end_error_rad"]
+    assert growth(open_log(tmp_path / "cell-5-seed-1.mcap")).end.end_error_rad == row["end_error_rad"]
     source.rename(source.with_suffix(".away"))
     assert "or not here" in again(results, row, tmp_path).note
     source.with_suffix(".away").rename(source)
