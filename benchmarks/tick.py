@@ -62,20 +62,12 @@ def run() -> list[str]:
         return encode_state("m1", 7, site.peers, done, taken, 0, 0, sent_ns, echoed)
 
     def leaf() -> None:
-        site_tick(
-            next(counter),
-            2,
-            site._site,
-            site._links,
-            site._models,
-            site._samples,
-            site._calendars,
-            site._points,
-            site._ramps,
-            site._arrivals,
-            site._pulses,
-            site._row,
-        )
+        k = next(counter)
+        looked = tables.site, tables.links, tables.models, tables.samples, tables.calendars, tables.points
+        came_in = site._arrivals, site._forces, tables.actors, tables.table
+        site_tick(k, 1_000_000 * k, 2, *looked, tables.ramps, *came_in, site._row)
+
+    tables = site._tables
 
     gc.disable()
     total = each_us(whole)
