@@ -11,6 +11,8 @@ import pytest
 
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
 from trilat_net.sweep import judging, new_folder, old_folder, run, running
+from trilat_net.sweep.cell import run_cell
+from trilat_net.sweep.crew import Crew
 from trilat_net.sweep.plan import plan
 from trilat_net.sweep.running import Estimate, estimate, refuse_enormous, spoken
 
@@ -146,7 +148,7 @@ def test_few_runs_wait_at_a_time_however_many_there_are(tmp_path: Path, judge: J
             yield sweep.task(number, 1)
 
     cells = []
-    for entry in running._made(pool, tasks(), 6):  # type: ignore[arg-type]
+    for _, entry in Crew(pool, 6).each(run_cell, tasks()):  # type: ignore[arg-type]
         pool.under_way -= 1
         cells.append(entry.cell)
         assert len(asked_for) - len(cells) <= 6
@@ -158,7 +160,7 @@ def test_few_runs_wait_at_a_time_however_many_there_are(tmp_path: Path, judge: J
 def test_a_process_that_was_ended_is_told_of_with_what_to_do(tmp_path: Path) -> None:
     task = asked(tmp_path).task(0, 1)
     with pytest.raises(RunFailed, match="what is done is kept: go on with --resume"):
-        list(running._made(_Pool(broken=True), iter([task]), 2))  # type: ignore[arg-type]
+        list(Crew(_Pool(broken=True), 2, running._KEPT).each(run_cell, [task]))  # type: ignore[arg-type]
 
 
 def test_times_are_said_as_people_say_them() -> None:

@@ -4,14 +4,14 @@ Law: the runs come from the results and the lines from the plan alone; neither k
 """
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..scenario import Scenario
 from ..scenario.tables import is_number
-from ..workers import cores, deaf, workers
+from ..workers import cores
 from .cell import Written
+from .crew import crew
 from .line import Line, closed_form, linear
 from .plan import LONGEST, MOST_S, Plan
 from .plane import Panel, Plane, plane
@@ -102,19 +102,16 @@ Column = tuple[list[float], list[str]]
 
 def _columns(
     drawn: Plane, at: Sequence[Places], jobs: int | None, progress: Callable[[int, int], None]
-) -> Iterator[list[Column]]:
-    """Yields per panel the real parts of the rightmost roots, column by column."""
+) -> list[list[Column]]:
+    """Returns per panel the real parts of the rightmost roots, column by column."""
     tasks = [(one, x, drawn.y.values) for one in at for x in drawn.x.values]
-    found: list[Column] = []
-    count = min(jobs or cores(), len(tasks))
-    with workers(count) if count > 1 else nullcontext() as pool:
-        with deaf():
-            columns = map(_column, tasks) if pool is None else pool.map(_column, tasks)
-        for column in columns:
-            found.append(column)
+    found: dict[int, Column] = {}
+    with crew(min(jobs or cores(), len(tasks))) as hands:
+        for n, column in hands.each(_column, tasks):
+            found[n] = column
             progress(len(found), len(tasks))
-            if len(found) % len(drawn.x.values) == 0:
-                yield found[-len(drawn.x.values) :]
+    wide = len(drawn.x.values)
+    return [[found[n] for n in range(first, first + wide)] for first in range(0, len(tasks), wide)]
 
 
 def _column(task: tuple[Places, float, tuple[float, ...]]) -> Column:

@@ -4,16 +4,16 @@ Law: a place is a function of its scenario, its seed and the range; places are s
 whatever process, and come back in their order.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario
-from ..workers import cores, deaf, workers
+from ..workers import cores
 from . import judging
 from .cell import Cell, Written
 from .chart import number, override
+from .crew import crew
 from .criterion import criterion
 from .line import met
 from .margin import TOLERANCE, Margin, margin
@@ -113,6 +113,7 @@ def margins(
 
     Raises:
         ScenarioError: some value makes no scenario.
+        RunFailed: a process was ended.
     """
     cells = [asked.cell(first) for first in range(0, asked.cells, 2)]
     places = [(cell, seed) for cell in cells for seed in _seeds(asked, cell)]
@@ -120,23 +121,12 @@ def margins(
         Search(asked.written, cell.overrides[:-1], seed, asked.longest_s, within) for cell, seed in places
     ]
     found: dict[int, Found] = {}
-    for n, told in _searched(searches, min(jobs or cores(), len(searches))):
-        cell, seed = places[n]
-        found[n] = Found(cell._replace(values=cell.values[:-1]), seed, *told)
-        progress(len(found), len(searches))
+    with crew(min(jobs or cores(), len(searches))) as hands:
+        for n, told in hands.each(search, searches):
+            cell, seed = places[n]
+            found[n] = Found(cell._replace(values=cell.values[:-1]), seed, *told)
+            progress(len(found), len(searches))
     return [found[n] for n in range(len(searches))]
-
-
-def _searched(searches: Sequence[Search], jobs: int) -> Iterator[tuple[int, Told]]:
-    """Yields what the search of each place found, as they end; one process is this one."""
-    if jobs <= 1:
-        yield from enumerate(map(search, searches))
-        return
-    with workers(jobs) as pool:
-        with deaf():
-            order = {pool.submit(search, one): n for n, one in enumerate(searches)}
-        for done in as_completed(order):
-            yield order[done], done.result()
 
 
 def _seeds(asked: Plan, cell: Cell) -> Sequence[int]:

@@ -5,18 +5,15 @@ how often the sweep was interrupted enters them. A run that is in the journal is
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from itertools import islice
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from ..errors import RunFailed, UsageError
+from ..errors import UsageError
 from ..net.clock import SystemClock
-from ..workers import cores, deaf, workers
+from ..workers import cores
 from . import judging
-from .cell import Entry, Task, run_cell
+from .cell import Entry, run_cell
+from .crew import Crew, crew
 from .folder import Folder
 from .journal import Journal
 from .place import PLACES, places, places_parquet
@@ -29,11 +26,9 @@ MOST_S = 86_400.0
 _PROBES = 7
 _PROBING_S = 3.0
 """So many runs tell how long all will take; fewer, once that has taken so long."""
-_WAITING = 2
-"""So many runs are under way or wait, per process: enough that none is idle."""
+_KEPT = "what is done is kept: go on with --resume, "
 
 Told = Callable[[int, int], None]
-Map = Callable[[Iterable[Task]], Iterator[Entry]]
 
 
 class Estimate(NamedTuple):
@@ -167,8 +162,8 @@ def run(
         before, began_ns = set(journal.done), clock.monotonic_ns()
         left = asked.cells * len(asked.seeds) - len(before)
         count = max(1, min(jobs or cores(), left))
-        with _crew(count if left else 1) as crew:
-            _run_cells(asked, journal, crew, progress)
+        with crew(count if left else 1, _KEPT) as hands:
+            _run_cells(asked, journal, hands, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         made = [entry for key, entry in journal.done.items() if key not in before]
         rows = rows_of(asked, list(journal.done.values()))
@@ -180,7 +175,7 @@ def run(
     return Swept(results, folder, speed)
 
 
-def _run_cells(asked: Plan, journal: Journal, crew: Map, progress: Told) -> None:
+def _run_cells(asked: Plan, journal: Journal, hands: Crew, progress: Told) -> None:
     """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = asked.seeds
 
@@ -189,40 +184,11 @@ def _run_cells(asked: Plan, journal: Journal, crew: Map, progress: Told) -> None
         return asked.cells + random * len(others)
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
-        for entry in crew(asked.task(*key) for key in runs if key not in journal.done):
+        tasks = (asked.task(*key) for key in runs if key not in journal.done)
+        for _, entry in hands.each(run_cell, tasks):
             journal.add(entry)
             progress(len(journal.done), count)
 
     make(((number, first) for number in range(asked.cells)), asked.cells)
     again = [number for number in range(asked.cells) if others and journal.done[number, first].random]
     make(((number, seed) for number in again for seed in others), total())
-
-
-@contextmanager
-def _crew(jobs: int) -> Iterator[Map]:
-    """Yields what makes runs, as they end; one process is this one."""
-    if jobs <= 1:
-        yield lambda tasks: map(run_cell, tasks)
-        return
-    with workers(jobs) as pool:
-        yield lambda tasks: _made(pool, iter(tasks), jobs * (1 + _WAITING))
-
-
-def _made(pool: ProcessPoolExecutor, tasks: Iterator[Task], most: int) -> Iterator[Entry]:
-    """Yields runs as they end; so many are under way or wait at a time, however many there are."""
-    under_way: set[Future[Entry]] = set()
-    try:
-        with deaf():  # here the processes begin
-            under_way |= {pool.submit(run_cell, task) for task in islice(tasks, 1)}
-        while True:
-            under_way |= {pool.submit(run_cell, task) for task in islice(tasks, most - len(under_way))}
-            if not under_way:
-                return
-            ended, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-            for future in ended:
-                yield future.result()
-    except BrokenProcessPool:
-        raise RunFailed(
-            "a process of the sweep was ended, or could not begin; what is done is kept: go on with "
-            "--resume, perhaps with --jobs 1"
-        ) from None
