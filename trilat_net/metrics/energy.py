@@ -102,8 +102,8 @@ def of_site(scenario: Scenario, track: Track, by: Pushed) -> Facts:
         return np.cumsum(np.where(there, amounts, 0.0))
 
     controller = summed(held_work(applied(track, scenario), track.q))
-    hands = summed(work(by.hands, track.q) + held_work(by.hands_held, track.q))
-    walls = summed(work(by.walls, track.q) + held_work(by.walls_held, track.q))
+    hands = summed(work(by.parts.hands, track.q) + held_work(by.parts.hands_held, track.q))
+    walls = summed(work(by.parts.walls, track.q) + held_work(by.parts.walls_held, track.q))
     found = {
         "controller_j": said(controller[-1]),
         "hands_j": said(hands[-1]),

@@ -134,6 +134,6 @@ def _walls(log: Log, found: Mapping[str, Track], by: Mapping[str, Pushed]) -> di
     facts = {}
     for site in log.sites:
         for n, wall in enumerate(contact.walls(log.scenario.sites[site]), 1):
-            tip = by[site].tip if site in by else None
+            tip = by[site].parts.tip if site in by else None
             facts[f"{site}/{n}"] = contact.of_wall(wall, found.get(site), tip)
     return facts

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.actors import Tip, spring_of, torque_of
-from ..certificate.parting import parted
+from ..analysis.actors import spring_of, torque_of
+from ..certificate.parting import Parted, parted
 from ..certificate.track import Track
 from ..core.arm import JOINTS, Array
 from ..core.exogenous import Actor, Acts
@@ -46,34 +46,26 @@ def script_of(actor: Actor, t_s: Array, J: Array) -> Array:
 
 
 class Pushed(NamedTuple):
-    """The torque ON an arm, shape (K, 2) each, N m; `held` is what is computed once a tick and held.
+    """The torque ON an arm, and what was meant by it.
 
     Attributes:
-        tip: where the arm's tip was.
-        hands: of the hands, a function of the present.
-        hands_held: of the hands, held.
-        walls: of the environment, a function of the present.
-        walls_held: of the environment, held.
+        parts: the torque, parted; without hands there is none of them, not what rounding leaves.
         script: what the hands were to do, whatever the arm does, see `script_of`; None where they did
             something else than the scenario says.
     """
 
-    tip: Tip
-    hands: Array
-    hands_held: Array
-    walls: Array
-    walls_held: Array
+    parts: Parted
     script: Array | None
 
     @property
     def by_hand(self) -> Array:
         """What all hands do, shape (K, 2), N m."""
-        return self.hands + self.hands_held
+        return self.parts.hands + self.parts.hands_held
 
     @property
     def by_wall(self) -> Array:
         """What all of the environment does, shape (K, 2), N m."""
-        return self.walls + self.walls_held
+        return self.parts.walls + self.parts.walls_held
 
 
 def pushed(track: Track, spec: SiteSpec) -> Pushed:
@@ -100,4 +92,4 @@ def pushed(track: Track, spec: SiteSpec) -> Pushed:
     if not hands:  # what rounding leaves of nobody
         rest[as_told] = 0.0
     script = sum(scripts, np.zeros_like(track.q)) if as_told[track.known].all() else None
-    return Pushed(who.tip, rest, who.hands_held, who.walls, who.walls_held, script)
+    return Pushed(who._replace(hands=rest), script)

@@ -83,7 +83,7 @@ def rests(found: Mapping[str, Track], by: Mapping[str, Pushed], owned: Mapping[s
 def _moving(by: Pushed) -> Bools:
     """Returns where a hand moves by its script, shape (K,); of one without a script the torque decides."""
     if by.script is None:
-        return np.zeros(len(by.hands), dtype=np.bool_)
+        return np.zeros(len(by.by_hand), dtype=np.bool_)
     change = np.abs(np.diff(by.script, axis=0)).max(axis=1) > MOVES_NM
     moving: Bools = np.append(change, False) | np.append(False, change)
     return moving
