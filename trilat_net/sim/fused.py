@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.arm import Array
 from ..core.delay import Row
-from ..core.grid import BUCKETS_PER_S, NS_PER_S
+from ..core.grid import BUCKETS_PER_S, NS_PER_S, tick_ns
 from ..core.link import Rows
 from ..core.run import COURSE, SENT, run_until
 from ..core.tables import stacked
@@ -95,7 +95,7 @@ class FusedRun:
         for course in self._courses:
             course.ticks = max(1, round(until_s * course.rate_hz))
             if course.tick < course.ticks:
-                course.t_ns = course.tick * NS_PER_S // int(course.rate_hz)
+                course.t_ns = tick_ns(course.tick, course.rate_hz)
         buckets = math.ceil(until_s * BUCKETS_PER_S) + 1
         grown = np.full((len(self._courses), buckets, 2), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
@@ -119,7 +119,7 @@ class FusedRun:
         course: Row = self._courses[last]
         if course.apart_ns < 0:
             return 0.0
-        ended = course.apart_ns == (course.tick - 1) * NS_PER_S // course.rate_hz
+        ended = course.apart_ns == tick_ns(course.tick - 1, course.rate_hz)
         return None if ended else float(course.apart_ns) / NS_PER_S
 
     @property

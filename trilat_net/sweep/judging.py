@@ -9,6 +9,7 @@ import msgspec
 
 from ..analysis.quantities import SETTLED_RAD
 from ..certificate.ending import Motion, ending
+from ..errors import ScenarioError
 from ..scenario import Scenario, parse
 from ..sim.fused import FusedRun, check_fuses
 from .outcome import VERDICT_OF, Outcome, Verdict
@@ -21,8 +22,15 @@ def check_sweepable(scenario: Scenario) -> None:
     """Refuses what cannot be run without a network, or not fast.
 
     Raises:
-        ScenarioError: see `sim.fused.check_fuses`.
+        ScenarioError: a link has the delay of a real network, which here would be one tick; or see
+            `sim.fused.check_fuses`.
     """
+    if scenario.measured:
+        raise ScenarioError(
+            "a measured link has the delay of a real network, and a sweep runs without one: give it a model, "
+            "as in link.model=constant and link.delay_ms=50",
+            path="link.model",
+        )
     check_fuses(scenario)
 
 

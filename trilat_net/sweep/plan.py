@@ -254,22 +254,11 @@ def _checked(asked: Plan, places: Sequence[int]) -> Scenario:
     cell = asked.cell_at(places)
     try:
         scenario = asked.written.scenario(*cell.overrides)
-        _refuse_measured(scenario)
         judging.check_sweepable(scenario)
     except ScenarioError as error:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
         raise ScenarioError(problem, path=error.path, source=asked.written.source) from None
     return scenario
-
-
-def _refuse_measured(scenario: Scenario) -> None:
-    """Refuses links whose delay is that of a real network: here each would be one tick."""
-    if scenario.measured:
-        raise ScenarioError(
-            "a measured link has the delay of a real network, and a sweep runs without one: give it a model, "
-            "as in link.model=constant and link.delay_ms=50",
-            path="link.model",
-        )
 
 
 def _some(count: int) -> Iterator[int]:

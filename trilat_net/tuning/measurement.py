@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import collector
 from ..analysis.envelope import Trend, envelope
+from ..analysis.quantities import SETTLED_RAD
 from ..core.arm import JOINTS, Array
 from ..core.grid import NS_PER_S
 from ..core.tick import Mode, Output
@@ -21,9 +22,6 @@ from ..scenario.site import SiteSpec
 from ..sim import virtual
 from .goal import consensus
 from .outcome import END_S, Ending, Outcome, judged
-
-SETTLED_RAD = 0.01
-"""Largest |e| of a run that has settled."""
 
 
 class Score(msgspec.Struct, frozen=True):
