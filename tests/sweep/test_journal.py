@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trilat_net.errors import LogRefused
 from trilat_net.sweep.cell import Entry
 from trilat_net.sweep.journal import Journal
 
@@ -100,3 +101,19 @@ def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
     written(path, FIVE[:2])
     assert read(path) == FIVE[:2]
     assert read(path, "another sweep") == FIVE
+
+
+def test_a_run_that_a_full_disk_refuses_is_not_done_and_says_how_to_go_on(path: Path) -> None:
+    """`/dev/full` answers as a disk does that is full."""
+    with Journal(path, "sweep") as journal:
+        journal.add(FIVE[0])
+        whole = journal._file
+        with Path("/dev/full").open("ab", buffering=0) as full:
+            journal._file = full
+            with pytest.raises(
+                LogRefused, match=r"No space left on device.*make room, and go on with"
+            ) as found:
+                journal.add(FIVE[1])
+        journal._file = whole
+        assert [entry.cell for entry in journal.done.values()] == [FIVE[0].cell]
+    assert found.value.exit_code == 5

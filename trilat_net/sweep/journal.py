@@ -4,8 +4,10 @@ Law: a line that is there was whole when it was written, or its checksum tells; 
 when, loses no line that was written before and spoils none that is written after.
 """
 
+import errno
 import json
 import os
+import shlex
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from ..errors import LogRefused
 from .cell import Entry
 
 JOURNAL = "cells.journal"
@@ -33,14 +36,14 @@ class Journal:
     """
 
     def __init__(self, path: Path, sweep: str) -> None:
-        self._sweep = sweep
+        self._path, self._sweep = path, sweep
         self.done: dict[Key, Entry] = {}
         before = path.read_bytes() if path.exists() else b""
         for entry in _entries(before, sweep):
             self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = path.open("ab", buffering=0)
         if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
-            self._file.write(b"\n")
+            self._put(b"\n")
 
     def __enter__(self) -> "Journal":
         return self
@@ -50,11 +53,31 @@ class Journal:
         self._file.close()
 
     def add(self, entry: Entry) -> None:
-        """Writes one run down, at once; one that is there already changes nothing."""
+        """Writes one run down, at once; one that is there already changes nothing.
+
+        Raises:
+            LogRefused: the disk refused it.
+        """
         if (entry.cell, entry.seed) in self.done:
             return
-        self._file.write(line(entry, self._sweep))
+        self._put(line(entry, self._sweep))
         self.done[entry.cell, entry.seed] = entry
+
+    def _put(self, data: bytes) -> None:
+        try:
+            written = self._file.write(data)
+        except OSError as error:
+            raise not_written(self._path, error) from None
+        if written != len(data):  # a disk that became full takes a part, and says nothing
+            raise not_written(self._path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+
+def not_written(path: Path, error: OSError) -> LogRefused:
+    """Returns what is said of a file of a sweep that the disk refused."""
+    return LogRefused(
+        f"{path}: cannot be written: {error.strerror}; what is done is kept: make room, and go on with: "
+        f"trilat sweep --resume {shlex.quote(str(path.parent))}"
+    )
 
 
 def line(entry: Entry, sweep: str) -> bytes:

@@ -17,6 +17,7 @@ from ..errors import UsageError
 from ..extra import extra
 from .cell import Entry, command
 from .delta import whole
+from .journal import not_written
 from .outcome import Outcome
 from .plan import Plan, plan_of
 
@@ -152,13 +153,20 @@ def _outcome_schema(pl: Any) -> dict[str, Any]:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file that is there whole or not at all."""
+    """Writes a file that is there whole or not at all.
+
+    Raises:
+        LogRefused: the disk refused it.
+    """
     unfinished = path.with_name(f"{path.name}.unfinished")
-    with unfinished.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    unfinished.replace(path)
+    try:
+        with unfinished.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        raise not_written(path, error) from None
 
 
 def read_results(path: Path) -> Results:
