@@ -6,6 +6,8 @@
 the sine and cosine that the program has had since: on its arithmetic whole runs are compared.
 """
 
+import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ import pytest
 from trilat_net.core.fingerprint import fingerprint
 from trilat_net.experiment import compare_with_virtual, open_log, simulate, verify
 from trilat_net.replay.difference import TOLERANCE
+
+from .digests import COMMAND
 
 GOLDEN = sorted(Path(__file__).parent.glob("v*.mcap"))
 
@@ -46,3 +50,14 @@ def test_only_the_newest_has_the_arithmetic_of_today() -> None:
 
 def test_every_released_version_has_one() -> None:
     assert {path.stem for path in GOLDEN} == {"v1", "v2", "v3", "v3-own-sines"}
+
+
+def test_a_log_with_a_users_own_law_is_executed_again() -> None:
+    made = subprocess.run(
+        [*COMMAND, "verify", "own-law.mcap", "--json"],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+    )
+    assert made.returncode == 0, made.stderr
+    assert json.loads(made.stdout)["identical"] == 1200

@@ -1,0 +1,20 @@
+"""Digests of a log's payload bytes, by channel, read by the `mcap` package."""
+
+import hashlib
+import sys
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+COMMAND = (sys.executable, "-m", "trilat_net")
+
+
+def channel_digests(path: Path) -> dict[str, str]:
+    """Returns the SHA-256 over the lengths and payloads of each channel's messages, in order, by topic."""
+    sums = {}
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            digest = sums.setdefault(channel.topic, hashlib.sha256())
+            digest.update(len(message.data).to_bytes(8, "little"))
+            digest.update(message.data)
+    return {topic: digest.hexdigest() for topic, digest in sorted(sums.items())}

@@ -1,0 +1,38 @@
+"""The payload bytes of every channel stay as they were before the house was put in order.
+
+`payloads.json` was written then: the channels of `trilat sim` for every shipped scenario, and of two live
+sessions (`live-*.mcap`) executed again in closed loop.
+"""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from trilat_net.core.fingerprint import fingerprint
+
+from .digests import COMMAND, channel_digests
+
+HERE = Path(__file__).parent
+BEFORE = json.loads((HERE / "payloads.json").read_text())
+
+pytestmark = pytest.mark.skipif(
+    fingerprint() != BEFORE["fingerprint"],
+    reason="another arithmetic: L5 compares whole runs on an equal one",
+)
+
+
+@pytest.mark.parametrize("scenario", BEFORE["sim"])
+def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, tmp_path: Path) -> None:
+    path = tmp_path / "sim.mcap"
+    subprocess.run([*COMMAND, "sim", scenario, "-o", str(path)], check=True, capture_output=True)
+    assert channel_digests(path) == BEFORE["sim"][scenario]
+
+
+@pytest.mark.parametrize("log", BEFORE["live"])
+def test_the_payloads_of_a_live_session_executed_again_are_the_same_bytes(log: str, tmp_path: Path) -> None:
+    path = tmp_path / "rerun.mcap"
+    asked = [*COMMAND, "rerun", str(HERE / log), "--closed-loop", "-o", str(path)]
+    subprocess.run(asked, check=True, capture_output=True)
+    assert channel_digests(path) == BEFORE["live"][log]

@@ -1,0 +1,37 @@
+"""Commands, options, keys of JSON and exit codes stay; what is new may join them.
+
+`surface.json` was written before the house was put in order.
+"""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from .digests import COMMAND
+from .surface import all_options, keys
+
+HERE = Path(__file__).parent
+BEFORE = json.loads((HERE / "surface.json").read_text())
+
+
+def test_every_command_and_option_is_still_there() -> None:
+    now = all_options()
+    assert not BEFORE["options"].keys() - now.keys()
+    assert not {c: gone for c, names in BEFORE["options"].items() if (gone := set(names) - set(now[c]))}
+
+
+@pytest.mark.parametrize("case", BEFORE["json"], ids=lambda case: " ".join(case["asked"][:2]))
+def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path) -> None:
+    asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
+    made = subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True, text=True)
+    text = made.stdout if case["file"] is None else (tmp_path / case["file"]).read_text()
+    assert not set(case["keys"]) - set(keys(json.loads(text)))
+    assert made.returncode == case["exit"], made.stderr
+
+
+@pytest.mark.parametrize("case", BEFORE["exit"], ids=lambda case: " ".join(case["asked"]) or "nothing")
+def test_every_exit_code_stays(case: dict, tmp_path: Path) -> None:
+    asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
+    assert subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True).returncode == case["exit"]
