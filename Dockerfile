@@ -28,7 +28,7 @@ COPY containers/entry.py /opt/trilat/entry.py
 ENV XDG_CACHE_HOME=/opt/trilat/cache
 RUN /opt/trilat/bin/trilat sim paper --duration 0.1 -o /tmp/run.mcap \
     && /opt/trilat/bin/trilat report /tmp/run.mcap \
-    && /opt/trilat/bin/python -c 'import sites.process, recorder.process' \
+    && /opt/trilat/bin/python -c 'import sites.site_process, recorder.record_process' \
     && chmod -R a+rX /opt/trilat
 
 FROM python:3.11-slim-bookworm

@@ -11,8 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.scenario import load_scenario
 
 from .sessions import paper
 
@@ -30,22 +30,22 @@ def lap(what):
     now = time.process_time()
     print(f"{what}={now - last:.3f}")
     last = now
-from trilat_net.analysis.report import write_report
-from trilat_net.certificate.certificate import certify
-from trilat_net.certificate.section import section
-from trilat_net.experiment import open_log, twin_without_hands, verify
-from trilat_net.metrics.facts import facts
-from trilat_net.metrics.measurement import measure
+from trilat_net.reporting.page import write_report
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.reporting.certificate_section import build_certificate_section
+from trilat_net import open_log, verify
+from trilat_net.execution.virtual_comparison import simulate_without_operators
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
 lap("start")
 log = open_log(sys.argv[1])
 lap("opening")
-facts(log, measure(log))
+metrics_to_json(log, compute_log_metrics(log))
 lap("metrics")
 certify(log)
 lap("certificate")
-write_report(log, Path(sys.argv[2]), sections=[section(log)])
+write_report(log, Path(sys.argv[2]), sections=[build_certificate_section(log)])
 lap("report")
-twin_without_hands(log)
+simulate_without_operators(log)
 lap("twin")
 verify(log)
 lap("verify")
@@ -62,7 +62,7 @@ def run() -> list[str]:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "run.mcap"
             with path.open("wb") as stream:
-                virtual.record(load(name, {"duration_s": SECONDS}), stream)
+                virtual.write_virtual_log(load_scenario(name, {"duration_s": SECONDS}), stream)
             lines += measured(name, path, Path(folder))
     return lines
 

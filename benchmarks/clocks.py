@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.truth import Judged, judged, offset_errors
-from trilat_net.log.reader import open_log
+from trilat_net.log.log_reader import open_log
 
 from .sessions import SITES, paper
 

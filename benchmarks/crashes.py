@@ -8,11 +8,11 @@ from statistics import median
 from tests.live.killing import SITES, killed
 from tests.live.processes import Session, Stage
 from tests.live.small_disks import NoSmallDisk, small_disk
+from trilat_net.execution.verify import verify
 from trilat_net.net import topics
 from trilat_net.net.messages import LinkStats
 from trilat_net.net.wire import decode
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.replay.verify import verify
 
 KILLS = 20
 PAIRS = 3

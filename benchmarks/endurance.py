@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trilat_net.log.reader import open_log
+from trilat_net.log.log_reader import open_log
 
 from .sessions import SITES, paper
 

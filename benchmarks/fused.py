@@ -10,11 +10,11 @@ import time
 import numpy as np
 
 from tests.theory.delay_equations import equations
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
-from trilat_net.sim.fused import FusedRun
-from trilat_net.sweep.judging import judge
-from trilat_net.workers import cores, deaf, workers
+from trilat_net.execution import virtual
+from trilat_net.execution.fused import FusedRun
+from trilat_net.process import count_cores, ignore_sigint, worker_pool
+from trilat_net.scenario import load_scenario
+from trilat_net.studies.sweep.cell_result import classify_cell
 
 from .stopwatch import best_s
 
@@ -24,7 +24,7 @@ ASKED = 10_000
 
 
 def run() -> list[str]:
-    scenario = load("free", {"duration_s": 20.0})
+    scenario = load_scenario("free", {"duration_s": 20.0})
     real_s = scenario.duration_s
 
     def fused() -> FusedRun:
@@ -33,7 +33,7 @@ def run() -> list[str]:
         return whole
 
     def per_tick() -> np.ndarray:
-        last = {s.site.name: s.output.q for s in virtual.run(scenario)}
+        last = {s.site.name: s.output.q for s in virtual.execute_virtual(scenario)}
         return np.array([last[name] for name in scenario.names])
 
     fused_s = best_s(fused, 40)
@@ -64,15 +64,16 @@ def run() -> list[str]:
 def _on_all_cores(real_s: float) -> list[str]:
     """Judges many cells, each with gains of its own, in as many processes as there are cores."""
     texts = [
-        load("free", {"duration_s": real_s, "control.Kd": 2.0 + 2.0 * n / CELLS}).text for n in range(CELLS)
+        load_scenario("free", {"duration_s": real_s, "control.Kd": 2.0 + 2.0 * n / CELLS}).text
+        for n in range(CELLS)
     ]
-    count = cores()
-    with workers(count) as pool:
-        with deaf():
-            list(pool.map(judge, texts[:count], [0.0] * count))  # begins the processes
+    count = count_cores()
+    with worker_pool(count) as pool:
+        with ignore_sigint():
+            list(pool.map(classify_cell, texts[:count], [0.0] * count))  # begins the processes
         begun = time.perf_counter()
-        with deaf():
-            outcomes = list(pool.map(judge, texts, [0.0] * CELLS, chunksize=8))
+        with ignore_sigint():
+            outcomes = list(pool.map(classify_cell, texts, [0.0] * CELLS, chunksize=8))
         wall_s = time.perf_counter() - begun
     words = sorted({str(outcome.verdict) for outcome in outcomes})
     speed = CELLS * real_s / wall_s / count

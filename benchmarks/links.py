@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Tick
-from trilat_net.scenario import load
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.scenario import load_scenario
 
 from .stopwatch import each_us
 
@@ -49,7 +49,7 @@ def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
     """Returns a call that steps a site by a tick in which every peer's newest sample comes."""
     names = [f"p{n}" for n in range(peers + 1)]
     share = 1.0 / peers
-    scenario = load(
+    scenario = load_scenario(
         "paper",
         {
             "sites": {name: {} for name in names},
@@ -59,13 +59,13 @@ def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
         },
     )
     site = Site(scenario.setup(names[0]))
-    site.step(Tick(0))
+    site.step(TickInput(0))
     k = 0
 
     def step() -> None:
         nonlocal k
         k += 1
-        site.step(Tick(k, [Arrival(n, k - 1, (0.1, 0.2), (0.0, 0.0)) for n in range(peers)]))
+        site.step(TickInput(k, [Arrival(n, k - 1, (0.1, 0.2), (0.0, 0.0)) for n in range(peers)]))
 
     return step
 

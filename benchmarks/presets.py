@@ -6,11 +6,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sites.demo import run_demo
-from sites.display import Display
-from trilat_net.experiment import compare_with_virtual, open_log, verify
-from trilat_net.scenario import Scenario, load
-from trilat_net.scenario.presets import PRESETS
+from sites.demo_session import run_demo
+from sites.monitor import SessionDisplay
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.resolve_links import PRESETS
 
 DURATION_S = 10.0
 
@@ -18,7 +20,7 @@ DURATION_S = 10.0
 def run() -> list[str]:
     print(f"every preset, {DURATION_S:g} s live: records identical to virtual time, of all")
     for name in PRESETS:
-        scenario = load("free", {"duration_s": DURATION_S, "link.preset": name})
+        scenario = load_scenario("free", {"duration_s": DURATION_S, "link.preset": name})
         folder = Path(tempfile.mkdtemp(prefix="trilat-preset-"))
         try:
             print(f"  {name:20} {_session(scenario, folder)}", flush=True)
@@ -28,7 +30,7 @@ def run() -> list[str]:
 
 
 def _session(scenario: Scenario, folder: Path) -> str:
-    with Display(scenario, Console(quiet=True)) as display:
+    with SessionDisplay(scenario, Console(quiet=True)) as display:
         outcome = run_demo(scenario, folder, display)
     if outcome.problems or not outcome.log.exists():
         return "; ".join(outcome.problems)

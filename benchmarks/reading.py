@@ -7,16 +7,16 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from trilat_net.log.reader import Log, open_log
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.scenario import load_scenario
 
 from .stopwatch import best_s
 
 SECONDS = 60
 _ALONE = """
 import sys
-from trilat_net.log.reader import open_log
+from trilat_net.log.log_reader import open_log
 def resident_kib():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
@@ -31,7 +31,7 @@ def run() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         with path.open("wb") as stream:
-            virtual.record(load("paper", {"duration_s": SECONDS}), stream)
+            virtual.write_virtual_log(load_scenario("paper", {"duration_s": SECONDS}), stream)
         return measured(path)
 
 

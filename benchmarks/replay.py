@@ -13,16 +13,16 @@ from typing import Any
 
 import msgspec
 
+from trilat_net.execution import virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import find_free_endpoints
+from trilat_net.net.membership import liveliness_token, new_boot
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.voice import new_boot, token
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import Scenario, load
-from trilat_net.sim import virtual
+from trilat_net.scenario import Scenario, load_scenario
 
 SITES, DURATION_S = 9, 10.0
 SESSION = "replay-benchmark"
@@ -32,7 +32,7 @@ ROUNDS = 3
 def _nine() -> Scenario:
     names = [f"p{n}" for n in range(SITES)]
     share = 1.0 / (SITES - 1)
-    return load(
+    return load_scenario(
         "paper",
         {
             "name": "benchmark",
@@ -68,7 +68,7 @@ def subscribe(endpoint: str) -> None:
     bus.tap(topics.key(SESSION, "*", topics.EVENT), stored)
     info = _info(boot)
     bus.respond(topics.key(SESSION, topics.RECORDER, topics.INFO), lambda _: encode(info))
-    bus.announce(token(SESSION, topics.RECORDER, boot))
+    bus.announce(liveliness_token(SESSION, topics.RECORDER, boot))
     clock = SystemClock()
     while not ended[0]:
         clock.sleep_until(clock.monotonic_ns() + 50_000_000)
@@ -92,7 +92,7 @@ def _info(boot: int) -> Info:
 
 def _play(path: Path, *options: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns what the replay says of itself, and what its subscriber got."""
-    (endpoint,) = free_endpoints(1)
+    (endpoint,) = find_free_endpoints(1)
     subscriber = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.replay", endpoint], stdout=subprocess.PIPE, text=True
     )
@@ -115,7 +115,7 @@ def run() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "nine.mcap"
         with path.open("wb") as stream:
-            virtual.record(scenario, stream)
+            virtual.write_virtual_log(scenario, stream)
         for options in ((), ("--low-cpu",), ("--preload", "1"), ("--rate", "max")):
             name = " ".join(options) or "as it was"
             lines += [_line(name, *_play(path, *options)) for _ in range(ROUNDS)]

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from trilat_net.log.reader import Log, open_log
+from trilat_net.log.log_reader import Log, open_log
 
 from .sessions import SITES, paper
 

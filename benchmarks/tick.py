@@ -5,13 +5,13 @@ import gc
 import numpy as np
 
 from trilat_net.core.kernel import site_tick
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Tick
-from trilat_net.net.messages import Sample
-from trilat_net.net.offset import OffsetEstimator, known
-from trilat_net.net.timing import Peer, Timing
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.net.messages import PeerSample
+from trilat_net.net.offset import OffsetEstimator, exact_offset
+from trilat_net.net.timing import PeerClock, SiteTiming
 from trilat_net.net.wire import decode, encode_state
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .stopwatch import each_us
 
@@ -20,20 +20,20 @@ DELAY_NS = 300_000
 
 
 def run() -> list[str]:
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     site = Site(scenario.setup("m1"))
-    record = site.step(Tick(0))
+    record = site.step(TickInput(0))
     echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
     payloads = [encode_state(p, 7, ("m1", "s"), record, [], 0, 0, AT_NS - DELAY_NS, echo) for p in site.peers]
-    peers = [Peer(peer, 0, 0, known(0), OffsetEstimator()) for peer in site.peers]
-    timing = Timing(0, site.rate_hz, peers, "m2")
+    peers = [PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers]
+    timing = SiteTiming(0, site.rate_hz, peers, "m2")
     timing.sent(0, AT_NS - 2 * DELAY_NS)
     counter = iter(range(1, 10_000_000))
 
-    def decoded() -> list[Sample]:
-        return [decode(payload, Sample) for payload in payloads]
+    def decoded() -> list[PeerSample]:
+        return [decode(payload, PeerSample) for payload in payloads]
 
-    def arrivals(samples: list[Sample]) -> list[Arrival]:
+    def arrivals(samples: list[PeerSample]) -> list[Arrival]:
         pairs = zip(timing.meters, samples, strict=True)
         delays = [meter.take(sample, AT_NS) for meter, sample in pairs]
         return [Arrival(j, s.tick, s.q, s.qd, delays[j] // 1000) for j, s in enumerate(samples)]
@@ -49,13 +49,13 @@ def run() -> list[str]:
 
     samples = decoded()
     came = arrivals(samples)
-    output = site.step(Tick(next(counter), came))
+    output = site.step(TickInput(next(counter), came))
 
     def whole() -> bytes:
         k = next(counter)
         timing.grid.deadline(k)
         taken = arrivals(decoded())
-        done = site.step(Tick(k, taken))
+        done = site.step(TickInput(k, taken))
         sent_ns, echoed = timing.sent(k, AT_NS), timing.echo()
         if k % 100 == 0:
             timing.measured(AT_NS)
@@ -74,7 +74,7 @@ def run() -> list[str]:
     parts = {
         "decode two payloads": each_us(decoded),
         "stamps: deadline, two delays, sending, echo": each_us(stamps),
-        "Site.step": each_us(lambda: site.step(Tick(next(counter), came))),
+        "Site.step": each_us(lambda: site.step(TickInput(next(counter), came))),
         "  of it the compiled leaf": each_us(leaf),
         "encode the record": each_us(
             lambda: encode_state("m1", 7, site.peers, output, came, 0, 0, AT_NS, echo)

@@ -2,23 +2,24 @@
 
 import io
 
-from trilat_net.experiment import open_log, verify
-from trilat_net.log.views import VIEWS_HZ
-from trilat_net.log.writer import LogWriter
+from trilat_net.execution import virtual
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.ros2.viz_channels import VIZ_HZ
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.scenario import load_scenario
 
 from .stopwatch import best_s
 
 
 def run() -> list[str]:
-    scenario = load("paper")
-    with_log = best_s(lambda: virtual.record(scenario, io.BytesIO()))
-    with_views = best_s(lambda: virtual.record(scenario, io.BytesIO(), views_hz=VIEWS_HZ))
-    alone = best_s(lambda: [None for _ in virtual.run(scenario)])
-    steps = list(virtual.run(scenario))
+    scenario = load_scenario("paper")
+    with_log = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO()))
+    with_views = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO(), views_hz=VIZ_HZ))
+    alone = best_s(lambda: [None for _ in virtual.execute_virtual(scenario)])
+    steps = list(virtual.execute_virtual(scenario))
 
     def encode() -> list[tuple[str, bytes, int, int]]:
         return [
@@ -43,7 +44,7 @@ def run() -> list[str]:
 
     writing = best_s(write)
     stream = io.BytesIO()
-    virtual.record(scenario, stream)
+    virtual.write_virtual_log(scenario, stream)
 
     def read() -> None:
         stream.seek(0)

@@ -7,13 +7,13 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from trilat_net.core.tick import Arrival
-from trilat_net.log.container import Container
-from trilat_net.log.writer import LogWriter
+from trilat_net.core.ticks import Arrival
+from trilat_net.execution import virtual
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.mcap_writer import McapWriter
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.scenario import load_scenario
 
 from .stopwatch import best_s
 
@@ -42,9 +42,9 @@ def run() -> list[str]:
 
 def _messages(duration_s: float) -> list[Message]:
     """Records of the paper's experiment, with as many arrivals as make them long enough."""
-    scenario = load("paper", {"duration_s": duration_s})
+    scenario = load_scenario("paper", {"duration_s": duration_s})
     messages = []
-    for site, arrivals, output in virtual.run(scenario):
+    for site, arrivals, output in virtual.execute_virtual(scenario):
         key = topics.key(scenario.name, site.name, topics.STATE)
         more: list[Arrival] = list(arrivals) * 4
         payload = encode_state(site.name, 7, site.peers, output, more, 12, 34)
@@ -55,7 +55,7 @@ def _messages(duration_s: float) -> list[Message]:
 
 def _ours(messages: list[Message]) -> bytes:
     stream = io.BytesIO()
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
     for n, (key, payload, t_ns, tick) in enumerate(messages, 1):
         writer.add(key, payload, t_ns, t_ns, tick)
@@ -107,7 +107,7 @@ def _theirs_nowhere() -> Any:
 
 
 _WRITERS: dict[str, Callable[[], Any]] = {
-    "ours": lambda: Container(_Nowhere(), "benchmark"),
+    "ours": lambda: McapWriter(_Nowhere(), "benchmark"),
     "mcap.Writer": _theirs_nowhere,
 }
 

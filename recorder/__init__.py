@@ -1,1 +1,4 @@
-"""The recording process: every channel of a session into one MCAP file."""
+"""Records every channel of a session into one MCAP file (`record_process`).
+
+And plays a log again (`play`).
+"""

@@ -1,1 +1,1 @@
-"""One operating-system process per manipulator: join, agree on the epoch, run the loop, leave."""
+"""The live driver: one operating-system process per manipulator joins a session, runs its loop and leaves."""

@@ -1,7 +1,7 @@
-"""What a process can do to be woken in time, and what it obtained.
+"""Real-time settings of a process: affinity, timer slack, locked memory, scheduling, garbage collector.
 
-Law: every step warns and goes on. A loop without privileges runs as well as it can, and its log says how
-that was.
+Invariant: a step that fails warns and the site goes on. A loop without privileges runs as well as it can, and
+its log records the settings obtained.
 """
 
 import ctypes
@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable
 
-from trilat_net import collector
+from trilat_net import process
 
 FIFO_PRIORITY = 50
 NICE = -10
@@ -85,5 +85,5 @@ def _schedule() -> str:
 
 
 def _stop_collector() -> str:
-    collector.off_for_good()
+    process.disable_gc()
     return "frozen and off"

@@ -18,12 +18,9 @@ import atheris  # type: ignore[import-not-found]
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # what Numba compiles cannot be instrumented
-import trilat_net.core.fingerprint
 import trilat_net.core.site  # noqa: F401
 
-with atheris.instrument_imports(
-    include=["trilat_net.log", "trilat_net.replay", "trilat_net.playback", "mcap"]
-):
+with atheris.instrument_imports(include=["trilat_net.log", "trilat_net.execution", "recorder.play", "mcap"]):
     from tests.log.hostility import mangled, read_by_all
     from tests.log_editing import edited, recorded
 

@@ -6,29 +6,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from trilat_net.core import control
-from trilat_net.core.arm import regressor
-from trilat_net.core.own import Facts, Now
+from trilat_net.core.two_link_arm import regressor
+from trilat_net.core.user_law import LawContext, LawInput
 
 
 class Adaptive:
     """Eq. (13) and (15) with the trapezoid rule, by the same leaves as the built-in law."""
 
-    def __init__(self, facts: Facts, Lambda: float = 1.0, Kp: float = 1.0, Kd: float = 3.0) -> None:
+    def __init__(self, facts: LawContext, Lambda: float = 1.0, Kp: float = 1.0, Kd: float = 3.0) -> None:
         self._facts = facts
         self._Lambda, self._Kp, self._Kd = (np.full(2, gain) for gain in (Lambda, Kp, Kd))
         self._Yr = np.zeros(5)
         self.theta_hat = np.zeros(5)
 
-    def torque(self, now: Now) -> Sequence[float]:
+    def torque(self, now: LawInput) -> Sequence[float]:
         q, qd, q_des, qd_des = map(np.array, (now.q, now.qd, now.q_des, now.qd_des))
-        e, ed, r = control.errors(q, qd, q_des, qd_des, self._Lambda)
+        e, ed, r = control.control_errors(q, qd, q_des, qd_des, self._Lambda)
         v, a = -self._Lambda * e, -self._Lambda * ed
         Y = regressor(self._facts.g_m_s2, q, qd, v, a)
         Yr = np.array(control.regressor_transpose_times(Y, r))
         if now.k:
             self.theta_hat = self.theta_hat - 0.5 / self._facts.rate_hz * (self._Yr + Yr)
         self._Yr = Yr
-        return control.torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm)
+        return control.adaptive_torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm)
 
     def memory(self) -> Sequence[float]:
         return [*self._Yr, *self.theta_hat]
@@ -40,11 +40,11 @@ class Adaptive:
 class Failing(Adaptive):
     """Does something wrong at a tick."""
 
-    def __init__(self, facts: Facts, how: str = "nan", at: int = 3) -> None:
+    def __init__(self, facts: LawContext, how: str = "nan", at: int = 3) -> None:
         super().__init__(facts)
         self._how, self._at = how, at
 
-    def torque(self, now: Now) -> Sequence[float]:
+    def torque(self, now: LawInput) -> Sequence[float]:
         wrong = self._how if now.k == self._at else ""
         if wrong == "raises":
             raise ValueError("out of\nits depth")
@@ -88,5 +88,5 @@ class NoLaw:
     """Has nothing that a law has."""
 
 
-def no_class(_facts: Facts) -> NoLaw:
+def no_class(_facts: LawContext) -> NoLaw:
     return NoLaw()

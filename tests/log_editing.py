@@ -9,9 +9,9 @@ import msgpack
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from trilat_net.log.reader import Log, open_log
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.scenario import load_scenario
 
 Record = dict[str, Any]
 SHORT = (("duration_s", 0.12), ("link.delay_ms", 20.0))
@@ -21,7 +21,7 @@ SHORT = (("duration_s", 0.12), ("link.delay_ms", 20.0))
 @cache
 def _recorded(name: str, overrides: tuple[tuple[str, Any], ...]) -> bytes:
     stream = io.BytesIO()
-    virtual.record(load(name, dict(overrides)), stream)
+    virtual.write_virtual_log(load_scenario(name, dict(overrides)), stream)
     return stream.getvalue()
 
 

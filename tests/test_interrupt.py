@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from trilat_net.interrupt import Interrupt
+from trilat_net.process import Interrupt
 
 
 def test_a_signal_is_remembered_and_ends_nothing() -> None:

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from trilat_net.workers import cores, deaf, workers
+from trilat_net.process import count_cores, ignore_sigint, worker_pool
 
 
 def wait_for_ever() -> None:
@@ -15,18 +15,18 @@ def wait_for_ever() -> None:
 
 
 def interrupted() -> None:
-    with workers(1) as pool:
-        with deaf():
+    with worker_pool(1) as pool:
+        with ignore_sigint():
             assert pool.submit(os.getpid).result() != os.getpid()
             pool.submit(wait_for_ever)
         raise KeyboardInterrupt
 
 
 def test_they_do_what_they_are_given_elsewhere() -> None:
-    with workers(1) as pool, deaf():
+    with worker_pool(1) as pool, ignore_sigint():
         assert list(pool.map(int.bit_length, [1, 255])) == [1, 8]
         assert pool.submit(os.getpid).result() != os.getpid()
-    assert cores() >= 1
+    assert count_cores() >= 1
 
 
 def test_they_are_gone_when_their_work_is_not_wanted_any_more() -> None:
@@ -38,7 +38,7 @@ def test_they_are_gone_when_their_work_is_not_wanted_any_more() -> None:
 
 
 def test_ctrl_c_is_left_to_this_process() -> None:
-    with workers(1) as pool, deaf():
+    with worker_pool(1) as pool, ignore_sigint():
         assert pool.submit(signal.getsignal, signal.SIGINT).result() is signal.SIG_IGN
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -47,7 +47,7 @@ def test_a_thread_is_never_deaf() -> None:
     heard: list[object] = []
 
     def look() -> None:
-        with deaf():
+        with ignore_sigint():
             heard.append(signal.getsignal(signal.SIGINT))
 
     thread = threading.Thread(target=look)

@@ -12,10 +12,10 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.grid import NS_PER_S
-from trilat_net.log.reader import Log
-from trilat_net.net.course import BEND_NS
+from trilat_net.core.ticks import NS_PER_S
+from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
+from trilat_net.net.offset import SLEW_NS
 
 SKEWED = re.compile(r"skewed by (-?\d+) ns and (-?\d+) ns/s since (-?\d+) ns$")
 Ints = NDArray[np.int64]
@@ -89,7 +89,7 @@ class Bound:
         if place < 0:
             return None
         event = self.events[place]
-        later_ns = max(0, t_ns - event.t_ns - BEND_NS)
+        later_ns = max(0, t_ns - event.t_ns - SLEW_NS)
         return (event.bound_ns + later_ns * event.drift_bound_ppb / NS_PER_S) / 1000
 
 

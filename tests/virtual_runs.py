@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.scenario import Scenario, load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.scenario import Scenario, load_scenario
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Run:
 
 def trajectories(scenario: Scenario) -> Run:
     records: dict[str, list[Any]] = {name: [] for name in scenario.names}
-    for site, _, output in virtual.run(scenario):
+    for site, _, output in virtual.execute_virtual(scenario):
         records[site.name].append(output)
     return Run(
         scenario,
@@ -60,7 +60,7 @@ def trajectories(scenario: Scenario) -> Run:
 
 @cache
 def _run(name: str, overrides: tuple[tuple[str, Any], ...]) -> Run:
-    return trajectories(load(name, dict(overrides)))
+    return trajectories(load_scenario(name, dict(overrides)))
 
 
 def run(name: str, overrides: Mapping[str, Any] | None = None) -> Run:

@@ -7,34 +7,40 @@
     log = trilat_net.open_log("run.mcap")
     log.frame("m1")
 
-One `Site.step`, three drivers: live over a network, in virtual time, and again from the log, the same code
-gives the same numbers bit for bit.
+One `Site.step` and three drivers: live over a network, in virtual time, and again from a log. The same code
+gives the same numbers, bit for bit.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from . import deprecated
+
 if TYPE_CHECKING:
-    from .drawing.figure import figure
-    from .experiment import simulate, verify
-    from .log.reader import open_log
-    from .trial.running import check
-    from .trial.trial import trials
-    from .whatif.rerun import rerun
+    from .api import simulate
+    from .execution.rerun import rerun
+    from .execution.verify import verify
+    from .log.log_reader import open_log
+    from .reporting.figures.registry import figure
+    from .studies.trials.trial import trials
+    from .studies.trials.trial_runner import check
 
 __all__ = ["check", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
 
 _MODULES = {
-    "rerun": "whatif.rerun",
-    "check": "trial.running",
-    "trials": "trial.trial",
-    "open_log": "log.reader",
-    "figure": "drawing.figure",
+    "check": "studies.trials.trial_runner",
+    "figure": "reporting.figures.registry",
+    "open_log": "log.log_reader",
+    "rerun": "execution.rerun",
+    "trials": "studies.trials.trial",
+    "verify": "execution.verify",
 }
+
+deprecated.install()
 
 
 def __getattr__(name: str) -> Any:
     """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
     if name in __all__:
-        return getattr(import_module(f".{_MODULES.get(name, 'experiment')}", __name__), name)
+        return getattr(import_module(f".{_MODULES.get(name, 'api')}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

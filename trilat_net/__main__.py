@@ -1,4 +1,4 @@
-"""`python -m trilat_net` is `trilat`."""
+"""Entry point of `python -m trilat_net`, the same as `trilat`."""
 
 from .cli import main
 

@@ -1,7 +1,7 @@
-"""Errors that show whose fault it is.
+"""Errors, by who has to act: the author of a scenario, the caller, a peer, a file, the program.
 
-Law: an error carries its facts and a sentence that says what is wrong, where, and what would be right.
-The command line prints that sentence and nothing else.
+Invariant: an error carries its data and one sentence that names the problem, its place and the remedy. The
+command line prints that sentence and nothing else; `exit_code` is the code that a command ends with.
 """
 
 

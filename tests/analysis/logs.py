@@ -8,16 +8,17 @@ from typing import NamedTuple
 import msgspec
 
 import trilat_net
-from trilat_net.core.tick import LinkCounts
-from trilat_net.log.reader import Log, SiteLog, open_log
-from trilat_net.log.writer import LogWriter
+from trilat_net.core.ticks import LinkCounts
+from trilat_net.execution import virtual
+from trilat_net.execution.virtual_network import RecordedNetwork
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.site_log import SiteLog
 from trilat_net.net import topics
-from trilat_net.net.messages import Event, LinkStats
-from trilat_net.net.wire import State, encode, encode_state
-from trilat_net.scenario import Scenario, command, load, parse
-from trilat_net.scenario.timeline import Change
-from trilat_net.sim import virtual
-from trilat_net.sim.network import RecordedNetwork
+from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.net.wire import encode, encode_state
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario, to_core_change
+from trilat_net.scenario.scenario_types import Change
 
 FOUR = """
 name = "four"
@@ -135,7 +136,7 @@ Sample = tuple[str, int, int]
 
 @cache
 def busy() -> Run:
-    return driven(parse(BUSY))
+    return driven(parse_scenario(BUSY))
 
 
 def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()) -> Run:
@@ -151,14 +152,14 @@ def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[
                 at[name].setdefault(comes, []).extend([[index, tick, 0]] * times)
     network = RecordedNetwork(at, {name: scenario.peers(name) for name in scenario.names})
     ordered = {
-        site: {tick: [command(scenario, change)] for tick, change in changes.items()}
+        site: {tick: [to_core_change(scenario, change)] for tick, change in changes.items()}
         for site, changes in ORDERED.items()
         if site in scenario.sites
     }
     stream = io.BytesIO()
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
     counts = {}
-    for site, arrivals, output in virtual.run(scenario, network, ordered):
+    for site, arrivals, output in virtual.execute_virtual(scenario, network, ordered):
         payload = encode_state(site.name, 1, site.peers, output, arrivals, 0, 0)
         key = topics.key(scenario.name, site.name, topics.STATE)
         writer.add(key, payload, output.t_ns, output.t_ns, output.tick, output)
@@ -172,7 +173,7 @@ def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[
 def simulated(name: str) -> Log:
     """Two seconds of a shipped scenario, or of four sites with rates of their own."""
     if name == "four":
-        return trilat_net.simulate(parse(FOUR))
+        return trilat_net.simulate(parse_scenario(FOUR))
     return trilat_net.simulate(name, {"duration_s": 2, "rate_hz": 200})
 
 
@@ -183,7 +184,9 @@ def twin(name: str) -> Log:
 
 @cache
 def diverged() -> Log:
-    return trilat_net.simulate(load("free", {"duration_s": 2, "rate_hz": 200, "limits.qd_limit_rad_s": 0.5}))
+    return trilat_net.simulate(
+        load_scenario("free", {"duration_s": 2, "rate_hz": 200, "limits.qd_limit_rad_s": 0.5})
+    )
 
 
 def rewritten(

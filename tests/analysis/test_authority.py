@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis import authority
+from trilat_net.reporting.figures import authority
 
 from . import logs
 
@@ -26,7 +26,7 @@ def ramped():
 
 
 def test_a_ramp_begins_where_the_one_before_it_is(ramped):
-    t_s, shares = authority.shares(ramped, "s")
+    t_s, shares = authority.dominance_lines(ramped, "s")
     at = [0.5, 1.0, 1.5, 2.0, 2.75, 3.5, 4.9, 5.1]
     assert np.interp(at, t_s, shares["m1"]) == pytest.approx([0.5, 0.5, 0.625, 0.75, 0.375, 0.0, 0.0, 0.5])
     assert shares["m1"] + shares["m2"] == pytest.approx(np.ones(len(t_s)))
@@ -35,7 +35,7 @@ def test_a_ramp_begins_where_the_one_before_it_is(ramped):
 def test_they_are_the_shares_that_the_references_were_made_of(ramped):
     """Eq. (6) with the drawn shares and the samples in use gives the recorded reference."""
     part = ramped["s"]
-    t_s, shares = authority.shares(ramped, "s")
+    t_s, shares = authority.dominance_lines(ramped, "s")
     reference = np.zeros_like(part.q)
     for peer, share in shares.items():
         used, q = part.used[peer], ramped[peer].q
@@ -46,8 +46,8 @@ def test_they_are_the_shares_that_the_references_were_made_of(ramped):
 
 
 def test_only_sites_whose_shares_change_are_shown(ramped):
-    assert authority.changing(ramped) == ["s"]
-    assert len(authority.authority(ramped).axes) == 3
-    assert authority.changing(logs.simulated("paper")) == []
-    (text,) = authority.authority(logs.simulated("paper")).texts
-    assert text.get_text() == authority.CONSTANT
+    assert authority.sites_with_changing_dominance(ramped) == ["s"]
+    assert len(authority.draw_authority(ramped).axes) == 3
+    assert authority.sites_with_changing_dominance(logs.simulated("paper")) == []
+    (text,) = authority.draw_authority(logs.simulated("paper")).texts
+    assert text.get_text() == authority.CONSTANT_DOMINANCE

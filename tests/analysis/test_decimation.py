@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from trilat_net.analysis.decimation import kept, thin
+from trilat_net.analysis.trace_decimation import decimate, extreme_rows
 
 numbers = st.one_of(st.floats(-1e6, 1e6), st.just(np.nan))
 columns = hnp.arrays(np.float64, st.tuples(st.integers(1, 400), st.integers(1, 4)), elements=numbers)
@@ -11,7 +11,7 @@ columns = hnp.arrays(np.float64, st.tuples(st.integers(1, 400), st.integers(1, 4
 
 @given(columns, st.integers(1, 30))
 def test_every_bucket_keeps_its_extremes(values, buckets):
-    keep = kept(values, buckets)
+    keep = extreme_rows(values, buckets)
     size = max(1, -(-len(values) // buckets))
     for first in range(0, len(values), size):
         bucket = values[first : first + size]
@@ -27,7 +27,7 @@ def test_every_bucket_keeps_its_extremes(values, buckets):
 
 @given(columns, st.integers(1, 30))
 def test_the_ends_stay_and_the_rest_is_bounded(values, buckets):
-    keep = kept(values, buckets)
+    keep = extreme_rows(values, buckets)
     assert keep[0] == 0
     assert keep[-1] == len(values) - 1
     assert (np.diff(keep) > 0).all()
@@ -38,7 +38,7 @@ def test_a_spike_of_one_tick_in_a_million_survives():
     values = np.zeros((1_000_000, 1))
     values[654_321] = -3.0
     tick = np.arange(1_000_000)
-    trace = thin(tick, tick * 1e-3, values, 500)
+    trace = decimate(tick, tick * 1e-3, values, 500)
     assert len(trace.tick) < 1100
     assert trace.values.min() == -3.0
     assert trace.t_s[trace.values[:, 0].argmin()] == 654.321
@@ -46,7 +46,7 @@ def test_a_spike_of_one_tick_in_a_million_survives():
 
 def test_a_line_is_broken_in_a_gap_that_can_be_seen():
     tick = np.concatenate([np.arange(100), np.arange(900, 1000)])
-    trace = thin(tick, tick * 1e-3, np.ones((200, 2)), 50)
+    trace = decimate(tick, tick * 1e-3, np.ones((200, 2)), 50)
     (gap,) = np.flatnonzero(np.isnan(trace.values).any(axis=1))
     assert trace.tick[gap - 1] == 99
     assert trace.tick[gap] == 100
@@ -56,10 +56,10 @@ def test_a_line_is_broken_in_a_gap_that_can_be_seen():
 
 def test_gaps_narrower_than_a_bucket_break_nothing():
     tick = np.arange(0, 20_000, 2)
-    trace = thin(tick, tick * 1e-3, np.ones((10_000, 1)), 100)
+    trace = decimate(tick, tick * 1e-3, np.ones((10_000, 1)), 100)
     assert np.isfinite(trace.values).all()
 
 
 def test_nothing_stays_nothing():
-    trace = thin(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)), 10)
+    trace = decimate(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)), 10)
     assert trace.values.shape == (0, 2)

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.envelope import FLOOR_RAD, Trend, envelope
+from trilat_net.analysis.run_end import FLOOR_RAD, EnvelopeTrend, fit_envelope
 
 Array = NDArray[np.float64]
 
@@ -31,26 +31,26 @@ def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.
 
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, phase: float) -> None:
-    found = envelope(T_S, oscillation(rate, omega, phase))
-    assert found.trend is Trend.GROWS
+    found = fit_envelope(T_S, oscillation(rate, omega, phase))
+    assert found.trend is EnvelopeTrend.GROWS
     assert found.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
 
 
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_decay_is_decay(rate: float, omega: float, phase: float) -> None:
-    assert envelope(T_S, oscillation(-rate, omega, phase)).trend is Trend.DECAYS
+    assert fit_envelope(T_S, oscillation(-rate, omega, phase)).trend is EnvelopeTrend.DECAYS
 
 
 @given(omega=quick, phase=phases, scale=scales)
 def test_a_sustained_oscillation_of_whatever_size_is_steady(omega: float, phase: float, scale: float) -> None:
-    assert envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is Trend.STEADY
+    assert fit_envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is EnvelopeTrend.STEADY
 
 
 @given(rate=st.floats(-0.3, 0.3), omega=st.floats(0.0, 40.0), phase=phases, scale=scales)
 def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: float, scale: float) -> None:
     error = np.maximum(oscillation(rate, omega, phase), 1e-3)
-    found = envelope(T_S, error)
-    larger, slower = envelope(T_S, scale * error), envelope(60.0 * T_S, error)
+    found = fit_envelope(T_S, error)
+    larger, slower = fit_envelope(T_S, scale * error), fit_envelope(60.0 * T_S, error)
     assert larger.trend is slower.trend is found.trend
     assert larger.rate_per_s == pytest.approx(found.rate_per_s, rel=1e-6, abs=1e-9)
     assert slower.rate_per_s == pytest.approx(found.rate_per_s / 60.0, rel=1e-6, abs=1e-9)
@@ -60,14 +60,16 @@ def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: flo
 @example(rate=0.0, omega=0.015625, phase=1.3125)
 def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> None:
     error = oscillation(rate, omega, phase)
-    assert Trend.GROWS not in {envelope(T_S, error).trend} & {envelope(T_S, error[::-1]).trend}
+    assert EnvelopeTrend.GROWS not in {fit_envelope(T_S, error).trend} & {
+        fit_envelope(T_S, error[::-1]).trend
+    }
 
 
 @given(turn_s=st.floats(16.5, 23.5), power=st.floats(0.3, 3.0), scale=scales)
 def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, scale: float) -> None:
     """A quarter of a swing before the middle of a run and one behind it: nobody knows how it goes on."""
-    trend = envelope(T_S, scale * np.abs(T_S - turn_s) ** power).trend
-    assert trend in (Trend.UNDECIDED, Trend.STEADY)
+    trend = fit_envelope(T_S, scale * np.abs(T_S - turn_s) ** power).trend
+    assert trend in (EnvelopeTrend.UNDECIDED, EnvelopeTrend.STEADY)
 
 
 @given(decay=st.floats(0.05, 2.0), rate=st.floats(0.03, 0.3), share=st.floats(0.01, 1.0))
@@ -77,39 +79,39 @@ def test_growth_under_a_start_that_dies_is_growth_once_it_has_gone_on(
     """At the middle of the longer run the growing part is ten times the dying one."""
     t_s = np.linspace(0.0, 2.0 * max(4.0 / rate, math.log(10.0 / share) / (decay + rate)), 800)
     error = np.exp(-decay * t_s) + share * np.exp(rate * t_s)
-    assert envelope(t_s, error).trend is Trend.GROWS
+    assert fit_envelope(t_s, error).trend is EnvelopeTrend.GROWS
 
 
 @given(at_s=st.floats(20.0, 39.0), height=st.floats(10.0, 1e4), decay=st.floats(0.1, 5.0))
 def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float, decay: float) -> None:
     since_s = np.maximum(0.0, T_S - at_s)
     kick = np.where(since_s > 0.0, height * np.exp(-decay * since_s), 0.0)
-    assert envelope(T_S, 1e-3 * (1.0 + kick)).trend is not Trend.GROWS
+    assert fit_envelope(T_S, 1e-3 * (1.0 + kick)).trend is not EnvelopeTrend.GROWS
 
 
 @given(time_constant_s=st.floats(0.5, 1e3))
 def test_a_response_that_settles_is_not_growth(time_constant_s: float) -> None:
-    assert envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not Trend.GROWS
+    assert fit_envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not EnvelopeTrend.GROWS
 
 
 def test_what_has_converged_decays_whatever_noise_is_left() -> None:
     noise = np.random.default_rng(1).uniform(0.0, FLOOR_RAD, len(T_S))
-    assert envelope(T_S, noise).trend is Trend.DECAYS
-    assert envelope(T_S, np.where(T_S < 10.0, 1.0, noise)).trend is Trend.DECAYS
+    assert fit_envelope(T_S, noise).trend is EnvelopeTrend.DECAYS
+    assert fit_envelope(T_S, np.where(T_S < 10.0, 1.0, noise)).trend is EnvelopeTrend.DECAYS
 
 
 def test_of_stationary_noise_next_to_nothing_is_called_growth() -> None:
     trends = [
-        envelope(T_S, np.exp(0.3 * np.random.default_rng(seed).standard_normal(len(T_S)))).trend
+        fit_envelope(T_S, np.exp(0.3 * np.random.default_rng(seed).standard_normal(len(T_S)))).trend
         for seed in range(300)
     ]
-    assert trends.count(Trend.GROWS) <= 3
-    assert trends.count(Trend.STEADY) + trends.count(Trend.DECAYS) >= 270
+    assert trends.count(EnvelopeTrend.GROWS) <= 3
+    assert trends.count(EnvelopeTrend.STEADY) + trends.count(EnvelopeTrend.DECAYS) >= 270
 
 
 @pytest.mark.parametrize("points", [0, 1, 2, 15, 30])
 def test_a_short_run_is_undecided(points: int) -> None:
-    found = envelope(T_S[:points], np.exp(T_S[:points]))
-    assert found.trend is Trend.UNDECIDED
+    found = fit_envelope(T_S[:points], np.exp(T_S[:points]))
+    assert found.trend is EnvelopeTrend.UNDECIDED
     assert math.isnan(found.rate_per_s)
     assert "record longer" in found.trend

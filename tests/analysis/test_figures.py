@@ -6,8 +6,10 @@ import pytest
 from matplotlib.colors import to_hex
 
 import trilat_net
-from trilat_net.analysis import ages, figures, marks, motion, poses, quantities, style, timing
-from trilat_net.analysis.happenings import spans
+from trilat_net.analysis import site_signals
+from trilat_net.analysis.timeline import find_mode_intervals
+from trilat_net.reporting import event_markers, style
+from trilat_net.reporting.figures import arm_poses, joint_motion, loop_timing, registry, sample_age
 
 from . import logs
 
@@ -37,7 +39,7 @@ def lines(axes):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_axis_says_its_unit(name):
     log = logs.timed(logs.simulated(name))
-    for title, figure in figures.all_figures(log, logs.twin(name)):
+    for title, figure in registry.draw_report_figures(log, logs.twin(name)):
         grid = outer(figure)
         assert grid, title
         for axes in grid:
@@ -52,7 +54,7 @@ def test_every_axis_says_its_unit(name):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_figures_are_written_and_leave_matplotlib_as_it_was(name, tmp_path):
     before = dict(mpl.rcParams)
-    paths = figures.write_figures(logs.timed(logs.simulated(name)), tmp_path, logs.twin(name))
+    paths = registry.write_report_figures(logs.timed(logs.simulated(name)), tmp_path, logs.twin(name))
     assert len(paths) == 8
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
     assert dict(mpl.rcParams) == before
@@ -61,48 +63,51 @@ def test_figures_are_written_and_leave_matplotlib_as_it_was(name, tmp_path):
 def test_a_site_has_one_colour_in_every_figure():
     log = logs.simulated("paper")
     for figure in (
-        motion.tracking_errors(log),
-        motion.parameter_estimates(log),
-        motion.hands_moved(log, log),
+        joint_motion.draw_tracking_errors(log),
+        joint_motion.draw_parameter_estimates(log),
+        joint_motion.draw_operator_displacement(log, log),
     ):
         drawn = [to_hex(line.get_color()) for line in lines(figure.axes[0])]
-        assert drawn[: len(log.sites)] == [style.colour(log, site) for site in log.sites]
-    for site, axes in zip(log.sites, motion.positions(log).axes[::2], strict=True):
-        assert to_hex(lines(axes)[0].get_color()) == style.colour(log, site)
+        assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
+    for site, axes in zip(log.sites, joint_motion.draw_positions(log).axes[::2], strict=True):
+        assert to_hex(lines(axes)[0].get_color()) == style.site_colour(log, site)
 
 
 def test_operator_torque_is_the_torque_on_the_arm():
     log = logs.simulated("four")
-    (line,) = lines(motion.operator_torques(log).axes[0])
+    (line,) = lines(joint_motion.draw_operator_torques(log).axes[0])
     assert line.get_ydata().max() == pytest.approx(8.0, rel=1e-3)
     assert line.get_ydata().min() == 0.0
-    assert quantities.sites_with_hands(log) == ["a"]
+    assert site_signals.sites_with_operator(log) == ["a"]
 
 
 def test_nobody_at_the_arms_is_said():
     log = logs.simulated("free")
-    for figure in (motion.operator_torques(log), motion.hands_moved(log, None)):
-        assert [text.get_text() for text in figure.texts] == [motion.NO_HANDS]
-    (text,) = motion.hands_moved(logs.simulated("paper"), None).texts
-    assert text.get_text() == motion.NO_TWIN
+    for figure in (
+        joint_motion.draw_operator_torques(log),
+        joint_motion.draw_operator_displacement(log, None),
+    ):
+        assert [text.get_text() for text in figure.texts] == [joint_motion.NO_OPERATOR]
+    (text,) = joint_motion.draw_operator_displacement(logs.simulated("paper"), None).texts
+    assert text.get_text() == joint_motion.NO_RUN_WITHOUT_OPERATOR
 
 
 def test_virtual_time_is_said_instead_of_zeros():
-    (text,) = timing.loop_timing(logs.simulated("paper")).texts
-    assert text.get_text() == timing.NO_CLOCK
+    (text,) = loop_timing.draw_loop_timing(logs.simulated("paper")).texts
+    assert text.get_text() == loop_timing.NO_LOOP_CLOCK
 
 
 def test_histograms_count_every_tick():
     log = logs.timed(logs.simulated("four"))
-    edges = timing.bin_edges(log)
+    edges = loop_timing.loop_time_bin_edges(log)
     for site in log.sites:
-        assert timing.histogram(log[site].late_us, edges).sum() == len(log[site])
-        assert timing.histogram(log[site].busy_us, edges).sum() == len(log[site]) - 1
+        assert loop_timing.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
+        assert loop_timing.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
 
 
 def test_estimates_show_the_sites_that_are_asked_for():
     log = logs.simulated("paper")
-    figure = motion.parameter_estimates(log, ["m2"])
+    figure = joint_motion.draw_parameter_estimates(log, ["m2"])
     assert [len(lines(axes)) for axes in figure.axes] == [1] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
     assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
@@ -110,7 +115,7 @@ def test_estimates_show_the_sites_that_are_asked_for():
 
 def test_ages_are_drawn_per_link():
     log = logs.simulated("four")
-    figure = ages.sample_age(log)
+    figure = sample_age.draw_sample_age(log)
     assert len(figure.axes) == 12
     assert figure.axes[0].get_title(loc="left") == "b → a"
     drawn = lines(figure.axes[0])[0].get_ydata()
@@ -120,51 +125,55 @@ def test_ages_are_drawn_per_link():
 
 def test_a_log_in_which_nothing_happened_has_no_marks_and_no_distribution():
     log = logs.simulated("paper")
-    for title, figure in figures.all_figures(log, logs.twin("paper")):
+    for title, figure in registry.draw_report_figures(log, logs.twin("paper")):
         assert marked(figure) == ([], []), title
         assert figure.get_supxlabel() == ""
-    assert "delay_distributions" not in dict(figures.all_figures(log, None))
-    assert [text.get_text() for text in ages.delay_distributions(log).texts] == [ages.NO_JITTER]
+    assert "delay_distributions" not in dict(registry.draw_report_figures(log, None))
+    assert [text.get_text() for text in sample_age.draw_delay_distributions(log).texts] == [
+        sample_age.NO_VARYING_DELAY
+    ]
 
 
 def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow():
     log = logs.busy().log
-    figure = motion.positions(log)
+    figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
             at_s = [line.get_xdata()[0] for line in axes.lines if line.get_zorder() == BACKGROUND]
             assert at_s == {"a": [3.0], "b": [], "c": [1.0, 4.0]}[site]
             drawn = [edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())]
-            assert drawn == pytest.approx([edge for span in spans(log[site]) for edge in span[1:]])
-    shades, changes = marked(motion.tracking_errors(log))
+            assert drawn == pytest.approx(
+                [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
+            )
+    shades, changes = marked(joint_motion.draw_tracking_errors(log))
     assert len(changes) == 3 * 3
-    assert len(shades) == 3 * sum(len(spans(log[site])) for site in log.sites)
+    assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
     assert "holds" in figure.get_supxlabel()
 
 
 def test_of_many_changes_a_figure_names_the_first_ones(monkeypatch):
-    monkeypatch.setattr(marks, "MOST", 1)
-    assert "and 2 more" in motion.positions(logs.busy().log).get_supxlabel()
+    monkeypatch.setattr(event_markers, "MOST_EXPLAINED_CHANGES", 1)
+    assert "and 2 more" in joint_motion.draw_positions(logs.busy().log).get_supxlabel()
 
 
 def test_the_stated_mean_is_drawn_while_it_holds_and_not_where_there_is_none():
     log = logs.busy().log
-    figure = ages.sample_age(log)
+    figure = sample_age.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
     t_s, mean_ms = lines(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
     assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
     measured = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
-    figure = ages.sample_age(measured)
+    figure = sample_age.draw_sample_age(measured)
     assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
     assert "mean delay as stated" not in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_distributions_are_cumulative_and_of_delay_and_age():
     log = logs.busy().log
-    assert "delay_distributions" in dict(figures.all_figures(log, None))
-    for axes in ages.delay_distributions(log).axes:
+    assert "delay_distributions" in dict(registry.draw_report_figures(log, None))
+    for axes in sample_age.draw_delay_distributions(log).axes:
         age, delay = (line.get_ydata() for line in axes.lines)
         for curve in (age, delay):
             assert (np.diff(curve) >= 0.0).all()
@@ -175,22 +184,24 @@ def test_distributions_are_cumulative_and_of_delay_and_age():
 @pytest.mark.parametrize("outage_ms", [0.0, 5000.0])
 def test_the_axis_of_ages_is_logarithmic_after_an_outage(outage_ms):
     values = np.append(np.full(1000, 200.0), 200.0 + outage_ms)
-    assert ages.is_tall(values) == (outage_ms > 0.0)
-    assert not ages.is_tall(np.full(3, np.nan))
+    assert sample_age.needs_log_axis(values) == (outage_ms > 0.0)
+    assert not sample_age.needs_log_axis(np.full(3, np.nan))
 
 
 def test_shares_are_of_all_that_there_is():
-    assert ages.percent_up_to(np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])).tolist() == [
+    assert sample_age.cumulative_percent(
+        np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])
+    ).tolist() == [
         0,
         75,
         100,
     ]
-    assert np.isnan(ages.percent_up_to(np.zeros(0), np.zeros(2))).all()
+    assert np.isnan(sample_age.cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
 
 def test_arms_stand_where_their_angles_put_them():
     arm = logs.simulated("four").scenario.sites["c"].arm
-    base, elbow, tip = poses.joints_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
+    base, elbow, tip = arm_poses.joint_positions_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert base == pytest.approx([0.0, 0.0])
     assert elbow == pytest.approx([0.0, 0.6])
     assert tip == pytest.approx([1.0, 0.6])
@@ -198,7 +209,7 @@ def test_arms_stand_where_their_angles_put_them():
 
 def test_arms_fit_into_their_panels_with_equal_axes():
     log = logs.simulated("four")
-    figure = poses.arms(log, [0.0, 1.0])
+    figure = arm_poses.draw_arms(log, [0.0, 1.0])
     assert len(figure.axes) == 8
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -214,11 +225,11 @@ def test_arms_fit_into_their_panels_with_equal_axes():
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_instants_begin_at_the_beginning_and_end_at_the_end(name):
     log = logs.simulated(name)
-    instants = poses.instants_s(log)
+    instants = arm_poses.choose_instants_s(log)
     assert instants[0] == 0.0
     assert instants[-1] == pytest.approx(2.0)
     assert (np.diff(instants) > 0.0).all()
-    assert 3 <= len(instants) <= poses.INSTANTS
+    assert 3 <= len(instants) <= arm_poses.INSTANTS
 
 
 def test_importing_the_package_does_not_import_matplotlib():

@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.analysis.happenings import FOLLOWING, changes, diverged_at_s, end_s, spans, stated
+from trilat_net.analysis.timeline import (
+    FOLLOWING_MODES,
+    diverged_at_s,
+    find_mode_intervals,
+    list_changes,
+    list_stated_models,
+    recorded_end_s,
+)
 from trilat_net.errors import LogError
 
 from . import logs
@@ -15,35 +22,35 @@ MODES = ("run", "hold", "brake", "return", "diverged")
 @given(st.lists(st.sampled_from(MODES), max_size=60))
 def test_spans_are_the_ticks_at_which_a_site_did_not_follow(modes):
     part = logs.in_modes(modes)
-    away = [(mode, k) for k, mode in enumerate(modes) if mode not in FOLLOWING]
+    away = [(mode, k) for k, mode in enumerate(modes) if mode not in FOLLOWING_MODES]
     found = [
         (span.mode, k)
-        for span in spans(part)
+        for span in find_mode_intervals(part)
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
     assert found == away
-    for before, after in zip(spans(part), spans(part)[1:], strict=False):
+    for before, after in zip(find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False):
         assert (before.mode, before.to_s) != (after.mode, after.from_s)  # one span, not two in a row
     assert (diverged_at_s(part) is None) == (modes[-1:] != ["diverged"])
 
 
 def test_changes_come_in_the_order_in_which_they_hold_and_those_after_the_end_never_did():
     log = logs.busy().log
-    assert [(c.change.at_s, c.about, c.taken_at_tick) for c in changes(log)] == [
+    assert [(c.change.at_s, c.about, c.taken_at_tick) for c in list_changes(log)] == [
         (1.0, "a->c", None),
         (3.0, "c->a", 500),
         (4.0, "shares of c", None),
     ]
-    assert end_s(log) == 6.0
+    assert recorded_end_s(log) == 6.0
 
 
 def test_what_is_stated_of_a_link_changes_with_it():
     log = logs.busy().log
-    assert [(s.from_s, s.link.describe()) for s in stated(log, "a->c")] == [
+    assert [(s.from_s, s.link.describe()) for s in list_stated_models(log, "a->c")] == [
         (0.0, "50 ms"),
         (1.0, "90 ms, loss 10 %"),
     ]
-    assert [s.from_s for s in stated(log, "b->a")] == [0.0]
+    assert [s.from_s for s in list_stated_models(log, "b->a")] == [0.0]
 
 
 @pytest.mark.parametrize("text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}'])
@@ -52,10 +59,10 @@ def test_a_record_that_names_a_change_that_is_none_of_its_sites_is_refused(text)
         return logs.replaced(state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd)
 
     with pytest.raises(LogError):
-        changes(logs.rewritten(logs.busy().log, change=spoiled))
+        list_changes(logs.rewritten(logs.busy().log, change=spoiled))
 
 
 def test_a_log_without_records_ends_as_planned():
     empty = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
-    assert end_s(empty) == 2.0
-    assert spans(empty["m1"]) == []
+    assert recorded_end_s(empty) == 2.0
+    assert find_mode_intervals(empty["m1"]) == []

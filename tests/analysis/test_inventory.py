@@ -7,8 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.log_editing import edited, recorded, without
-from trilat_net.analysis.inventory import Inventory
-from trilat_net.analysis.overview import overview
+from trilat_net.analysis.file_overview import FileInventory, describe_files
 from trilat_net.errors import LogError
 
 WHOLE = recorded("paper")
@@ -27,7 +26,7 @@ def written(folder: Path, data: bytes) -> Path:
 def test_gaps_are_the_records_that_are_not_there(tmp_path: Path, lost: set[int]) -> None:
     """But for those behind the last one, which no number tells of."""
     path = written(tmp_path, edited(WHOLE, record=without("m1", lost)))
-    facts = Inventory([path]).channels("paper", RATES)[STATE]
+    facts = FileInventory([path]).channels("paper", RATES)[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
     assert named == {n for n in lost if n < last}
@@ -41,20 +40,20 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
     for n, half in enumerate(halves):
         paths.append(tmp_path / f"{n}.mcap")
         paths[-1].write_bytes(edited(WHOLE, record=half))
-    inventory = Inventory(paths)
+    inventory = FileInventory(paths)
     facts = inventory.channels("paper", RATES)[STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
     assert [file["finished"] for file in inventory.files] == [True, True]
-    assert overview(paths)["sites"]["m1"]["missing"] == 0
+    assert describe_files(paths)["sites"]["m1"]["missing"] == 0
 
 
 def test_progress_runs_once_through_all(tmp_path: Path) -> None:
     told: list[float] = []
-    overview([written(tmp_path, WHOLE)], lambda done, total: told.append(done / total))
+    describe_files([written(tmp_path, WHOLE)], lambda done, total: told.append(done / total))
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.5 < told[-1] <= 1.0
 
 
 def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
-        Inventory([tmp_path])
+        FileInventory([tmp_path])

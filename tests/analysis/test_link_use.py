@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 
 import trilat_net
-from trilat_net.analysis.fates import fates
-from trilat_net.analysis.link_use import histogram, link_uses, spread
+from trilat_net.analysis.delivery import predict_delivery
+from trilat_net.analysis.link_summary import bin_ages, compute_statistics, summarise_links
 from trilat_net.errors import LogError
-from trilat_net.scenario import load, parse
+from trilat_net.scenario import load_scenario, parse_scenario
 
 from . import logs
 
@@ -19,7 +19,7 @@ PERIOD_MS = 1.0
 
 
 def uses(log):
-    return {use.name: use for use in link_uses(log)}
+    return {use.name: use for use in summarise_links(log)}
 
 
 @cache
@@ -48,7 +48,7 @@ def test_counts_are_those_of_the_link_itself(link):
 def test_what_was_superseded_is_in_use_in_no_record():
     log = logs.busy().log
     for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
-        release = fates(log, peer, site, log.scenario.ticks(peer)).release(log[site].rate_hz)
+        release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(log[site].rate_hz)
         released = {n for n, tick in enumerate(release) if 0 <= tick <= log[site].tick[-1]}
         arrived = {
             tick for state in log[site].states for j, tick, _ in state.rx if log[site].peers[j] == peer
@@ -58,7 +58,7 @@ def test_what_was_superseded_is_in_use_in_no_record():
 
 
 def test_what_the_network_lost_and_doubled_is_counted():
-    scenario = load("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
+    scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
     run = logs.driven(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
     found = uses(run.log)
@@ -84,7 +84,7 @@ def test_what_a_missing_record_would_have_named_is_neither_lost_nor_come():
 
 
 def test_a_link_that_is_cut_until_the_end_has_lost_all_that_was_sent():
-    scenario = load("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
+    scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     run = logs.driven(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
     cut = uses(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
@@ -96,8 +96,8 @@ def test_late_samples_are_those_of_the_core():
     log = logs.simulated("free")
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
-    run = logs.driven(parse(hurried))
-    for use in link_uses(run.log):
+    run = logs.driven(parse_scenario(hurried))
+    for use in summarise_links(run.log):
         assert use.counts.late == counted(run, use.name).late
 
 
@@ -126,10 +126,10 @@ def test_a_record_of_a_tick_that_is_never_made_costs_no_memory():
 
 
 def test_without_jitter_the_effective_delay_is_the_stated_one():
-    for use in link_uses(logs.simulated("paper")):
+    for use in summarise_links(logs.simulated("paper")):
         assert use.plain
-        assert use.age_ms == spread([200.0])
-        assert use.drawn_ms == spread([200.0])
+        assert use.age_ms == compute_statistics([200.0])
+        assert use.drawn_ms == compute_statistics([200.0])
         assert (use.ticks_without_new, use.silence_ms, use.first_use_s) == (0.0, 5.0, 0.2)
         assert sum(use.ages.ticks) == 400 - 40
 
@@ -138,7 +138,7 @@ def test_without_jitter_the_effective_delay_is_the_stated_one():
 def test_ages_in_the_records_are_what_the_fates_of_the_samples_make_them(link):
     peer, site = link.split("->")
     log, part = logs.busy().log, logs.busy().log[site]
-    fate = fates(log, peer, site, log.scenario.ticks(peer))
+    fate = predict_delivery(log, peer, site, log.scenario.ticks(peer))
     release = fate.release(part.rate_hz)
     usable = np.full(len(part), -1)
     for sample, tick in enumerate(release):
@@ -147,7 +147,7 @@ def test_ages_in_the_records_are_what_the_fates_of_the_samples_make_them(link):
     in_use = np.maximum.accumulate(usable)
     t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
     ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
-    assert tuple(busy()[link].age_ms) == pytest.approx(tuple(spread(ages)))
+    assert tuple(busy()[link].age_ms) == pytest.approx(tuple(compute_statistics(ages)))
 
 
 def newest_wins(cdf, h_ms):
@@ -200,7 +200,7 @@ def cdf_of(link):
 @cache
 def jittery(order):
     links = {f"links.{name}": {**table, "order": order} for name, (table, _) in MODELS.items()}
-    return trilat_net.simulate(load("free", {"duration_s": 4.0, **links}))
+    return trilat_net.simulate(load_scenario("free", {"duration_s": 4.0, **links}))
 
 
 @pytest.mark.parametrize("link", MODELS)
@@ -217,7 +217,7 @@ def test_the_effective_delay_under_jitter_is_that_of_theory(link, order, theory,
     use = uses(log)[link]
     assert use.age_ms.mean == pytest.approx(mean_ms, rel=margin)
     peer, site = link.split("->")
-    release = fates(log, peer, site, 300_000).release(1000)
+    release = predict_delivery(log, peer, site, 300_000).release(1000)
     ages = long_ages(release)[2000:-2000]
     assert ages.mean() == pytest.approx(mean_ms, rel=0.01)
     assert ages.std() == pytest.approx(deviation_ms, rel=0.05)
@@ -241,10 +241,10 @@ def test_the_figures_that_are_quoted():
 
 
 def test_loss_and_bursts_as_seen_are_those_of_the_model():
-    scenario = load(
+    scenario = load_scenario(
         "two_sites", {"duration_s": 60.0, "rate_hz": 200, "link.loss": 0.2, "link.loss_burst": 5.0}
     )
-    for use in link_uses(trilat_net.simulate(scenario)):
+    for use in summarise_links(trilat_net.simulate(scenario)):
         bursts = use.counts.lost / 5.0
         assert use.loss == pytest.approx(0.2, abs=4 * 0.2 * math.sqrt(2.0 / bursts))
         assert use.burst == pytest.approx(5.0, abs=4 * 5.0 / math.sqrt(bursts))
@@ -272,9 +272,9 @@ def test_a_histogram_counts_every_tick_in_few_bins_of_a_round_width():
 
 
 def test_one_age_is_one_bin():
-    assert histogram(np.full(7, 200_000_000)).ticks == [7]
-    assert histogram(np.zeros(0, dtype=np.int64)) is None
-    assert spread([]) is None
+    assert bin_ages(np.full(7, 200_000_000)).ticks == [7]
+    assert bin_ages(np.zeros(0, dtype=np.int64)) is None
+    assert compute_statistics([]) is None
 
 
 # -- logs that cannot tell
@@ -282,14 +282,14 @@ def test_one_age_is_one_bin():
 
 def test_an_empty_log_tells_nothing():
     log = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
-    for use in link_uses(log):
+    for use in summarise_links(log):
         assert use.stated[0].link.delay_ms == 200.0
         assert use.plain
         assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (None,) * 6
 
 
 def test_virtual_time_measures_no_delay_on_the_way():
-    assert all(use.one_way_us is None for use in link_uses(logs.simulated("paper")))
+    assert all(use.one_way_us is None for use in summarise_links(logs.simulated("paper")))
 
 
 def test_measured_delays_are_those_in_the_records():

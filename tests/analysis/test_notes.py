@@ -3,17 +3,23 @@
 from types import SimpleNamespace
 
 import trilat_net
-from trilat_net.analysis import notes
-from trilat_net.analysis.clocks import clock_use
-from trilat_net.analysis.notes import MOST_LETTERS, clock_lines, link_lines, outside_lines, run_lines
+from trilat_net.analysis.health import summarise_clock
 from trilat_net.net.messages import Event, LinkStats
+from trilat_net.reporting import summary_text
+from trilat_net.reporting.summary_text import (
+    MOST_LINE_CHARACTERS,
+    format_clock_lines,
+    format_link_lines,
+    format_outside_lines,
+    format_run_lines,
+)
 
 from . import logs
 
 
 def test_a_run_of_constant_links_without_loss_is_not_worth_a_line():
     for name in ("paper", "free", "two_sites", "four"):
-        assert run_lines(logs.simulated(name)) == []
+        assert format_run_lines(logs.simulated(name)) == []
 
 
 def test_a_link_says_what_was_stated_and_what_was_seen():
@@ -21,14 +27,14 @@ def test_a_link_says_what_was_stated_and_what_was_seen():
         "two_sites",
         {"duration_s": 2, "link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50},
     )
-    line = link_lines(log)[0]
+    line = format_link_lines(log)[0]
     assert line.startswith("link s->m: stated uniform 200 +- 28.9 ms; effective 16")
     assert " superseded " in line
     assert "lost" not in line
 
 
 def test_what_happened_is_told_once():
-    lines = run_lines(logs.busy().log)
+    lines = format_run_lines(logs.busy().log)
     assert "change at 3 s, ordered at tick 500: c->a: uniform 30 +- 17.3 ms" in lines
     assert "change at 4 s: shares of c: a 0.9, b 0.1 within 1 s" in lines
     assert "b: braked 2.200-3.053 s, returned 3.053-3.553 s" in lines
@@ -38,8 +44,8 @@ def test_what_happened_is_told_once():
 
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):
-    monkeypatch.setattr(notes, "MOST", 2)
-    lines = link_lines(logs.busy().log)
+    monkeypatch.setattr(summary_text, "MOST_LINES", 2)
+    lines = format_link_lines(logs.busy().log)
     assert len(lines) == 3
     assert lines[-1] == "and 4 more of this kind: see summary.json"
 
@@ -92,11 +98,11 @@ def clocked():
 
 
 def test_a_clock_is_told_as_it_stood_at_the_end():
-    use = clock_use(clocked(), "m1", "m2")
+    use = summarise_clock(clocked(), "m1", "m2")
     assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
     assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (130.0, 200, 180, 2)
     assert (use.drift_ppm, use.drift_bound_ppm) == (50.0, 0.9)
-    (line,) = clock_lines(clocked())
+    (line,) = format_clock_lines(clocked())
     assert line == (
         "clock of m1 seen by m2: +3000.100 ms at the end, known to 60 us (p50 130, max 200), "
         "drift +50.00 ppm, 2 samples came before they were sent: a clock has stepped"
@@ -104,11 +110,11 @@ def test_a_clock_is_told_as_it_stood_at_the_end():
 
 
 def test_a_shared_clock_and_a_log_without_one_are_not_worth_a_line():
-    shared = clock_use(clocked(), "s", "m2")
+    shared = summarise_clock(clocked(), "s", "m2")
     assert shared is not None
     assert shared.shared
-    assert clock_use(clocked(), "m2", "m1") is None
-    assert clock_lines(logs.simulated("paper")) == []
+    assert summarise_clock(clocked(), "m2", "m1") is None
+    assert format_clock_lines(logs.simulated("paper")) == []
 
 
 def test_what_came_from_outside_and_ended_the_run_is_a_line_that_a_terminal_can_have() -> None:
@@ -117,7 +123,7 @@ def test_what_came_from_outside_and_ended_the_run_is_a_line_that_a_terminal_can_
         SimpleNamespace(kind=kind, text=text)
         for kind, text in (("ready", "s is ready"), ("failed", long), ("law", "slow"), ("arm", "off"))
     ]
-    failed, law, arm = outside_lines(SimpleNamespace(events=said))
+    failed, law, arm = format_outside_lines(SimpleNamespace(events=said))
     assert (law, arm) == ("slow", "off")
     assert failed.startswith("the law a:B of s failed at tick 3:  [31mxxx")
-    assert len(failed) == MOST_LETTERS
+    assert len(failed) == MOST_LINE_CHARACTERS

@@ -7,13 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from trilat_net.analysis import quantities
-from trilat_net.analysis.report import VerdictLine, report_html, write_report
-from trilat_net.analysis.summary import summarise
+from trilat_net.analysis import site_signals
+from trilat_net.analysis.run_summary import summarise_run
+from trilat_net.execution.log_checks import CheckLine
+from trilat_net.reporting.page import render_report, write_report
 
 from . import logs
 
-VERDICTS = [VerdictLine("records", "all <b>there</b>", True), VerdictLine("executed again", "differs", False)]
+VERDICTS = [CheckLine("records", "all <b>there</b>", True), CheckLine("executed again", "differs", False)]
 
 
 class Page(HTMLParser):
@@ -43,7 +44,7 @@ def read(html):
 
 
 def page(log, twin=None):
-    return read(report_html(log, twin, VERDICTS, summarise(log, twin)))
+    return read(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
 
 
 def written(log, folder, twin=None):
@@ -132,7 +133,7 @@ def test_the_page_holds_the_log():
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
         values = column(data["tables"][series["table"]], series["column"])
-        assert values == pytest.approx(quantities.errors(log[site])[:, 1], rel=1e-6, abs=1e-12)
+        assert values == pytest.approx(site_signals.joint_errors(log[site])[:, 1], rel=1e-6, abs=1e-12)
 
 
 def test_the_page_tells_what_the_links_did_and_what_happened():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.summary import summarise
+from trilat_net.analysis.run_summary import summarise_run
 
 from . import logs
 
@@ -17,7 +17,7 @@ def strict(facts):
 
 def test_numbers_agree_with_the_records():
     log = logs.simulated("paper")
-    facts = strict(summarise(log, logs.twin("paper")))
+    facts = strict(summarise_run(log, logs.twin("paper")))
     for name in log.sites:
         states = log[name].states
         site = facts["sites"][name]
@@ -50,15 +50,15 @@ def test_settling_is_the_last_time_above_the_limit():
     def settle_at_250(state):
         return msgspec.structs.replace(state, q=[q + 0.02 * (state.tick == 250) for q in state.q_des])
 
-    facts = summarise(logs.rewritten(log, change=settle_at_250))
+    facts = summarise_run(logs.rewritten(log, change=settle_at_250))
     assert [site["settle_s"] for site in facts["sites"].values()] == [250 / 200] * 3
     assert facts["settle_s"] == 250 / 200
     quiet = logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, q=s.q_des))
-    assert summarise(quiet)["settle_s"] == 0.0
+    assert summarise_run(quiet)["settle_s"] == 0.0
 
 
 def test_times_of_the_loop():
-    facts = summarise(logs.timed(logs.simulated("four")))
+    facts = summarise_run(logs.timed(logs.simulated("four")))
     site = facts["sites"]["c"]  # 200 Hz: 400 ticks, late by 0 to 399 us
     assert site["late_us"]["p50"] == 199.5
     assert site["late_us"]["p99_9"] == pytest.approx(np.percentile(np.arange(400), 99.9))
@@ -71,7 +71,7 @@ def test_overruns_begin_at_a_whole_period():
     def late(state):
         return msgspec.structs.replace(state, late_us={10: 4999, 20: 5000, 30: 9000}.get(state.tick, 1))
 
-    facts = summarise(logs.rewritten(logs.simulated("paper"), change=late))
+    facts = summarise_run(logs.rewritten(logs.simulated("paper"), change=late))
     assert [site["overruns"] for site in facts["sites"].values()] == [2, 2, 2]  # 200 Hz: 5000 us
 
 
@@ -82,11 +82,11 @@ def test_saturation_is_counted():
     def cut(state):
         return msgspec.structs.replace(state, tau=[0.0, -limit]) if state.tick < 5 else state
 
-    assert summarise(logs.rewritten(log, change=cut))["sites"]["m1"]["saturated_ticks"] == 5
+    assert summarise_run(logs.rewritten(log, change=cut))["sites"]["m1"]["saturated_ticks"] == 5
 
 
 def test_a_run_that_diverged_says_so_and_misses_nothing():
-    facts = strict(summarise(logs.diverged()))
+    facts = strict(summarise_run(logs.diverged()))
     assert facts["diverged"] is True
     assert facts["missing"] == 0
     assert 0.0 < min(s["diverged_at_s"] for s in facts["sites"].values() if s["diverged_at_s"]) < 2.0
@@ -96,13 +96,13 @@ def test_a_site_that_holds_at_the_end_has_not_diverged():
     def hold(state):
         return logs.replaced(state, mode="hold" if state.tick > 350 else "run")
 
-    facts = strict(summarise(logs.rewritten(logs.simulated("paper"), change=hold)))
+    facts = strict(summarise_run(logs.rewritten(logs.simulated("paper"), change=hold)))
     assert facts["diverged"] is False
     assert facts["sites"]["m1"]["modes"] == [{"mode": "hold", "from_s": 351 / 200, "to_s": 2.0}]
 
 
 def test_what_was_changed_is_told_with_who_asked():
-    facts = strict(summarise(logs.busy().log))
+    facts = strict(summarise_run(logs.busy().log))
     told = [(c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"]) for c in facts["changes"]]
     assert told == [
         (1.0, "a->c", "90 ms, loss 10 %", "c", None),
@@ -114,7 +114,7 @@ def test_what_was_changed_is_told_with_who_asked():
 
 def test_a_measured_link_states_nothing():
     log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
-    facts = strict(summarise(log))
+    facts = strict(summarise_run(log))
     for link in facts["links"].values():
         assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (None, None, None)
         assert link["age_ms"]["max"] == 5.0
@@ -123,7 +123,7 @@ def test_a_measured_link_states_nothing():
 
 def test_missing_records_are_counted():
     log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
-    facts = summarise(log)
+    facts = summarise_run(log)
     assert [site["missing"] for site in facts["sites"].values()] == [0, 50, 0]
     assert facts["missing"] == 50
 
@@ -131,7 +131,7 @@ def test_missing_records_are_counted():
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_nulls_and_no_nan(records):
     log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False)
-    facts = strict(summarise(log, logs.twin("paper")))
+    facts = strict(summarise_run(log, logs.twin("paper")))
     assert facts["session"]["complete"] is False
     for site in facts["sites"].values():
         assert site["records"] == records

@@ -2,13 +2,13 @@ import io
 
 import pytest
 
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.scenario import load_scenario
 
 
 @pytest.fixture(scope="session")
 def short_log() -> bytes:
     """The bytes of a log of half a second of virtual time."""
     stream = io.BytesIO()
-    virtual.record(load("paper", {"duration_s": 0.5}), stream)
+    virtual.write_virtual_log(load_scenario("paper", {"duration_s": 0.5}), stream)
     return stream.getvalue()

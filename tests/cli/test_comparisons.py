@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.tuning.experiments import TRIO
+from tests.studies.tuning.experiments import TRIO
 
 from .running import trilat
 

@@ -9,7 +9,7 @@ from mcap.writer import Writer
 
 from tests.cli.running import trilat
 from tests.log_editing import edited, recorded, without
-from trilat_net.cli.show import shown
+from trilat_net.reporting.terminal_output import sanitize
 
 WHOLE = recorded("paper")
 
@@ -133,8 +133,8 @@ def test_verify_names_every_gap_and_goes_on_behind_it(tmp_path: Path) -> None:
 
 def test_what_a_file_says_reaches_no_terminal_as_it_is(tmp_path: Path) -> None:
     """An escape sequence in a name could clear the screen, or write what was never there."""
-    assert shown("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
-    assert len(shown("x" * 10_000)) < 400
+    assert sanitize("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
+    assert len(sanitize("x" * 10_000)) < 400
     path = written(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
     done = trilat("log", "info", path, cwd=tmp_path)
     assert "\x1b" not in done.out + done.err

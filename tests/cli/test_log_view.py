@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from trilat_net.log.standard import channels_of
+from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 
 from .running import trilat
 
@@ -23,7 +23,7 @@ def test_a_simulation_shows_itself_as_often_as_asked(
 
 def test_views_are_on_by_default(tmp_path: Path) -> None:
     trilat("sim", "two_sites", "--duration", "0.1", "-o", "x.mcap", cwd=tmp_path).succeeds()
-    assert "/viz/m/joint_states" in channels_of(tmp_path / "x.mcap")
+    assert "/viz/m/joint_states" in read_ros2_channels(tmp_path / "x.mcap")
 
 
 @pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from trilat_net.log.reader import open_log
+from trilat_net.log.log_reader import open_log
 
 from .running import trilat
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sweep.quick import SHORT
+from tests.studies.sweep.quick import SHORT
 
 from .running import trilat
 

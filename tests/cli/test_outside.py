@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.running import trilat
-from trilat_net.log.reader import open_log
+from trilat_net.log.log_reader import open_log
 
 DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
@@ -42,11 +42,11 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
 
 def test_what_a_page_says_of_a_law_is_what_a_law_gets() -> None:
     """Every name in the table is one of `core.own`, and every one of those is in the table."""
-    from trilat_net.core.own import Facts, Now
+    from trilat_net.core.user_law import LawContext, LawInput
 
     page = DOC.read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| `(Facts|Now)`, [^|]*\| (.*) \|$", page, re.MULTILINE))
-    for kind in (Facts, Now):
+    rows = dict(re.findall(r"^\| `(LawContext|LawInput)`, [^|]*\| (.*) \|$", page, re.MULTILINE))
+    for kind in (LawContext, LawInput):
         assert set(re.findall(r"`(\w+)`", rows[kind.__name__])) == set(kind._fields)
 
 
@@ -131,7 +131,7 @@ def test_virtual_time_has_no_arm_outside(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
-    from tests.replay.test_outside import external_log
+    from tests.execution.test_outside import external_log
 
     (tmp_path / "outside.mcap").write_bytes(external_log())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses("sites.s.plant", "as in --replace m")

@@ -44,7 +44,7 @@ BLOCKED = """
 import sys
 for name in {blocked!r}:
     sys.modules[name] = None
-import trilat_net, trilat_net.experiment, trilat_net.conclusion, trilat_net.cli
+import trilat_net, trilat_net.api, trilat_net.reporting.conclude, trilat_net.cli
 from typer.testing import CliRunner
 for arguments in {commands!r}:
     result = CliRunner().invoke(trilat_net.cli.app, arguments)

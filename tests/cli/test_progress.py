@@ -5,40 +5,40 @@ import io
 import pytest
 from rich.console import Console
 
-from trilat_net.cli import progress
+from trilat_net.reporting import terminal_output
 
 
 def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.StringIO:
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=interactive, force_interactive=interactive, width=80)
-    monkeypatch.setattr(progress, "err", console)
+    monkeypatch.setattr(terminal_output, "err", console)
     return stream
 
 
 def work() -> None:
-    with progress.bar("reading run.mcap") as told:
+    with terminal_output.progress_bar("reading run.mcap") as told:
         for done in range(0, 101, 20):
             told(done, 100)
 
 
 def test_nothing_is_drawn_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=False)
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
     work()
     assert stream.getvalue() == ""
 
 
 def test_nothing_is_drawn_of_what_is_done_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=True)
-    monkeypatch.setattr(progress, "PATIENCE_S", 1e6)
+    monkeypatch.setattr(terminal_output, "PATIENCE_S", 1e6)
     work()
     assert stream.getvalue() == ""
 
 
 def test_what_takes_long_has_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=True)
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    monkeypatch.setattr(progress, "_EVERY_S", -1.0)
+    monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(terminal_output, "_EVERY_S", -1.0)
     work()
     text = stream.getvalue()
     assert "reading run.mcap" in text

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.log_editing import edited
-from trilat_net.experiment import open_log
+from trilat_net.log.log_reader import open_log
 
 from .running import trilat
 

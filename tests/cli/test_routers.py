@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 
 from .running import trilat
@@ -59,14 +59,14 @@ def test_a_router_goes_alone(command: tuple[str, ...], options: list[str], fact:
 
 
 def test_a_router_that_does_not_answer_is_named(tmp_path: Path) -> None:
-    (endpoint,) = free_endpoints(1)
+    (endpoint,) = find_free_endpoints(1)
     done = trilat(*COMMANDS[1], "--router", endpoint, "--join-timeout", "0", cwd=tmp_path)
     done.refuses(f"no router answers at {endpoint} within 0 s")
     assert not (tmp_path / "t.mcap").exists()
 
 
 def test_a_router_on_a_busy_port_says_so(tmp_path: Path) -> None:
-    (endpoint,) = free_endpoints(1)
+    (endpoint,) = find_free_endpoints(1)
     other = ZenohBus([endpoint])
     try:
         trilat("router", "--listen", endpoint, cwd=tmp_path).refuses(f"{endpoint}: the port is in use")

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.scenario import load, shipped
+from trilat_net.scenario import list_shipped, load_scenario
 
 from .running import trilat
 
@@ -12,21 +12,21 @@ SHIPPED = {"paper", "paper_rods", "free", "asymmetric", "two_sites"}
 
 def test_list_names_every_shipped_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "list", cwd=tmp_path).succeeds()
-    assert set(shipped()) >= SHIPPED
-    for name in shipped():
+    assert set(list_shipped()) >= SHIPPED
+    for name in list_shipped():
         assert name in text
 
 
 def test_list_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
     lines = trilat("scenario", "list", cwd=tmp_path).succeeds().splitlines()
-    assert len(lines) == 1 + len(shipped())
+    assert len(lines) == 1 + len(list_shipped())
     assert max(map(len, lines)) <= 80
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_what_show_says_of_a_scenario_fits_a_terminal_of_80_columns(name: str) -> None:
     """The same words as in its file: `show` prints them as they stand there."""
-    scenario = load(name)
+    scenario = load_scenario(name)
     assert f'about = """\n{scenario.about}"""' in scenario.text
     assert max(map(len, scenario.about.splitlines())) <= 80
     assert len(scenario.about.splitlines()) <= 16
@@ -37,8 +37,11 @@ def test_what_show_prints_is_the_same_scenario(name: str, tmp_path: Path) -> Non
     text = trilat("scenario", "show", name, cwd=tmp_path).succeeds()
     copy = tmp_path / "copy.toml"
     copy.write_text(text)
-    assert load(copy).sha256 == load(name).sha256
-    assert f"sha256 {load(name).sha256[:16]}" in trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
+    assert load_scenario(copy).sha256 == load_scenario(name).sha256
+    assert (
+        f"sha256 {load_scenario(name).sha256[:16]}"
+        in trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
+    )
 
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.sweep.quick import SHORT
-from trilat_net.cli.sweeps import chosen_seeds
+from tests.studies.sweep.quick import SHORT
+from trilat_net.cli.sweep import parse_seed_count
 from trilat_net.errors import UsageError
 
 from .running import trilat
@@ -63,12 +63,12 @@ def test_a_folder_that_is_called_as_a_scenario_is_none(folder: Path) -> None:
 
 
 def test_seeds_are_a_number_or_a_list() -> None:
-    assert chosen_seeds(None) == 1
-    assert chosen_seeds("10") == 10
-    assert chosen_seeds("1..3,8") == [1, 2, 3, 8]
-    assert chosen_seeds("7..7") == chosen_seeds("7,") == [7]
+    assert parse_seed_count(None) == 1
+    assert parse_seed_count("10") == 10
+    assert parse_seed_count("1..3,8") == [1, 2, 3, 8]
+    assert parse_seed_count("7..7") == parse_seed_count("7,") == [7]
     with pytest.raises(UsageError, match=r"1\.\.20"):
-        chosen_seeds("x")
+        parse_seed_count("x")
 
 
 BAD = {

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.waiting import until
-from tests.trial.results import QUICK
-from trilat_net.cli.trials import parsed_seeds
+from tests.studies.trials.results import QUICK
+from trilat_net.cli.test import parse_seeds
 from trilat_net.errors import UsageError
-from trilat_net.scenario import load, shipped
+from trilat_net.scenario import list_shipped, load_scenario
 
 from .running import COMMAND, PLAIN, trilat
 
@@ -90,10 +90,10 @@ def test_bad_input_is_2_before_anything_runs(folder: Path) -> None:
 
 
 def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
-    from trilat_net.cli.trials import _batch
+    from trilat_net.cli.test import _batch
 
     named = [trial.source for trial in _batch([], [1, 2], [], live=False)]
-    assert set(named) == {name for name in shipped() if load(name).expect.asks}
+    assert set(named) == {name for name in list_shipped() if load_scenario(name).expect.asks}
     assert "paper" in named
 
 
@@ -102,7 +102,7 @@ def test_without_arguments_every_shipped_scenario_that_expects_something_is_mean
 )
 def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list[int]) -> None:
     text = ",".join([f"{first}..{first + count}", *map(str, others)])
-    assert parsed_seeds(text) == [*range(first, first + count + 1), *others]
+    assert parse_seeds(text) == [*range(first, first + count + 1), *others]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list
 )
 def test_other_texts_name_no_seeds(text: str) -> None:
     with pytest.raises(UsageError, match="--seeds"):
-        parsed_seeds(text)
+        parse_seeds(text)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

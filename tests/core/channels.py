@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.channel import foresee
-from trilat_net.core.delay import MODEL, Model, Points
-from trilat_net.core.draw import link_key
-from trilat_net.core.link import LINK, SAMPLE
-from trilat_net.scenario.link import LinkBase
+from trilat_net.core.channel import schedule_deliveries
+from trilat_net.core.delay import LINK_MODEL_DTYPE, LinkModel
+from trilat_net.core.link import LINK_DTYPE, SAMPLE_DTYPE
+from trilat_net.core.philox import link_key
+from trilat_net.core.vectors import Points
+from trilat_net.scenario.delay_models import LinkBase
 
 Ints = NDArray[np.int64]
 SEEDS = (1, 2, 3, 20_240_229, 2**63 - 1)
@@ -28,7 +29,7 @@ class Channel(NamedTuple):
 
 
 def channel(
-    models: Sequence[Model],
+    models: Sequence[LinkModel],
     seed: int = 1,
     name: str = LINK_NAME,
     rate_hz: int = 1000,
@@ -38,11 +39,16 @@ def channel(
 ) -> Channel:
     """A channel at its beginning; of the points the last `outages` are such."""
     table = np.empty((0, 2), dtype=np.int64) if points is None else points
-    row: Any = np.zeros(1, LINK)[0]
+    row: Any = np.zeros(1, LINK_DTYPE)[0]
     row.rate_hz, row.key, row.models = rate_hz, link_key(seed, name), len(models)
     row.used = row.foreseen = -1
     row.outage_first, row.outage_count = len(table) - outages, outages
-    return Channel(row, np.array([tuple(model) for model in models], MODEL), np.zeros(pages, SAMPLE), table)
+    return Channel(
+        row,
+        np.array([tuple(model) for model in models], LINK_MODEL_DTYPE),
+        np.zeros(pages, SAMPLE_DTYPE),
+        table,
+    )
 
 
 def due(made: Channel, count: int) -> Ints:
@@ -52,7 +58,7 @@ def due(made: Channel, count: int) -> Ints:
     parts = []
     for start in range(first, count, len(pages)):
         end = min(start + len(pages), count)
-        foresee(end - 1, row, models, pages, points)
+        schedule_deliveries(end - 1, row, models, pages, points)
         parts.append(pages["due_ns"][np.arange(start, end) % len(pages)])
     return np.concatenate(parts)
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.draw import normal, standard_gamma, uniforms
 from trilat_net.core.jit import leaf
+from trilat_net.core.philox import standard_gamma, standard_normal, uniforms
 
 U32 = 2**32 - 1
 
@@ -25,7 +25,7 @@ def _table(key: np.uint64, count: int, kind: int, shape: float, numbers: NDArray
         if kind == 0:
             numbers[n], numbers[count + n] = uniforms(key, n, 3, 0)
         elif kind == 1:
-            numbers[n] = normal(key, n, 2, 0)
+            numbers[n] = standard_normal(key, n, 2, 0)
         else:
             numbers[n] = standard_gamma(key, n, 2, shape)
 

@@ -7,13 +7,13 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.core.arm import Links
+from trilat_net.core.two_link_arm import ArmLinks
 
 Array = NDArray[np.float64]
 
 positive = st.floats(0.05, 5.0)
 links = st.builds(
-    Links,
+    ArmLinks,
     l1_m=positive,
     m1_kg=positive,
     lc1_m=positive,  # a massless first link would make M singular where the arm is straight
@@ -35,7 +35,7 @@ angles, speeds = vectors(angle), vectors(speed)
 STEP = 1e-30
 
 
-def centres(a: Links, q: NDArray) -> list[NDArray]:
+def centres(a: ArmLinks, q: NDArray) -> list[NDArray]:
     """Where the centres of mass are, in the vertical plane; q may be complex."""
     first, both = q[0], q[0] + q[1]
     elbow = a.l1_m * np.array([np.cos(first), np.sin(first)])
@@ -43,24 +43,24 @@ def centres(a: Links, q: NDArray) -> list[NDArray]:
     return [one, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
 
 
-def kinetic(a: Links, q: Array, qd: Array) -> float:
+def kinetic(a: ArmLinks, q: Array, qd: Array) -> float:
     """Energy of the moving masses; their velocities by complex step along qd."""
     one, two = (centre.imag / STEP for centre in centres(a, q + 1j * STEP * qd))
     spin = a.I1_kg_m2 * qd[0] ** 2 + a.I2_kg_m2 * (qd[0] + qd[1]) ** 2
     return float(0.5 * (a.m1_kg * one @ one + a.m2_kg * two @ two + spin))
 
 
-def potential(a: Links, g: float, q: NDArray) -> NDArray:
+def potential(a: ArmLinks, g: float, q: NDArray) -> NDArray:
     one, two = centres(a, q)
     return g * (a.m1_kg * one[1] + a.m2_kg * two[1])
 
 
-def gravity(a: Links, g: float, q: Array) -> Array:
+def gravity(a: ArmLinks, g: float, q: Array) -> Array:
     """The gradient of the potential energy, by complex step."""
     return np.array([potential(a, g, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)])
 
 
-def inertia(a: Links, q: NDArray) -> NDArray:
+def inertia(a: ArmLinks, q: NDArray) -> NDArray:
     """Sum of m J'J and I, with the Jacobians of the centres of mass; q may be complex."""
     s1, c1 = np.sin(q[0]), np.cos(q[0])
     s12, c12 = np.sin(q[0] + q[1]), np.cos(q[0] + q[1])
@@ -72,12 +72,12 @@ def inertia(a: Links, q: NDArray) -> NDArray:
     return a.m1_kg * J1.T @ J1 + a.m2_kg * J2.T @ J2 + spins
 
 
-def inertia_rates(a: Links, q: Array) -> Array:
+def inertia_rates(a: ArmLinks, q: Array) -> Array:
     """dM/dq_k, shape (2, 2, 2) with k last, by complex step."""
     return np.stack([inertia(a, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)], axis=-1)
 
 
-def coriolis(a: Links, q: Array, qd: Array) -> Array:
+def coriolis(a: ArmLinks, q: Array, qd: Array) -> Array:
     """C(q, qd) by Christoffel symbols of the first kind."""
     D = inertia_rates(a, q)
     symbols = 0.5 * (D + D.transpose(0, 2, 1) - D.transpose(2, 0, 1))

@@ -4,28 +4,31 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from tests.core.channels import LINK_NAME
-from trilat_net.core.delay import Model, Points
-from trilat_net.core.draw import link_key
-from trilat_net.core.setup import LinkSetup, SiteSetup
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Output, Tick
-from trilat_net.scenario import load
+from trilat_net.core.delay import LinkModel
+from trilat_net.core.philox import link_key
+from trilat_net.core.site_setup import LinkSetup, SiteSetup
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput, TickRecord
+from trilat_net.core.vectors import Points
+from trilat_net.scenario import load_scenario
 
 
 def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSetup:
     """The setup of a site; overrides with `__` for the dot."""
-    return load(scenario, {key.replace("__", "."): value for key, value in overrides.items()}).setup(site)
+    return load_scenario(scenario, {key.replace("__", "."): value for key, value in overrides.items()}).setup(
+        site
+    )
 
 
 def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int) -> Site:
     """A site with a single peer behind a constant delay; its reference therefore is the sample in use."""
-    return linked(rate_hz, peer_rate_hz, [Model(location=delay_ns / 1000)])
+    return linked(rate_hz, peer_rate_hz, [LinkModel(location=delay_ns / 1000)])
 
 
 def linked(
     rate_hz: int,
     peer_rate_hz: int,
-    models: Sequence[Model],
+    models: Sequence[LinkModel],
     trace: Points | None = None,
     outages: tuple[tuple[int, int], ...] = (),
 ) -> Site:
@@ -40,5 +43,5 @@ def sample(tick: int, peer: int = 0) -> Arrival:
     return Arrival(peer, tick, (1e-3 * (tick + 1), -1e-3 * (tick + 1)), (1e-4 * tick, 0.0))
 
 
-def stepped(site: Site, ticks: Iterable[Tick]) -> list[Output]:
+def stepped(site: Site, ticks: Iterable[TickInput]) -> list[TickRecord]:
     return [site.step(tick) for tick in ticks]

@@ -9,100 +9,102 @@ from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
-from trilat_net.core import arm
-from trilat_net.core.arm import Links, parameters
+from trilat_net.core import two_link_arm
+from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
 
 g_values = st.sampled_from([0.0, 1.62, 9.81])
 
 
 def M_of(theta: Array, q: Array) -> Array:
-    return np.array(arm.inertia(theta, q))
+    return np.array(two_link_arm.inertia(theta, q))
 
 
 def C_of(theta: Array, q: Array, qd: Array) -> Array:
-    return np.array(arm.coriolis(theta, q, qd))
+    return np.array(two_link_arm.coriolis(theta, q, qd))
 
 
 def G_of(theta: Array, g: float, q: Array) -> Array:
-    return np.array(arm.gravity(theta, g, q))
+    return np.array(two_link_arm.gravity(theta, g, q))
 
 
 def Y_of(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
-    return np.array(arm.regressor(g, q, qd, v, a))
+    return np.array(two_link_arm.regressor(g, q, qd, v, a))
 
 
 def near(a: Array, b: Array, scale: float) -> bool:
     return bool(np.abs(np.asarray(a) - b).max() <= 1e-13 * (1.0 + scale))
 
 
-def size(a: Links) -> float:
+def size(a: ArmLinks) -> float:
     """An upper bound of the entries of theta."""
-    return float(np.abs(parameters(a)).sum())
+    return float(np.abs(theta_from_links(a)).sum())
 
 
 def test_theta_of_the_two_readings() -> None:
     """Eq. (24): point masses at the link ends, and uniform rods."""
-    point, third = Links(1, 1, 1, 0, 1, 1, 1, 0), 1 / 12
-    rods = Links(1, 1, 0.5, third, 1, 1, 0.5, third)
-    assert parameters(point).tolist() == [3, 1, 1, 2, 1]
-    assert parameters(rods) == pytest.approx([5 / 3, 1 / 2, 1 / 3, 3 / 2, 1 / 2])
+    point, third = ArmLinks(1, 1, 1, 0, 1, 1, 1, 0), 1 / 12
+    rods = ArmLinks(1, 1, 0.5, third, 1, 1, 0.5, third)
+    assert theta_from_links(point).tolist() == [3, 1, 1, 2, 1]
+    assert theta_from_links(rods) == pytest.approx([5 / 3, 1 / 2, 1 / 3, 3 / 2, 1 / 2])
 
 
 @given(a=links)
-def test_theta_2_is_l1_times_theta_5(a: Links) -> None:
+def test_theta_2_is_l1_times_theta_5(a: ArmLinks) -> None:
     """Eq. (24) has five parameters and four of them are independent; theta_5 is m2 lc2."""
-    theta = parameters(a)
+    theta = theta_from_links(a)
     assert theta[1] == pytest.approx(a.l1_m * theta[4], rel=1e-14)
     assert theta[4] == a.m2_kg * a.lc2_m
 
 
 @given(a=links, q=angles)
-def test_the_inertia_is_symmetric_and_positive_definite(a: Links, q: Array) -> None:
+def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -> None:
     """Property 1."""
-    M = M_of(parameters(a), q)
+    M = M_of(theta_from_links(a), q)
     assert M[0, 1] == M[1, 0]
     assert M[0, 0] > 0
     assert np.linalg.det(M) > 0
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_inertia_gives_the_kinetic_energy_of_the_masses(a: Links, q: Array, qd: Array) -> None:
-    M = M_of(parameters(a), q)
+def test_the_inertia_gives_the_kinetic_energy_of_the_masses(a: ArmLinks, q: Array, qd: Array) -> None:
+    M = M_of(theta_from_links(a), q)
     energy = physics.kinetic(a, q, qd)
     assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * size(a))
     assert near(M, physics.inertia(a, q), size(a))
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_coriolis_matrix_is_that_of_the_christoffel_symbols(a: Links, q: Array, qd: Array) -> None:
-    assert near(C_of(parameters(a), q, qd), physics.coriolis(a, q, qd), 20 * size(a))
+def test_the_coriolis_matrix_is_that_of_the_christoffel_symbols(a: ArmLinks, q: Array, qd: Array) -> None:
+    assert near(C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * size(a))
 
 
 @given(a=links, g=g_values, q=angles)
-def test_gravity_is_the_gradient_of_the_potential_energy(a: Links, g: float, q: Array) -> None:
-    assert near(G_of(parameters(a), g, q), physics.gravity(a, g, q), g * size(a))
+def test_gravity_is_the_gradient_of_the_potential_energy(a: ArmLinks, g: float, q: Array) -> None:
+    assert near(G_of(theta_from_links(a), g, q), physics.gravity(a, g, q), g * size(a))
 
 
 @given(a=links, q=angles, qd=speeds, x=speeds)
-def test_mdot_minus_two_c_is_skew(a: Links, q: Array, qd: Array, x: Array) -> None:
+def test_mdot_minus_two_c_is_skew(a: ArmLinks, q: Array, qd: Array, x: Array) -> None:
     """Eq. (4), with Mdot as the exact derivative of the masses' inertia along qd."""
     Mdot = physics.inertia_rates(a, q) @ qd
-    S = Mdot - 2.0 * C_of(parameters(a), q, qd)
+    S = Mdot - 2.0 * C_of(theta_from_links(a), q, qd)
     assert abs(x @ S @ x) <= 1e-13 * (1 + size(a)) * (1 + np.abs(qd).sum()) * (1 + x @ x)
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, v=speeds, acceleration=speeds)
 def test_the_regressor_takes_the_two_velocities_apart(
-    a: Links, g: float, q: Array, qd: Array, v: Array, acceleration: Array
+    a: ArmLinks, g: float, q: Array, qd: Array, v: Array, acceleration: Array
 ) -> None:
     """Eq. (12): Y(q, qd, v, a) theta = M a + C(q, qd) v + G."""
-    theta = parameters(a)
+    theta = theta_from_links(a)
     wanted = physics.inertia(a, q) @ acceleration + physics.coriolis(a, q, qd) @ v + physics.gravity(a, g, q)
     assert near(Y_of(g, q, qd, v, acceleration) @ theta, wanted, 1000 * size(a))
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, qdd=speeds)
-def test_with_one_velocity_it_is_the_printed_one(a: Links, g: float, q: Array, qd: Array, qdd: Array) -> None:
+def test_with_one_velocity_it_is_the_printed_one(
+    a: ArmLinks, g: float, q: Array, qd: Array, qdd: Array
+) -> None:
     """Eq. (5), with Y12 and Y22 as Section IV prints them."""
     Y = Y_of(g, q, qd, qd, qdd)
     s2, c2 = math.sin(q[1]), math.cos(q[1])
@@ -110,15 +112,15 @@ def test_with_one_velocity_it_is_the_printed_one(a: Links, g: float, q: Array, q
     assert Y[0, 1] == pytest.approx(y12, abs=1e-11)
     assert Y[1, 1] == pytest.approx(c2 * qdd[0] + s2 * qd[0] * qd[0], abs=1e-11)
     wanted = physics.inertia(a, q) @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q)
-    assert near(Y @ parameters(a), wanted, 1000 * size(a))
+    assert near(Y @ theta_from_links(a), wanted, 1000 * size(a))
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, torque=physics.vectors(st.floats(-200, 200)))
 def test_forward_dynamics_solve_the_equation_of_motion(
-    a: Links, g: float, q: Array, qd: Array, torque: Array
+    a: ArmLinks, g: float, q: Array, qd: Array, torque: Array
 ) -> None:
     """Eq. (8): M qdd + C qd + G = tau - tau_x."""
-    qdd = np.array(arm.forward_dynamics(parameters(a), g, q, qd, torque))
+    qdd = np.array(two_link_arm.forward_dynamics(theta_from_links(a), g, q, qd, torque))
     M = physics.inertia(a, q)
     rest = M @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q) - torque
     terms = np.abs(M).max() * np.abs(qdd).max() + 400 * size(a) + 200
@@ -126,7 +128,7 @@ def test_forward_dynamics_solve_the_equation_of_motion(
 
 
 @given(a=links, q=angles)
-def test_the_tip_is_where_the_links_lead(a: Links, q: Array) -> None:
-    xy = np.array(arm.elbow_and_tip((a.l1_m, a.l2_m), q))
+def test_the_tip_is_where_the_links_lead(a: ArmLinks, q: Array) -> None:
+    xy = np.array(two_link_arm.forward_kinematics((a.l1_m, a.l2_m), q))
     ends = physics.centres(a._replace(lc1_m=a.l1_m, lc2_m=a.l2_m), q)
     assert near(xy, np.array(ends), 10.0)

@@ -11,10 +11,9 @@ from tests.core.channels import channel, due
 from tests.core.kinds import KINDS, POINTS
 from tests.core.sites import linked, sample, stepped
 from trilat_net.core.channel import LOST
-from trilat_net.core.delay import Delay, Model
-from trilat_net.core.grid import first_tick_at, tick_ns
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Command, Output, Tick
+from trilat_net.core.delay import DelayKind, LinkModel
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, CoreChange, TickInput, TickRecord, first_tick_at, tick_ns
 
 TICKS = 500
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -51,7 +50,7 @@ def test_in_use_is_the_newest_sample_that_is_due_and_has_come(
     for k in range(TICKS):
         now = came[k] if k < len(came) else []
         there.update(now)
-        output = site.step(Tick(k, [sample(m) for m in now]))
+        output = site.step(TickInput(k, [sample(m) for m in now]))
         assert output.used == [max((m for m in there if LOST < release[m] <= k), default=-1)]
         assert output.used[0] >= before
         before = output.used[0]
@@ -69,7 +68,7 @@ def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> Non
     used: set[int] = set()
     for k in range(max(release) + len(came) + 1):
         now = came[k] if k < len(came) else []
-        used.add(site.step(Tick(k, [sample(m) for m in now])).used[0])
+        used.add(site.step(TickInput(k, [sample(m) for m in now])).used[0])
     counts = site.counts()[0]
     gone = counts.refused + counts.duplicate + counts.lost + counts.superseded
     assert counts.accepted == sum(map(len, came)) == gone + len(used - {-1})
@@ -99,8 +98,8 @@ def test_the_order_of_arrival_changes_no_bit(
 ) -> None:
     """Samples that come before they are due, in any order, some twice, one batch or many."""
 
-    def run_with(schedule: dict[int, list[int]]) -> list[Output]:
-        ticks = [Tick(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
+    def run_with(schedule: dict[int, list[int]]) -> list[TickRecord]:
+        ticks = [TickInput(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
         return [output._replace(rx_crc=0) for output in stepped(behind(name), ticks)]
 
     scattered: dict[int, list[int]] = {}
@@ -113,7 +112,7 @@ def test_the_order_of_arrival_changes_no_bit(
 @pytest.mark.parametrize("k", [1, 40, 333])
 def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> None:
     """Fresh or used for something else before: what a channel remembers follows from the beginning."""
-    ticks = [Tick(n, [sample(n - 1)] if n else []) for n in range(TICKS)]
+    ticks = [TickInput(n, [sample(n - 1)] if n else []) for n in range(TICKS)]
     whole = stepped(behind(name), ticks)
     before, last = whole[max(0, k - 2)], whole[k - 1]
     in_use = [sample(last.used[0]) if last.used[0] >= 0 else None]
@@ -129,8 +128,8 @@ def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> N
 @every_kind
 def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
     """The channel goes on by index while nothing comes."""
-    silent = stepped(behind(name), [Tick(k, [sample(k - 1)] if k > 600 else []) for k in range(900)])
-    heard = stepped(behind(name), [Tick(k, [sample(k - 1)] if k else []) for k in range(900)])
+    silent = stepped(behind(name), [TickInput(k, [sample(k - 1)] if k > 600 else []) for k in range(900)])
+    heard = stepped(behind(name), [TickInput(k, [sample(k - 1)] if k else []) for k in range(900)])
     settled = next(k for k in range(601, 900) if silent[k].used[0] >= 600)
     assert [o.used for o in silent[settled:]] == [o.used for o in heard[settled:]]
 
@@ -151,7 +150,7 @@ def test_whatever_number_a_sample_claims_the_work_is_bounded(name: str, came: li
     """A channel looks no further ahead than ten seconds, and nobody else's samples suffer."""
     site = behind(name)
     for k, now in enumerate(came):
-        output = site.step(Tick(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
+        output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
         assert site._links["foreseen"][0] <= k + 10_000
         assert output.used[0] < k
     k = len(came)
@@ -164,9 +163,9 @@ def test_whatever_number_a_sample_claims_the_work_is_bounded(name: str, came: li
 def test_an_ancient_sample_counts_as_lost(name: str) -> None:
     """Its page has been turned; at 1 Hz there are 32 of them."""
     site = behind(name, 1, 1)
-    stepped(site, [Tick(k, [sample(k - 1)] if k else []) for k in range(60)])
+    stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(60)])
     before = site.counts()[0]
-    output = site.step(Tick(60, [sample(59), sample(3), sample(27), sample(40)]))
+    output = site.step(TickInput(60, [sample(59), sample(3), sample(27), sample(40)]))
     after = site.counts()[0]
     assert output.used == [59]
     assert after.lost - before.lost == 2
@@ -188,9 +187,9 @@ def test_newest_wins_under_jitter_shortens_the_age_and_in_order_lengthens_it() -
     """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
 
     def mean_age(in_order: int) -> float:
-        model = Model(kind=Delay.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order)
+        model = LinkModel(kind=DelayKind.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order)
         outputs = stepped(
-            linked(1000, 1000, [model]), (Tick(k, [sample(k - 1)] if k else []) for k in range(5000))
+            linked(1000, 1000, [model]), (TickInput(k, [sample(k - 1)] if k else []) for k in range(5000))
         )
         return float(np.mean([o.tick - o.used[0] for o in outputs[1000:]]))
 
@@ -206,23 +205,23 @@ def test_a_measured_sample_is_in_use_from_the_tick_it_came_in_and_never_late(
     came: list[int], rates: tuple[int, int]
 ) -> None:
     """But not at its own stamp: one that comes from ahead waits for the first tick behind it."""
-    site = linked(*rates, [Model(kind=Delay.MEASURED)])
+    site = linked(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
         now = [m for m, at in enumerate(came) if at == k]
         usable = [m for m, at in enumerate(came) if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])]
-        assert site.step(Tick(k, [sample(m) for m in now])).used == [max(usable, default=-1)]
+        assert site.step(TickInput(k, [sample(m) for m in now])).used == [max(usable, default=-1)]
     assert site.counts()[0].late == 0
     assert site.measures(0)
 
 
 def test_a_measured_link_may_have_a_play_out_buffer_of_its_own() -> None:
     """Real jitter below the budget becomes a constant delay."""
-    site = linked(1000, 1000, [Model(kind=Delay.MEASURED, playout_us=20_000)])
+    site = linked(1000, 1000, [LinkModel(kind=DelayKind.MEASURED, playout_us=20_000)])
     jitter = [1, 7, 3, 19, 12, 5, 20, 2]
     at: dict[int, list[int]] = {}
     for m in range(200):
         at.setdefault(m + jitter[m % 8], []).append(m)
-    outputs = stepped(site, [Tick(k, [sample(m) for m in at.get(k, [])]) for k in range(200)])
+    outputs = stepped(site, [TickInput(k, [sample(m) for m in at.get(k, [])]) for k in range(200)])
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
 
@@ -236,9 +235,11 @@ def test_a_copy_with_an_earlier_delay_makes_its_sample_due_earlier() -> None:
 
 def test_a_link_that_is_cut_ages_and_heals() -> None:
     """`used` stands still, never decreases, and is back to nominal with the first fresh sample."""
-    model = Model(location=20_000.0)
+    model = LinkModel(location=20_000.0)
     site = linked(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
-    used = [o.used[0] for o in stepped(site, [Tick(k, [sample(k - 1)] if k else []) for k in range(300)])]
+    used = [
+        o.used[0] for o in stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(300)])
+    ]
     assert used[20:120] == list(range(100))
     assert used[120:220] == [99] * 100
     assert used[220:] == list(range(200, 280))
@@ -249,12 +250,12 @@ def test_a_link_that_is_cut_ages_and_heals() -> None:
 
 
 def test_a_command_holds_for_samples_stamped_from_then_on() -> None:
-    site = linked(1000, 1000, [Model(location=5_000.0)])
-    change = Command("slower", 0, Model(from_ns=30_000_000, location=20_000.0))
+    site = linked(1000, 1000, [LinkModel(location=5_000.0)])
+    change = CoreChange("slower", 0, LinkModel(from_ns=30_000_000, location=20_000.0))
     used = []
     for k in range(80):
         commands = [change] if k == 10 else []
-        used.append(site.step(Tick(k, [sample(k - 1)] if k else [], commands)).used[0])
+        used.append(site.step(TickInput(k, [sample(k - 1)] if k else [], commands)).used[0])
     assert used[:35] == [max(k - 5, -1) for k in range(35)]
     assert used[35:50] == [29] * 15
     assert used[50:] == list(range(30, 60))

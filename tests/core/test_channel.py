@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.channel import LOST
-from trilat_net.scenario.distributions import Gamma, Uniform
-from trilat_net.scenario.link import LinkBase
-from trilat_net.scenario.links import Constant, NoDelay
+from trilat_net.scenario.delay_models import ConstantDelay, GammaDelay, LinkBase, NoDelay, UniformDelay
 
 COUNT = 1_000_000
 SIGMAS = 4.0
@@ -92,9 +90,11 @@ def test_directions_and_seeds_lose_independently() -> None:
 
 def test_what_is_lost_and_how_long_the_others_take_are_independent() -> None:
     """So the delays of what comes through are those of the link without loss."""
-    link = Uniform(delay_ms=100, half_width_ms=50)
+    link = UniformDelay(delay_ms=100, half_width_ms=50)
     whole = due(channel([link.core()]), 10_000)
-    holed = due(channel([Uniform(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]), 10_000)
+    holed = due(
+        channel([UniformDelay(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]), 10_000
+    )
     kept = holed != LOST
     assert 0.6 < kept.mean() < 0.8
     assert (holed[kept] == whole[kept]).all()
@@ -112,9 +112,9 @@ def test_the_share_of_duplicates(seed: int) -> None:
 
 def test_the_earlier_of_sample_and_copy_counts() -> None:
     """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
-    link = Uniform(delay_ms=100, half_width_ms=60)
+    link = UniformDelay(delay_ms=100, half_width_ms=60)
     single = due(channel([link.core()]), 100_000)
-    made = channel([Uniform(delay_ms=100, half_width_ms=60, duplicate=1.0).core()])
+    made = channel([UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).core()])
     doubled = due(made, 100_000)
     assert made.row.copies == 100_000
     assert (doubled <= single).all()
@@ -133,8 +133,8 @@ def test_an_outage_takes_the_samples_stamped_within_it() -> None:
 
 def test_in_order_no_sample_overtakes_an_older_one_and_none_comes_earlier() -> None:
     keys = {"delay_ms": 50.0, "deviation_ms": 30.0, "loss": 0.1}
-    free = due(channel([Gamma(**keys).core()]), 20_000)
-    ordered = due(channel([Gamma(**keys, order="in_order").core()]), 20_000)
+    free = due(channel([GammaDelay(**keys).core()]), 20_000)
+    ordered = due(channel([GammaDelay(**keys, order="in_order").core()]), 20_000)
     kept = free != LOST
     assert ((ordered == LOST) == ~kept).all()
     assert (ordered[kept] == np.maximum.accumulate(free[kept])).all()
@@ -142,7 +142,7 @@ def test_in_order_no_sample_overtakes_an_older_one_and_none_comes_earlier() -> N
 
 
 def test_a_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
-    first, then = Constant(delay_ms=50.0), Constant(delay_ms=1.0, order="in_order")
+    first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
     made = due(channel([first.core(), then.core(10_000_000)]), 80)
     assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
     assert made[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
@@ -150,8 +150,8 @@ def test_a_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> N
 
 @given(playout_ms=st.floats(0, 300))
 def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None:
-    free = due(channel([Uniform(delay_ms=100, half_width_ms=100).core()]), 500)
-    held = due(channel([Uniform(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]), 500)
+    free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).core()]), 500)
+    held = due(channel([UniformDelay(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]), 500)
     assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
 
 
@@ -160,7 +160,7 @@ def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None
 
 def test_a_model_holds_from_its_first_stamp_on() -> None:
     models = [
-        Constant(delay_ms=d).core(n) for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
+        ConstantDelay(delay_ms=d).core(n) for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
     ]
     delays = due(channel(models), 10) - stamps(10)
     assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
@@ -168,8 +168,8 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
 
 def test_a_delay_without_memory_does_not_notice_that_the_loss_changed() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
-    whole = due(channel([Gamma(**keys).core()]), 2000)
-    changed = due(channel([Gamma(**keys).core(), Gamma(**keys, loss=0.2).core(500 * 10**6)]), 2000)
+    whole = due(channel([GammaDelay(**keys).core()]), 2000)
+    changed = due(channel([GammaDelay(**keys).core(), GammaDelay(**keys, loss=0.2).core(500 * 10**6)]), 2000)
     assert (changed[:500] == whole[:500]).all()
     kept = changed != LOST
     assert (changed[kept] == whole[kept]).all()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
 from trilat_net.core import control
-from trilat_net.core.arm import Links, parameters, regressor
+from trilat_net.core.two_link_arm import ArmLinks, regressor, theta_from_links
 
 gains = physics.vectors(st.floats(0.1, 20.0))
 NO_LIMIT = 1e300
@@ -17,7 +17,7 @@ NO_LIMIT = 1e300
 @given(q=angles, qd=speeds, q_des=angles, qd_des=speeds, Lambda=gains)
 def test_errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array) -> None:
     """Eq. (9), (18), (10)."""
-    e, ed, r = control.errors(q, qd, q_des, qd_des, Lambda)
+    e, ed, r = control.control_errors(q, qd, q_des, qd_des, Lambda)
     assert list(e) == (q - q_des).tolist()
     assert list(ed) == (qd - qd_des).tolist()
     assert r == pytest.approx(qd + Lambda * (q - q_des), rel=1e-14)
@@ -25,12 +25,12 @@ def test_errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array)
 
 @given(a=links, q=angles, qd=speeds, e=angles, ed=speeds, Lambda=gains, Kp=gains, Kd=gains)
 def test_torque(
-    a: Links, q: Array, qd: Array, e: Array, ed: Array, Lambda: Array, Kp: Array, Kd: Array
+    a: ArmLinks, q: Array, qd: Array, e: Array, ed: Array, Lambda: Array, Kp: Array, Kd: Array
 ) -> None:
     """Eq. (11) equals Eq. (13): estimated M, C and G of a wrong arm, and the two damping terms."""
     r = qd + Lambda * e
     Y = regressor(9.81, q, qd, -Lambda * e, -Lambda * ed)
-    tau = np.array(control.torque(Y, parameters(a), Kp, Kd, r, ed, NO_LIMIT))
+    tau = np.array(control.adaptive_torque(Y, theta_from_links(a), Kp, Kd, r, ed, NO_LIMIT))
     wanted = (
         -physics.inertia(a, q) @ (Lambda * ed)
         - physics.coriolis(a, q, qd) @ (Lambda * e)
@@ -38,13 +38,13 @@ def test_torque(
         - Kp * r
         - Kd * ed
     )
-    assert np.abs(tau - wanted).max() <= 1e-12 * (1 + np.abs(wanted).max() + 1e4 * parameters(a).sum())
+    assert np.abs(tau - wanted).max() <= 1e-12 * (1 + np.abs(wanted).max() + 1e4 * theta_from_links(a).sum())
 
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
     one, none = np.ones(2), np.zeros(2)
-    tau = control.torque(((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit)
+    tau = control.adaptive_torque(((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit)
     assert list(tau) == np.clip(-7.0 * ed, -limit, limit).tolist()
 
 
@@ -58,6 +58,6 @@ def test_the_estimate_goes_down_gamma_y_transpose_r(
     wanted = np.array(Y).T @ r
     assert Yr == pytest.approx(wanted, abs=1e-11)
     Gamma = np.array([1.0, 0.5, 0.0, 2.0, 3.0])
-    theta_hat = control.estimate(np.arange(5.0), gain_s, Gamma, Yr)
+    theta_hat = control.update_estimate(np.arange(5.0), gain_s, Gamma, Yr)
     assert theta_hat == pytest.approx(np.arange(5.0) - gain_s * Gamma * wanted, abs=1e-9)
     assert theta_hat[2] == 2.0

@@ -11,30 +11,31 @@ from scipy import stats
 
 from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
 from tests.core.draws import philox_in_integers
-from trilat_net.core.delay import LIMIT_US, AtEnd, Delay, Model, traced_us, whole_us
-from trilat_net.core.draw import link_key
-from trilat_net.scenario.distributions import (
-    Correlated,
-    Gamma,
-    HyperExponential,
-    LogNormal,
-    Normal,
-    Uniform,
+from trilat_net.core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd, clamp_delay_us, trace_delay_us
+from trilat_net.core.philox import link_key
+from trilat_net.scenario.delay_models import (
+    CorrelatedDelay,
+    GammaDelay,
+    HyperExponentialDelay,
+    LinkBase,
+    LogNormalDelay,
+    NormalDelay,
+    SineDelay,
+    TraceDelay,
+    UniformDelay,
 )
-from trilat_net.scenario.link import LinkBase
-from trilat_net.scenario.links import Sine, Trace
-from trilat_net.scenario.presets import PRESETS
-from trilat_net.scenario.traces import points_of, text_of
+from trilat_net.scenario.delay_traces import format_trace, parse_trace
+from trilat_net.scenario.resolve_links import PRESETS
 
 COUNT = 1_000_000
 SIGMAS = 4.0
 
 
-def truncated(link: Normal) -> Any:
+def truncated(link: NormalDelay) -> Any:
     return stats.truncnorm(-link.delay_ms / link.deviation_ms, np.inf, link.delay_ms, link.deviation_ms)
 
 
-def log_normal(link: LogNormal) -> Any:
+def log_normal(link: LogNormalDelay) -> Any:
     sigma = math.sqrt(math.log(1 + (link.deviation_ms / link.delay_ms) ** 2))
     return stats.lognorm(sigma, scale=link.delay_ms / math.sqrt(1 + (link.deviation_ms / link.delay_ms) ** 2))
 
@@ -42,7 +43,7 @@ def log_normal(link: LogNormal) -> Any:
 class Mixture:
     """A floor and one of two exponentials, put together from SciPy's."""
 
-    def __init__(self, link: HyperExponential) -> None:
+    def __init__(self, link: HyperExponentialDelay) -> None:
         self.parts = [stats.expon(link.floor_ms, mean) for mean in (link.fast_ms, link.slow_ms)]
         self.shares = (1 - link.slow_share, link.slow_share)
 
@@ -62,35 +63,38 @@ INDEPENDENT: list[tuple[LinkBase, Any]] = [
     for law, links in (
         (
             lambda u: stats.uniform(u.delay_ms - u.half_width_ms, 2 * u.half_width_ms),
-            [Uniform(delay_ms=200, half_width_ms=200), Uniform(delay_ms=35.5, half_width_ms=4)],
+            [UniformDelay(delay_ms=200, half_width_ms=200), UniformDelay(delay_ms=35.5, half_width_ms=4)],
         ),
         (
             truncated,
             [
-                Normal(delay_ms=200, deviation_ms=30),
-                Normal(delay_ms=10, deviation_ms=20),
-                Normal(delay_ms=0, deviation_ms=5),
+                NormalDelay(delay_ms=200, deviation_ms=30),
+                NormalDelay(delay_ms=10, deviation_ms=20),
+                NormalDelay(delay_ms=0, deviation_ms=5),
             ],
         ),
         (
             lambda g: stats.gamma((g.delay_ms / g.deviation_ms) ** 2, scale=g.deviation_ms**2 / g.delay_ms),
-            [Gamma(delay_ms=50, deviation_ms=20), Gamma(delay_ms=20, deviation_ms=40)],
+            [GammaDelay(delay_ms=50, deviation_ms=20), GammaDelay(delay_ms=20, deviation_ms=40)],
         ),
-        (log_normal, [LogNormal(delay_ms=80, deviation_ms=15), LogNormal(delay_ms=30, deviation_ms=20)]),
+        (
+            log_normal,
+            [LogNormalDelay(delay_ms=80, deviation_ms=15), LogNormalDelay(delay_ms=30, deviation_ms=20)],
+        ),
         (
             Mixture,
             [
-                HyperExponential(floor_ms=15, fast_ms=10, slow_ms=150, slow_share=0.2),
-                HyperExponential(floor_ms=7.5, fast_ms=5, slow_ms=50, slow_share=0.2),
+                HyperExponentialDelay(floor_ms=15, fast_ms=10, slow_ms=150, slow_share=0.2),
+                HyperExponentialDelay(floor_ms=7.5, fast_ms=5, slow_ms=50, slow_share=0.2),
             ],
         ),
     )
     for link in links
 ]
 CORRELATED = [
-    Correlated(delay_ms=200, deviation_ms=30, correlation=0.9),
-    Correlated(delay_ms=60, deviation_ms=8, correlation=0.5),
-    Correlated(delay_ms=100, deviation_ms=10, correlation=0.0),
+    CorrelatedDelay(delay_ms=200, deviation_ms=30, correlation=0.9),
+    CorrelatedDelay(delay_ms=60, deviation_ms=8, correlation=0.5),
+    CorrelatedDelay(delay_ms=100, deviation_ms=10, correlation=0.0),
 ]
 
 
@@ -132,7 +136,7 @@ def test_a_uniform_delay_worked_out_by_hand() -> None:
     words = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
     units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in words]
     expected = [math.floor(200_000 + 150_000 * (2 * u - 1) + 0.5) for u in units]
-    assert delays_us(Uniform(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
+    assert delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
 
 
 @pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
@@ -149,7 +153,7 @@ def test_the_distribution_is_the_stated_one(link: LinkBase, law: Any) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("link", CORRELATED, ids=named)
-def test_correlated_delays_have_their_moments_and_correlations(link: Correlated, seed: int) -> None:
+def test_correlated_delays_have_their_moments_and_correlations(link: CorrelatedDelay, seed: int) -> None:
     """Variances of the estimates of an AR(1) sequence: Bartlett 1946."""
     delays = delays_us(link, seed, COUNT)
     c = link.correlation
@@ -164,7 +168,7 @@ def test_correlated_delays_have_their_moments_and_correlations(link: Correlated,
 @pytest.mark.parametrize("seed", SEEDS)
 def test_correlated_delays_that_are_cut_off_at_zero_have_their_moments(seed: int) -> None:
     """A quarter of them is; a cut sequence is correlated less than the one it was cut from."""
-    link = Correlated(delay_ms=10, deviation_ms=15, correlation=0.8)
+    link = CorrelatedDelay(delay_ms=10, deviation_ms=15, correlation=0.8)
     delays = delays_us(link, seed, COUNT)
     assert np.mean(delays == 0) == pytest.approx(stats.norm.cdf(-10 / 15), abs=0.01)
     holds_its_moments(link, delays, 1.8 / 0.2, 1.64 / 0.36)
@@ -173,7 +177,9 @@ def test_correlated_delays_that_are_cut_off_at_zero_have_their_moments(seed: int
 @given(delay_ms=st.floats(0, 1e4), deviation_ms=st.floats(1e-6, 1e4))
 def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms: float) -> None:
     """Nothing is lost to cancellation: within its deviation, and exact where the cut is far."""
-    mean_ms, deviation = Correlated(delay_ms=delay_ms, deviation_ms=deviation_ms, correlation=0.5).moments()
+    mean_ms, deviation = CorrelatedDelay(
+        delay_ms=delay_ms, deviation_ms=deviation_ms, correlation=0.5
+    ).moments()
     assert delay_ms * (1 - 1e-12) <= mean_ms <= delay_ms + deviation_ms
     assert 0.5 * deviation_ms < deviation <= deviation_ms * (1 + 1e-12)
     if delay_ms > 10 * deviation_ms:
@@ -182,7 +188,7 @@ def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms:
 
 def test_a_sine_over_whole_periods() -> None:
     """Its mean, its deviation, its values; chance has no part in it."""
-    link = Sine(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
+    link = SineDelay(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
     delays = delays_us(link, 1, COUNT)
     assert (delays == delays_us(link, 2, COUNT)).all()
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, abs=5e-4)
@@ -198,7 +204,7 @@ ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 
 
 def test_a_trace_that_is_looped_has_the_moments_of_one_pass() -> None:
-    link = Trace(trace=text_of(ROWS), at_end="loop")
+    link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
     delays = delays_us(link, 1, 1250 * 800)
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, rel=1e-12)
     assert delays.std() / 1e3 == pytest.approx(link.moments().deviation_ms, rel=1e-12)
@@ -206,27 +212,27 @@ def test_a_trace_that_is_looped_has_the_moments_of_one_pass() -> None:
 
 @given(
     gaps_us=st.lists(st.integers(1, 10**7), max_size=20),
-    delays=st.lists(st.integers(-1, LIMIT_US), min_size=21, max_size=21),
+    delays=st.lists(st.integers(-1, MAX_DELAY_US), min_size=21, max_size=21),
     stamp_ns=st.integers(0, 10**12),
-    at_end=st.sampled_from(list(AtEnd)),
+    at_end=st.sampled_from(list(TraceEnd)),
 )
 def test_a_trace_gives_the_delay_of_its_last_point(
-    gaps_us: list[int], delays: list[int], stamp_ns: int, at_end: AtEnd
+    gaps_us: list[int], delays: list[int], stamp_ns: int, at_end: TraceEnd
 ) -> None:
     t_us = np.cumsum([0, *gaps_us])
     points = np.array([(7, 7), *zip(t_us, delays, strict=False), (9, 9)], dtype=np.int64)  # others around it
-    rows = np.zeros(1, dtype=channel([Model()]).models.dtype)
-    rows[0] = tuple(Model(kind=Delay.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us)))
+    rows = np.zeros(1, dtype=channel([LinkModel()]).models.dtype)
+    rows[0] = tuple(LinkModel(kind=DelayKind.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us)))
     now_us = stamp_ns // 1000
-    if at_end is AtEnd.LOOP and gaps_us:
+    if at_end is TraceEnd.LOOP and gaps_us:
         now_us %= int(t_us[-1]) + gaps_us[-1]
     expected = delays[max(n for n in range(len(t_us)) if t_us[n] <= now_us)]
-    assert traced_us(stamp_ns, rows[0], points) == expected
+    assert trace_delay_us(stamp_ns, rows[0], points) == expected
 
 
 def test_a_trace_may_lose_samples() -> None:
-    link = Trace(trace=text_of([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
-    points = points_of(link.trace)
+    link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
+    points = parse_trace(link.trace)
     made = due(channel([link.core()._replace(trace_count=3)], points=points), 8)
     assert made.tolist() == [5_000_000, 6_000_000, 7_000_000, -1, -1, 11_000_000, 12_000_000, 13_000_000]
     assert link.moments().mean_ms == pytest.approx((3 * 5.0 + 2 * 6.0) / 5)
@@ -237,10 +243,10 @@ def test_a_trace_may_lose_samples() -> None:
 
 @given(st.floats(-1e12, 1e12))
 def test_delays_are_whole_microseconds_from_zero_to_ten_seconds(delay_us: float) -> None:
-    rounded = whole_us(delay_us)
+    rounded = clamp_delay_us(delay_us)
     assert isinstance(rounded, int)
-    assert 0 <= rounded <= LIMIT_US
-    if 0 <= delay_us <= LIMIT_US:
+    assert 0 <= rounded <= MAX_DELAY_US
+    if 0 <= delay_us <= MAX_DELAY_US:
         assert abs(rounded - delay_us) <= 0.5
 
 
@@ -249,7 +255,7 @@ def test_delays_are_whole_microseconds_from_zero_to_ten_seconds(delay_us: float)
 )
 def test_a_mobile_preset_never_goes_below_its_floor(name: str) -> None:
     keys = {key: value for key, value in PRESETS[name].items() if key != "model"}
-    link = HyperExponential(**keys)
+    link = HyperExponentialDelay(**keys)
     delays = due(channel([link.core()]), 20_000)
     kept = delays >= 0
     assert ((delays - np.arange(20_000) * 10**6)[kept] >= 1e6 * link.floor_ms).all()

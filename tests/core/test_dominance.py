@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.core.dominance import irreducible, perron, row_fault, upsilon
+from trilat_net.core.dominance import find_row_problem, is_irreducible, perron_vector, upsilon
 
 Array = NDArray[np.float64]
 SMALLEST = 1e-6
@@ -41,7 +41,7 @@ def strongly_connected(a: Array) -> bool:
 def test_beta_is_the_positive_left_null_vector_of_upsilon(a: Array) -> None:
     """beta'Upsilon = 0 after Eq. (20), to 1e-12, entry by entry positive."""
     assume(strongly_connected(a))
-    beta = perron(a)
+    beta = perron_vector(a)
     assert (beta > 0).all()
     assert beta.sum() == pytest.approx(1.0, abs=1e-14)
     assert np.abs(beta @ upsilon(a)).max() <= 1e-12
@@ -50,12 +50,12 @@ def test_beta_is_the_positive_left_null_vector_of_upsilon(a: Array) -> None:
 @given(a=matrices(zeros=False))
 def test_beta_is_numpys_null_vector(a: Array) -> None:
     left = np.linalg.svd(upsilon(a).T)[2][-1]
-    assert perron(a) == pytest.approx(left / left.sum(), abs=1e-9)
+    assert perron_vector(a) == pytest.approx(left / left.sum(), abs=1e-9)
 
 
 @given(a=matrices())
 def test_a_matrix_is_irreducible_just_where_its_graph_is_strongly_connected(a: Array) -> None:
-    assert irreducible(a) == strongly_connected(a)
+    assert is_irreducible(a) == strongly_connected(a)
 
 
 @given(a=matrices(zeros=False), closed=st.integers(2, 5))
@@ -64,15 +64,15 @@ def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
     assume(closed < len(a))
     a[:closed, closed:] = 0.0
     a[:closed] /= a[:closed].sum(1, keepdims=True)
-    assert not irreducible(a)
+    assert not is_irreducible(a)
     with pytest.raises(ValueError, match="reducible"):
-        perron(a)
+        perron_vector(a)
 
 
 def test_two_that_are_locked_leave_the_third_without_weight() -> None:
     """Expert and slave locked, trainee following: a13 = a31 = 1."""
     with pytest.raises(ValueError, match="reducible"):
-        perron(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.5], [1.0, 0.0, 0.0]]))
+        perron_vector(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.5], [1.0, 0.0, 0.0]]))
 
 
 @given(shares=st.tuples(*[st.floats(0.01, 0.99)] * 3))
@@ -81,7 +81,7 @@ def test_beta_of_three_sites_in_closed_form(shares: tuple[float, float, float]) 
     a12, a21, a31 = shares
     a13, a23, a32 = 1 - a12, 1 - a21, 1 - a31
     closed = np.array([1 - a23 * a32, 1 - a13 * a31, 1 - a12 * a21])
-    beta = perron(np.array([[0, a12, a13], [a21, 0, a23], [a31, a32, 0]]))
+    beta = perron_vector(np.array([[0, a12, a13], [a21, 0, a23], [a31, a32, 0]]))
     assert beta == pytest.approx(closed / closed.sum(), rel=1e-12)
 
 
@@ -90,7 +90,7 @@ def test_ones_are_a_left_null_vector_of_circulant_shares_only(share: float) -> N
     """The paper's beta = (1, 1, 1) fits one free parameter, not three."""
     rest = 1 - share
     circulant = np.array([[0, share, rest], [rest, 0, share], [share, rest, 0]])
-    assert perron(circulant) == pytest.approx([1 / 3] * 3, rel=1e-12)
+    assert perron_vector(circulant) == pytest.approx([1 / 3] * 3, rel=1e-12)
     skewed = np.array([[0, share, rest], [0.5, 0, 0.5], [0.3, 0.7, 0]])
     assert np.abs(np.ones(3) @ upsilon(skewed)).max() > 1e-3
 
@@ -99,7 +99,7 @@ def test_ones_are_a_left_null_vector_of_circulant_shares_only(share: float) -> N
 def test_ones_are_the_right_null_vector_always(a: Array) -> None:
     """Which is what Eq. (7) says."""
     assert np.abs(upsilon(a) @ np.ones(len(a))).max() <= 1e-15 * 8
-    assert all(row_fault(row, own) is None for own, row in enumerate(a))
+    assert all(find_row_problem(row, own) is None for own, row in enumerate(a))
 
 
 @given(a=matrices(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
@@ -109,7 +109,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
     entry = int(np.argmax(row))
     row[entry] += off
     assume(0 <= row[entry] <= 1)
-    fault = row_fault(row, own)
+    fault = find_row_problem(row, own)
     assume(abs(abs(row.sum() - 1) - 1e-9) > 1e-15)
     assert (fault is not None) == (abs(row.sum() - 1.0) > 1e-9)
 
@@ -125,6 +125,6 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
     ],
 )
 def test_a_row_that_cannot_be_says_why(row: list[float], own: int, words: str) -> None:
-    fault = row_fault(np.array(row), own)
+    fault = find_row_problem(np.array(row), own)
     assert fault is not None
     assert words in fault

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from tests.core.draws import U32, philox_in_integers, table
-from trilat_net.core.draw import link_key, philox, uniforms, unit
+from trilat_net.core.philox import link_key, philox, uniforms, unit_interval
 
 words = st.integers(0, U32)
 
@@ -51,12 +51,12 @@ def test_uniforms_are_words_of_their_own_place(key: int, sample: int, purpose: i
 
 @given(high=words | st.sampled_from([0, U32]), low=words | st.sampled_from([0, U32]))
 def test_a_unit_lies_strictly_between_0_and_1(high: int, low: int) -> None:
-    assert 0.0 < unit(np.uint64(high), np.uint64(low)) < 1.0
+    assert 0.0 < unit_interval(np.uint64(high), np.uint64(low)) < 1.0
 
 
 def test_the_ends_of_the_open_interval() -> None:
-    assert unit(np.uint64(0), np.uint64(0)) == 2.0**-53
-    assert unit(np.uint64(U32), np.uint64(U32)) == 1.0 - 2.0**-53
+    assert unit_interval(np.uint64(0), np.uint64(0)) == 2.0**-53
+    assert unit_interval(np.uint64(U32), np.uint64(U32)) == 1.0 - 2.0**-53
 
 
 def test_links_and_seeds_have_keys_of_their_own() -> None:

@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.core.physical_arms import Array, angles, speeds
-from trilat_net.core.exogenous import Actor, Acts, minimum_jerk, rows_of, torque_on_arm
+from trilat_net.core.exogenous import (
+    TorqueKind,
+    TorqueSource,
+    minimum_jerk,
+    torque_on_arm,
+    torque_source_rows,
+)
 
 LENGTHS = np.array([1.0, 0.9])
 STEP = 1e-6
@@ -18,9 +24,9 @@ stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
 
 
 def torque(
-    t_s: float, q: Array, qd: Array, *actors: Actor, sampled: bool = False, lengths: Array = LENGTHS
+    t_s: float, q: Array, qd: Array, *actors: TorqueSource, sampled: bool = False, lengths: Array = LENGTHS
 ) -> Array:
-    return np.array(torque_on_arm(t_s, q, qd, lengths, *rows_of(actors), int(sampled)))
+    return np.array(torque_on_arm(t_s, q, qd, lengths, *torque_source_rows(actors), int(sampled)))
 
 
 def tip(q: Array) -> Array:
@@ -40,7 +46,7 @@ def still(q: Array) -> Array:
 
 
 def test_a_pulse_is_zero_at_its_ends_full_in_the_middle_and_symmetric() -> None:
-    pulse = Actor(Acts.PULSE, 1.0, 6.0, a=(10.0, -4.0))
+    pulse = TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0))
 
     def at(t_s: float) -> list[float]:
         return torque(t_s, np.zeros(2), np.zeros(2), pulse).tolist()
@@ -54,11 +60,15 @@ def test_a_pulse_is_zero_at_its_ends_full_in_the_middle_and_symmetric() -> None:
 @given(q=angles, qd=speeds, t_s=st.floats(0, 4))
 def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
     actors = (
-        Actor(Acts.PULSE, 1.0, 6.0, a=(10.0, -4.0)),
-        Actor(Acts.HAND, K=(3.0, 4.0), B=(1.0, 0.5), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0),
-        Actor(Acts.TASK_HAND, K=(30.0, 4.0), B=(1.0, 5.0), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0),
-        Actor(Acts.VISCOUS, B=(2.0, 3.0)),
-        Actor(Acts.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
+        TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0)),
+        TorqueSource(
+            TorqueKind.HAND, K=(3.0, 4.0), B=(1.0, 0.5), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0
+        ),
+        TorqueSource(
+            TorqueKind.TASK_HAND, K=(30.0, 4.0), B=(1.0, 5.0), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0
+        ),
+        TorqueSource(TorqueKind.VISCOUS, B=(2.0, 3.0)),
+        TorqueSource(TorqueKind.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
     )
     apart = sum(torque(t_s, q, qd, actor) for actor in actors)
     assert torque(t_s, q, qd, *actors) == pytest.approx(apart, abs=1e-9)
@@ -67,7 +77,7 @@ def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
 @given(q=angles, K=stiff, target=pairs)
 def test_a_hand_that_stays_is_a_spring(q: Array, K: tuple[float, float], target: tuple[float, float]) -> None:
     """Its torque is what its energy 1/2 K (q - target)^2 goes downhill by."""
-    hand = Actor(Acts.HAND, K=K, a=target, b=target)
+    hand = TorqueSource(TorqueKind.HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
         return float(0.5 * np.array(K) @ (at - target) ** 2)
@@ -79,7 +89,7 @@ def test_a_hand_that_stays_is_a_spring(q: Array, K: tuple[float, float], target:
 def test_a_hand_at_the_tip_is_a_spring_in_the_plane(
     q: Array, K: tuple[float, float], target: tuple[float, float]
 ) -> None:
-    hand = Actor(Acts.TASK_HAND, K=K, a=target, b=target)
+    hand = TorqueSource(TorqueKind.TASK_HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
         return float(0.5 * np.array(K) @ (tip(at) - target) ** 2)
@@ -92,7 +102,7 @@ def test_a_wall_is_a_spring_on_one_side(
     q: Array, K: float, place: tuple[float, float], direction: float
 ) -> None:
     normal = (math.cos(direction), math.sin(direction))
-    wall = Actor(Acts.WALL, K=(K, 0.0), a=place, b=normal)
+    wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=place, b=normal)
 
     def potential(at: Array) -> float:
         return float(0.5 * K * max(0.0, (np.array(place) - tip(at)) @ normal) ** 2)
@@ -105,14 +115,16 @@ def test_a_wall_is_a_spring_on_one_side(
 def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: float) -> None:
     """Whatever its damping, the force that it gives points along its normal, or is none."""
     normal = np.array([math.cos(direction), math.sin(direction)])
-    pushed = torque(1.0, q, qd, Actor(Acts.WALL, K=(K, 0.0), B=(B, 0.0), a=(0.3, 0.2), b=tuple(normal)))
+    pushed = torque(
+        1.0, q, qd, TorqueSource(TorqueKind.WALL, K=(K, 0.0), B=(B, 0.0), a=(0.3, 0.2), b=tuple(normal))
+    )
     unit = downhill(lambda at: -float(tip(at) @ normal), q)  # the torque of a force of 1 N along the normal
     assert pushed @ unit >= -1e-6 * (1 + np.abs(pushed).max())
 
 
 @given(q=angles, qd=speeds, B=stiff)
 def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: tuple[float, float]) -> None:
-    assert torque(1.0, q, qd, Actor(Acts.VISCOUS, B=B)) == pytest.approx(-np.array(B) * qd)
+    assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(-np.array(B) * qd)
 
 
 @given(start=st.floats(-5, 5), length=st.floats(0.01, 5), x=st.floats(0, 1))
@@ -130,8 +142,8 @@ def test_a_move_has_minimum_jerk(start: float, length: float, x: float) -> None:
 
 
 def test_a_target_stands_still_before_and_after_its_move() -> None:
-    hand = Actor(
-        Acts.HAND, K=(1.0, 1.0), B=(7.0, 7.0), a=(1.0, 2.0), b=(3.0, 5.0), move_start_s=1, move_end_s=2
+    hand = TorqueSource(
+        TorqueKind.HAND, K=(1.0, 1.0), B=(7.0, 7.0), a=(1.0, 2.0), b=(3.0, 5.0), move_start_s=1, move_end_s=2
     )
     rest = np.zeros(2)
     assert torque(0.5, rest, rest, hand).tolist() == [1.0, 2.0]
@@ -146,30 +158,30 @@ def test_a_target_stands_still_before_and_after_its_move() -> None:
 )
 def test_recorded_torque_is_linear_between_its_points(rows: list[tuple[float, ...]], t_s: float) -> None:
     table = np.array(sorted(rows))
-    found = torque(t_s, np.zeros(2), np.zeros(2), Actor(Acts.RECORDED, table=table))
+    found = torque(t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table))
     nothing = {"left": 0.0, "right": 0.0}
     expected = [np.interp(t_s, table[:, 0], table[:, 1 + i], **nothing) for i in (0, 1)]
     assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_two_recordings_keep_apart() -> None:
-    one = Actor(Acts.RECORDED, table=np.array([[0.0, 1.0, 2.0], [9.0, 1.0, 2.0]]))
-    two = Actor(Acts.RECORDED, table=np.array([[0.0, 10.0, 20.0], [9.0, 10.0, 20.0]]))
+    one = TorqueSource(TorqueKind.RECORDED, table=np.array([[0.0, 1.0, 2.0], [9.0, 1.0, 2.0]]))
+    two = TorqueSource(TorqueKind.RECORDED, table=np.array([[0.0, 10.0, 20.0], [9.0, 10.0, 20.0]]))
     assert torque(3.0, np.zeros(2), np.zeros(2), one, two).tolist() == [11.0, 22.0]
 
 
 def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
     rest = np.zeros(2)
-    held = Actor(Acts.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
-    other = Actor(Acts.PULSE, 0.0, 2.0, a=(5.0, 5.0))
+    held = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
+    other = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(5.0, 5.0))
     assert torque(1.0, rest, rest, held, other).tolist() == [5.0, 5.0]
     assert torque(1.0, rest, rest, held, other, sampled=True).tolist() == [1.0, 1.0]
 
 
-@pytest.mark.parametrize("acts", list(Acts))
-def test_nobody_acts_before_the_start_or_after_the_end(acts: Acts) -> None:
+@pytest.mark.parametrize("acts", list(TorqueKind))
+def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None:
     table = np.array([[0.0, 1.0, 1.0], [9.0, 1.0, 1.0]])
-    actor = Actor(acts, 2.0, 3.0, a=(1.0, 0.0), b=(-1.0, 0.0), K=(9.0, 9.0), B=(1.0, 1.0), table=table)
+    actor = TorqueSource(acts, 2.0, 3.0, a=(1.0, 0.0), b=(-1.0, 0.0), K=(9.0, 9.0), B=(1.0, 1.0), table=table)
     q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
         assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]

@@ -7,21 +7,21 @@ from scipy.integrate import solve_ivp
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, speeds
-from trilat_net.core.arm import Links, parameters
-from trilat_net.core.exogenous import Actor, Acts, rows_of
-from trilat_net.core.integrator import advance
+from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_source_rows
+from trilat_net.core.kernel import rk4_step
+from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
 
-ARM = Links(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
+ARM = ArmLinks(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
 LENGTHS = np.array([1.0, 0.9])
 G = 9.81
 
 
 def carried(
-    q0: Array, qd0: Array, h_s: float, periods: int, u: Array, actors: tuple[Actor, ...] = ()
+    q0: Array, qd0: Array, h_s: float, periods: int, u: Array, actors: tuple[TorqueSource, ...] = ()
 ) -> tuple[Array, Array]:
-    q, qd, who = (q0[0], q0[1]), (qd0[0], qd0[1]), rows_of(actors)
+    q, qd, who = (q0[0], q0[1]), (qd0[0], qd0[1]), torque_source_rows(actors)
     for k in range(periods):
-        q, qd = advance(k * h_s, h_s, q, qd, u, parameters(ARM), G, LENGTHS, *who)
+        q, qd = rk4_step(k * h_s, h_s, q, qd, u, theta_from_links(ARM), G, LENGTHS, *who)
     return np.array(q), np.array(qd)
 
 
@@ -36,7 +36,9 @@ def test_an_arm_that_is_left_alone_keeps_its_energy(q: Array, qd: Array) -> None
 
 
 PULSES = np.array([[-0.1, 0.35, 12.0, -5.0], [0.0, 0.3, 1.0, 2.0]])
-HANDS = tuple(Actor(Acts.PULSE, start, end, a=tuple(peak)) for start, end, *peak in PULSES.tolist())
+HANDS = tuple(
+    TorqueSource(TorqueKind.PULSE, start, end, a=tuple(peak)) for start, end, *peak in PULSES.tolist()
+)
 SPAN_S = 0.1
 
 

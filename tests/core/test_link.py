@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from tests.core.sites import one_link, sample, setup, stepped
 from tests.virtual_runs import run
 from trilat_net.core.link import calendar_pages
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Tick
-from trilat_net.scenario import load
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.scenario import load_scenario
 
 rates = st.sampled_from([1, 3, 50, 333, 700, 999, 1000, 1001, 4096, 20_000])
 S = 10**9
@@ -65,7 +65,7 @@ def test_a_sample_is_released_by_the_first_tick_at_or_after_its_due_time_and_nev
 
 def test_no_delay_means_one_period() -> None:
     site = one_link(1000, 1000, 0)
-    outputs = stepped(site, [Tick(0), *(Tick(k, [sample(k - 1), sample(k)]) for k in range(1, 6))])
+    outputs = stepped(site, [TickInput(0), *(TickInput(k, [sample(k - 1), sample(k)]) for k in range(1, 6))])
     assert [o.used for o in outputs] == [[-1], [0], [1], [2], [3], [4]]
 
 
@@ -88,7 +88,7 @@ def test_what_is_in_use_is_the_newest_sample_that_is_due_and_has_come(
         came = data.draw(arrivals)
         for tick in came:
             model.take(k, tick)
-        output = site.step(Tick(k, [sample(tick) for tick in came]))
+        output = site.step(TickInput(k, [sample(tick) for tick in came]))
         used = model.used(k)
         assert output.used == [used]
         if used >= 0:
@@ -110,7 +110,7 @@ def test_when_and_in_what_order_samples_arrive_before_they_are_due_changes_no_bi
 
     def run_with(at: dict[int, list[int]]) -> list[object]:
         site = one_link(rate_hz, peer_rate_hz, delay_ns)
-        ticks = [Tick(k, [sample(m) for m in at.get(k, [])]) for k in range(100)]
+        ticks = [TickInput(k, [sample(m) for m in at.get(k, [])]) for k in range(100)]
         return [output._replace(rx_crc=0) for output in stepped(site, ticks)]
 
     scattered: dict[int, list[int]] = {}
@@ -121,34 +121,34 @@ def test_when_and_in_what_order_samples_arrive_before_they_are_due_changes_no_bi
 
 def test_late_duplicate_and_refused_samples_are_counted() -> None:
     site = one_link(1000, 1000, 5_000_000)
-    site.step(Tick(0, [sample(0), sample(0), sample(-1), sample(10_001)]))
+    site.step(TickInput(0, [sample(0), sample(0), sample(-1), sample(10_001)]))
     counts = site.counts()[0]
     assert (counts.accepted, counts.late, counts.duplicate, counts.refused) == (4, 0, 1, 2)
-    stepped(site, [Tick(k) for k in range(1, 10)])
-    output = site.step(Tick(10, [sample(3), sample(5), sample(4)]))  # due at ticks 8, 10, 9
+    stepped(site, [TickInput(k) for k in range(1, 10)])
+    output = site.step(TickInput(10, [sample(3), sample(5), sample(4)]))  # due at ticks 8, 10, 9
     assert output.used == [5]
     assert site.counts()[0].late == 2
 
 
 def test_a_late_sample_comes_into_use_at_once_if_it_is_the_newest() -> None:
     site = one_link(1000, 1000, 5_000_000)
-    stepped(site, [Tick(k) for k in range(30)])
-    assert site.step(Tick(30, [sample(12)])).used == [12]
-    assert site.step(Tick(31, [sample(11)])).used == [12]
+    stepped(site, [TickInput(k) for k in range(30)])
+    assert site.step(TickInput(30, [sample(12)])).used == [12]
+    assert site.step(TickInput(31, [sample(11)])).used == [12]
 
 
 @pytest.mark.parametrize("peer_rate_hz", [1, 1000, 20_000])
 def test_a_stamp_more_than_ten_seconds_ahead_is_refused(peer_rate_hz: int) -> None:
     site = one_link(1000, peer_rate_hz, 0)
     limit = 10 * peer_rate_hz
-    site.step(Tick(0, [sample(limit), sample(limit + 1)]))
+    site.step(TickInput(0, [sample(limit), sample(limit + 1)]))
     assert site.counts()[0].refused == 1
 
 
 @given(tick=st.one_of(st.integers(10_001, 2**40 - 1), st.just(18_446_744_074)))
 def test_a_stamp_ahead_by_whatever_the_wire_can_carry_is_refused(tick: int) -> None:
     site = one_link(1000, 1000, 0)
-    site.step(Tick(0, [sample(tick)]))
+    site.step(TickInput(0, [sample(tick)]))
     assert site.counts()[0].refused == 1
 
 
@@ -163,7 +163,7 @@ def test_a_calendar_has_a_page_for_all_that_may_wait(rate_hz: int) -> None:
 def test_samples_from_far_ahead_wait_without_touching_nearer_ones() -> None:
     site = one_link(1000, 1000, 10_000_000_000)
     first = [sample(m) for m in range(0, 10_001, 50)]
-    outputs = stepped(site, [Tick(0, first), *(Tick(k) for k in range(1, 20_001))])
+    outputs = stepped(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
     assert [o.used[0] for o in outputs] == [
         -1 if k < 10_000 else 50 * ((k - 10_000) // 50) for k in range(20_001)
     ]
@@ -219,14 +219,14 @@ def test_until_the_first_sample_is_due_a_peer_rests_at_its_start_pose() -> None:
 
 
 def test_a_history_of_zero_would_move_free_by_a_tenth_of_a_radian() -> None:
-    scenario = load("free")
+    scenario = load_scenario("free")
     zero = [
         Site(setup(name, "free")._replace(links=tuple(link._replace(q0=(0.0, 0.0)) for link in s.links)))
         for name in scenario.names
         for s in [setup(name, "free")]
     ]
     q = np.zeros((3, 20_000, 2))
-    last = [site.step(Tick(0)) for site in zero]
+    last = [site.step(TickInput(0)) for site in zero]
     for k in range(1, 20_000):
         for i, output in enumerate(last):
             q[i, k - 1] = output.q
@@ -234,7 +234,7 @@ def test_a_history_of_zero_would_move_free_by_a_tenth_of_a_radian() -> None:
             [Arrival(n, k - 1, last[j].q, last[j].qd) for n, j in enumerate(j for j in range(3) if j != i)]
             for i in range(3)
         ]
-        last = [site.step(Tick(k, arrivals)) for site, arrivals in zip(zero, came, strict=True)]
+        last = [site.step(TickInput(k, arrivals)) for site, arrivals in zip(zero, came, strict=True)]
     q[:, -1] = [o.q for o in last]
     right = run("free", {"duration_s": 20.0}).stack("q")
     assert np.abs(q - right).max() == pytest.approx(0.117, abs=0.002)

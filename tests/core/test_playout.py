@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.virtual_runs import Run, run, trajectories
-from trilat_net.core.tick import Output
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.core.ticks import TickRecord
+from trilat_net.execution import virtual
+from trilat_net.scenario import load_scenario
 
 BUDGET_MS = 200.0
 BELOW: dict[str, dict[str, Any]] = {
@@ -38,7 +38,7 @@ def test_jitter_below_the_budget_is_the_constant_delay_bit_for_bit(scenario: str
 
 
 def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
-    return trajectories(load(scenario, overrides))
+    return trajectories(load_scenario(scenario, overrides))
 
 
 def test_it_holds_to_the_end_of_the_paper() -> None:
@@ -54,8 +54,11 @@ def test_jitter_above_the_budget_is_not() -> None:
     assert (np.diff(made.stack("used"), axis=1) >= 0).all()
 
 
-def outputs(overrides: dict[str, Any]) -> list[Output]:
-    return [step.output for step in virtual.run(load("free", {"duration_s": 1.0, **overrides}))]
+def outputs(overrides: dict[str, Any]) -> list[TickRecord]:
+    return [
+        step.output
+        for step in virtual.execute_virtual(load_scenario("free", {"duration_s": 1.0, **overrides}))
+    ]
 
 
 def test_even_the_arrivals_checksums_agree() -> None:

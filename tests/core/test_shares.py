@@ -9,11 +9,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
-from trilat_net.core.link import LINK
-from trilat_net.core.setup import LinkSetup
-from trilat_net.core.shares import follow_ramps
-from trilat_net.core.site import MAX_COMMANDS, Site
-from trilat_net.core.tick import Arrival, Command, Output, Ramp, Tick
+from trilat_net.core.dominance import apply_ramps
+from trilat_net.core.link import LINK_DTYPE
+from trilat_net.core.site_setup import LinkSetup
+from trilat_net.core.site_step import MAX_CHANGES, Site
+from trilat_net.core.ticks import Arrival, CoreChange, DominanceRamp, TickInput, TickRecord
 
 S = 10**9
 PEERS = 3
@@ -29,25 +29,27 @@ def rows(draw: st.DrawFn) -> tuple[float, ...]:
 
 
 @st.composite
-def ramp_lists(draw: st.DrawFn) -> list[Ramp]:
+def ramp_lists(draw: st.DrawFn) -> list[DominanceRamp]:
     """Up to six ramps in the order of their starts; they may overlap, touch, take no time, or begin at 0."""
     starts = sorted(draw(st.lists(st.integers(0, 10 * S), max_size=6)))
     lasts = st.one_of(st.just(0), st.integers(1, 5 * S))
-    return [Ramp(start, start + draw(lasts), draw(rows())) for start in starts]
+    return [DominanceRamp(start, start + draw(lasts), draw(rows())) for start in starts]
 
 
-def table(first: tuple[float, ...], ramps: list[Ramp]) -> np.ndarray:
+def table(first: tuple[float, ...], ramps: list[DominanceRamp]) -> np.ndarray:
     return np.array([(0, 0, *first), *((r.start_ns, r.end_ns, *r.alpha) for r in ramps)], dtype=np.float64)
 
 
-def shares(t_ns: int, first: tuple[float, ...], ramps: list[Ramp]) -> tuple[list[float], list[float]]:
+def shares(
+    t_ns: int, first: tuple[float, ...], ramps: list[DominanceRamp]
+) -> tuple[list[float], list[float]]:
     """(alpha, its derivative) per peer."""
-    links = np.zeros(PEERS, LINK)
-    follow_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
+    links = np.zeros(PEERS, LINK_DTYPE)
+    apply_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
     return links["alpha"].tolist(), links["alpha_rate"].tolist()
 
 
-def exact(t_ns: int, first: tuple[float, ...], ramps: list[Ramp]) -> list[Fraction]:
+def exact(t_ns: int, first: tuple[float, ...], ramps: list[DominanceRamp]) -> list[Fraction]:
     """The same in fractions: each ramp leads from where the ones before it are to its own end."""
     if not ramps or t_ns < ramps[0].start_ns:
         return [Fraction(a) for a in first]
@@ -64,13 +66,17 @@ times = st.integers(0, 16 * S)
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_shares_are_those_of_the_ramps(first: tuple[float, ...], ramps: list[Ramp], t_ns: int) -> None:
+def test_shares_are_those_of_the_ramps(
+    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
+) -> None:
     alpha, _ = shares(t_ns, first, ramps)
     assert alpha == pytest.approx([float(a) for a in exact(t_ns, first, ramps)], abs=1e-14)
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_a_row_sums_to_one_at_all_times(first: tuple[float, ...], ramps: list[Ramp], t_ns: int) -> None:
+def test_a_row_sums_to_one_at_all_times(
+    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
+) -> None:
     """Within two units in the last place, plus what its rows are off themselves."""
     alpha, rates = shares(t_ns, first, ramps)
     off = max(abs(math.fsum(row) - 1.0) for row in (first, *(ramp.alpha for ramp in ramps)))
@@ -84,7 +90,7 @@ def test_a_row_sums_to_one_at_all_times(first: tuple[float, ...], ramps: list[Ra
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
 def test_shares_are_continuous_where_a_ramp_takes_time(
-    first: tuple[float, ...], ramps: list[Ramp], t_ns: int
+    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
 ) -> None:
     """Also where one begins within another: no step is larger than the steepest slope allows."""
     slow = [ramp for ramp in ramps if ramp.end_ns - ramp.start_ns > S // 100]
@@ -94,7 +100,7 @@ def test_shares_are_continuous_where_a_ramp_takes_time(
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
 def test_the_derivative_is_the_finite_difference(
-    first: tuple[float, ...], ramps: list[Ramp], t_ns: int
+    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
 ) -> None:
     step_ns = 1000
     edges = [edge for ramp in ramps for edge in (ramp.start_ns, ramp.end_ns)]
@@ -107,7 +113,7 @@ def test_the_derivative_is_the_finite_difference(
 
 def test_a_ramp_that_begins_within_another_starts_from_where_that_one_is() -> None:
     first, half, all_first = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-    ramps = [Ramp(0, 10 * S, half), Ramp(5 * S, 7 * S, all_first)]
+    ramps = [DominanceRamp(0, 10 * S, half), DominanceRamp(5 * S, 7 * S, all_first)]
     assert shares(5 * S, first, ramps) == ([0.5, 0.5, 0.0], [-0.25, -0.25, 0.5])
     assert shares(6 * S, first, ramps)[0] == [0.25, 0.25, 0.5]
     assert shares(7 * S, first, ramps) == ([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
@@ -116,7 +122,7 @@ def test_a_ramp_that_begins_within_another_starts_from_where_that_one_is() -> No
 # In a site.
 
 
-def site(ramps: tuple[Ramp, ...] = ()) -> Site:
+def site(ramps: tuple[DominanceRamp, ...] = ()) -> Site:
     """Follows a peer at rest at (1, -1) and one that moves at (0.5, 0) rad/s."""
     links = (LinkSetup("a", 0.9, 1000, (1.0, -1.0)), LinkSetup("b", 0.1, 1000, (0.0, 0.0)))
     return Site(setup()._replace(links=links, ramps=ramps))
@@ -126,13 +132,13 @@ def moving(k: int) -> Arrival:
     return Arrival(1, k - 1, (0.5e-3 * (k - 1), 0.0), (0.5, 0.0))
 
 
-def ran(made: Site, commands: dict[int, list[Command]]) -> list[Output]:
-    return stepped(made, [Tick(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)])
+def ran(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
+    return stepped(made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)])
 
 
 def test_a_sites_reference_and_its_derivative_follow_its_shares() -> None:
     """Eq. (6) with shares that change: the derivative has their rates in it."""
-    outputs = ran(site((Ramp(S, 2 * S, (0.1, 0.9)),)), {})
+    outputs = ran(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     t_s = np.arange(3000) / 1000
     a = np.clip(0.9 - 0.8 * (t_s - 1), 0.1, 0.9)
@@ -145,8 +151,8 @@ def test_a_sites_reference_and_its_derivative_follow_its_shares() -> None:
 
 
 def test_a_command_is_what_the_script_would_have_been() -> None:
-    ramp = Ramp(S, 2 * S, (0.1, 0.9))
-    commanded = ran(site(), {700: [Command("shares", ramp=ramp)]})
+    ramp = DominanceRamp(S, 2 * S, (0.1, 0.9))
+    commanded = ran(site(), {700: [CoreChange("shares", ramp=ramp)]})
     scripted = ran(site((ramp,)), {})
     assert [o._replace(cmd=[]) for o in commanded] == scripted
     assert commanded[700].cmd == ["shares"]
@@ -154,14 +160,14 @@ def test_a_command_is_what_the_script_would_have_been() -> None:
 
 def test_a_command_before_what_is_planned_comes_first() -> None:
     """What the scenario plans for later still comes then."""
-    planned, sooner = Ramp(2 * S, 2 * S, (0.0, 1.0)), Ramp(S, S, (0.5, 0.5))
-    outputs = ran(site((planned,)), {500: [Command("shares", ramp=sooner)]})
+    planned, sooner = DominanceRamp(2 * S, 2 * S, (0.0, 1.0)), DominanceRamp(S, S, (0.5, 0.5))
+    outputs = ran(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
     assert [outputs[k].q_des[1] for k in (999, 1000, 1999, 2000)] == [-0.9, -0.5, -0.5, 0.0]
 
 
 def test_more_commands_than_a_run_takes_are_refused() -> None:
     made = site()
-    for n in range(MAX_COMMANDS):
-        made.order(Command(str(n), ramp=Ramp(n, n, (0.5, 0.5))))
+    for n in range(MAX_CHANGES):
+        made.order(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))))
     with pytest.raises(ValueError, match="256"):
-        made.order(Command("one more", ramp=Ramp(S, S, (0.5, 0.5))))
+        made.order(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))))

@@ -12,26 +12,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.sites import sample, setup, stepped
-from trilat_net.core.site import Site
-from trilat_net.core.tick import MAX_ARRIVALS, Arrival, Mode, Output, Tick
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.scenario import load_scenario
 
 VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 
 
-def finite(output: Output) -> bool:
+def finite(output: TickRecord) -> bool:
     return all(math.isfinite(v) for field in VECTORS for v in getattr(output, field))
 
 
-def bits(output: Output) -> str:
+def bits(output: TickRecord) -> str:
     return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(output[-2:])
 
 
 def executed(scenario: str, **overrides: object) -> list[str]:
     """A virtual run, every record as text."""
-    run = virtual.run(load(scenario, {k.replace("__", "."): v for k, v in overrides.items()}))
+    run = virtual.execute_virtual(
+        load_scenario(scenario, {k.replace("__", "."): v for k, v in overrides.items()})
+    )
     return [f"{site.name} {output.tick} {bits(output)}" for site, _, output in run]
 
 
@@ -52,7 +54,7 @@ arrivals = st.lists(
 def test_two_fresh_sites_fed_the_same_ticks_give_the_same_bits(
     came: list[list[Arrival]], scheme: str
 ) -> None:
-    ticks = [Tick(k, c) for k, c in enumerate(came)]
+    ticks = [TickInput(k, c) for k, c in enumerate(came)]
     one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
     assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
 
@@ -60,9 +62,9 @@ def test_two_fresh_sites_fed_the_same_ticks_give_the_same_bits(
 def test_a_record_holds_the_state_at_its_tick_and_its_inputs() -> None:
     """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm, Eq. (8)."""
     site = Site(setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]))
-    first = site.step(Tick(0))
+    first = site.step(TickInput(0))
     assert (first.q, first.qd, first.t_ns) == ([0.3, -0.1], [0.2, 0.4], 0)
-    outputs = stepped(site, [Tick(k) for k in range(1, 3501)])
+    outputs = stepped(site, [TickInput(k) for k in range(1, 3501)])
     assert outputs[-1].tau_x == pytest.approx([-10.0, -10.0])
     assert outputs[10].tau_x == [0.0, 0.0]
     assert "-" not in str(outputs[10].tau_x)
@@ -96,7 +98,7 @@ def test_without_the_compiler_a_run_has_the_same_bits() -> None:
 def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(scheme: str, k: int) -> None:
     """Every record is a key-frame: records k-2 and k-1 and what waits in the links."""
     built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
-    ticks = [Tick(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)]
+    ticks = [TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)]
     whole = stepped(Site(built), ticks)
     site = Site(built)
     before, last = whole[max(0, k - 2)], whole[k - 1]
@@ -110,11 +112,11 @@ def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(scheme: str,
 @pytest.mark.parametrize("name", ["asymmetric", "paper", "two_sites"])
 def test_rates_of_their_own_meet_on_the_grid(name: str) -> None:
     """Any mix of rates runs; every site ages what it uses by the delay and less than two periods."""
-    scenario = load(name)
+    scenario = load_scenario(name)
     rates = dict(zip(scenario.names, (1000, 450, 333), strict=False))
-    changed = load(name, {f"sites.{n}.rate_hz": r for n, r in rates.items()} | {"duration_s": 1.0})
-    last: dict[str, Output] = {}
-    for site, _, output in virtual.run(changed):
+    changed = load_scenario(name, {f"sites.{n}.rate_hz": r for n, r in rates.items()} | {"duration_s": 1.0})
+    last: dict[str, TickRecord] = {}
+    for site, _, output in virtual.execute_virtual(changed):
         last[site.name] = output
     for n, output in last.items():
         assert output.mode is Mode.RUN
@@ -134,7 +136,12 @@ def four_sites() -> dict[str, object]:
 
 
 def test_nothing_knows_the_number_three() -> None:
-    last = {site.name: o for site, _, o in virtual.run(load("paper", {**four_sites(), "duration_s": 30.0}))}
+    last = {
+        site.name: o
+        for site, _, o in virtual.execute_virtual(
+            load_scenario("paper", {**four_sites(), "duration_s": 30.0})
+        )
+    }
     assert len(last) == 4
     assert all(o.used == [29_799] * 3 for o in last.values())
     poses = [o.q for o in last.values()]
@@ -144,21 +151,21 @@ def test_nothing_knows_the_number_three() -> None:
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 def test_the_torque_limit_cuts(scheme: str) -> None:
     site = Site(setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
-    torques = [o.tau for o in stepped(site, [Tick(k) for k in range(400)])]
+    torques = [o.tau for o in stepped(site, [TickInput(k) for k in range(400)])]
     assert max(abs(t) for tau in torques for t in tau) == 2.0
-    assert site.step(Tick(400)).mode is Mode.RUN
+    assert site.step(TickInput(400)).mode is Mode.RUN
 
 
 def test_a_site_beyond_its_speed_limit_diverges_once_and_stays_where_it_is() -> None:
     site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
-    outputs = stepped(site, [Tick(k) for k in range(400)])
+    outputs = stepped(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert max(map(abs, outputs[k].qd)) > 0.5 >= max(map(abs, outputs[k - 1].qd))
     assert all(o.mode is Mode.DIVERGED and (o.q, o.qd) == (outputs[k].q, outputs[k].qd) for o in outputs[k:])
 
 
 def test_a_run_that_diverges_ends_at_that_instant() -> None:
-    ran = list(virtual.run(load("free", {"limits.qd_limit_rad_s": 0.5})))
+    ran = list(virtual.execute_virtual(load_scenario("free", {"limits.qd_limit_rad_s": 0.5})))
     assert ran[-1].output.t_ns == ran[-3].output.t_ns < 20 * 10**9
     assert any(r.output.mode is Mode.DIVERGED for r in ran[-3:])
     assert all(r.output.mode is Mode.RUN for r in ran[:-3])
@@ -180,7 +187,7 @@ def test_no_record_ever_holds_what_is_not_finite(
     site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
     for k, numbers in enumerate([None, *came, None, None]):
         numbers_of_tick = [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
-        assert finite(site.step(Tick(k, numbers_of_tick)))
+        assert finite(site.step(TickInput(k, numbers_of_tick)))
 
 
 LARGEST = 1e9
@@ -206,16 +213,18 @@ def test_absurd_scenarios_are_refused_or_end_in_a_stop_but_never_in_numbers_that
     key: str, scheme: str
 ) -> None:
     with pytest.raises(ScenarioError, match=key.rpartition(".")[2]):
-        load("paper", {key: 1e308})
-    ran = list(virtual.run(load("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3})))
+        load_scenario("paper", {key: 1e308})
+    ran = list(
+        virtual.execute_virtual(load_scenario("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3}))
+    )
     assert all(finite(r.output) for r in ran)
 
 
 def test_more_arrivals_than_a_tick_takes_are_refused() -> None:
     site = Site(setup())
-    site.step(Tick(0, [sample(n) for n in range(MAX_ARRIVALS)]))
+    site.step(TickInput(0, [sample(n) for n in range(MAX_ARRIVALS)]))
     with pytest.raises(ValueError, match="4096"):
-        site.step(Tick(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
+        site.step(TickInput(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
 
 
 def test_the_arrivals_crc_is_that_of_their_bytes() -> None:
@@ -223,4 +232,4 @@ def test_the_arrivals_crc_is_that_of_their_bytes() -> None:
 
     came = [Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77), Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9)]
     packed = b"".join(struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in came)
-    assert Site(setup()).step(Tick(0, came)).rx_crc == zlib.crc32(packed)
+    assert Site(setup()).step(TickInput(0, came)).rx_crc == zlib.crc32(packed)

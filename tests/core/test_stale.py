@@ -9,20 +9,20 @@ from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
 from tests.virtual_runs import trajectories
-from trilat_net.core.delay import Model
-from trilat_net.core.setup import LinkSetup, Stale, StaleRule
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Arrival, Mode, Output, Tick
-from trilat_net.scenario import load
+from trilat_net.core.delay import LinkModel
+from trilat_net.core.site_setup import LinkSetup, StaleAction, StaleRule
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
+from trilat_net.scenario import load_scenario
 
 MS = 1_000_000
-RULE = StaleRule(Stale.HOLD, 20 * MS, 30 * MS)
+RULE = StaleRule(StaleAction.HOLD, 20 * MS, 30 * MS)
 
 
 def site(rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0) -> Site:
     """Two peers behind 5 ms; what it follows it gets from `moving`."""
     links = tuple(
-        LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(Model(location=5_000.0),))
+        LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(LinkModel(location=5_000.0),))
         for n, (name, share) in enumerate(zip("ab", shares, strict=True))
     )
     return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
@@ -38,22 +38,22 @@ def moving(peer: int, tick: int) -> Arrival:
     return Arrival(peer, tick, *at(peer, tick))
 
 
-def cut(rule: StaleRule, start: int, end: int, count: int = 200) -> list[Output]:
+def cut(rule: StaleRule, start: int, end: int, count: int = 200) -> list[TickRecord]:
     """Both peers heard every tick, but not peer 1 in samples from `start` to `end`."""
     ticks = [
-        Tick(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and start <= k - 1 < end)])
+        TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and start <= k - 1 < end)])
         for k in range(count)
     ]
     return stepped(site(rule), ticks)
 
 
-def runs_of(outputs: Sequence[Output]) -> list[tuple[Mode, int]]:
+def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
     """(mode, first tick) of every stretch."""
     edges = [0, *(k for k in range(1, len(outputs)) if outputs[k].mode is not outputs[k - 1].mode)]
     return [(outputs[k].mode, k) for k in edges]
 
 
-def followed(output: Output, shares: Sequence[float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
+def followed(output: TickRecord, shares: Sequence[float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
     """What the peers ask for, from the samples in use."""
     poses = [((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)]
     q, qd = (np.array([pose[n] for pose in poses]) for n in (0, 1))
@@ -63,20 +63,22 @@ def followed(output: Output, shares: Sequence[float] = (0.5, 0.5)) -> tuple[np.n
 # The modes.
 
 
-@pytest.mark.parametrize(("action", "mode"), [(Stale.HOLD, Mode.HOLD), (Stale.BRAKE, Mode.BRAKE)])
-def test_a_cut_leads_to_hold_or_brake_and_back_by_a_return(action: Stale, mode: Mode) -> None:
+@pytest.mark.parametrize(("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)])
+def test_a_cut_leads_to_hold_or_brake_and_back_by_a_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
     outputs = cut(RULE._replace(action=action), 50, 90)
     assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
 
 
 def test_to_use_is_to_go_on() -> None:
-    assert runs_of(cut(RULE._replace(action=Stale.USE), 50, 90)) == [(Mode.RUN, 0)]
+    assert runs_of(cut(RULE._replace(action=StaleAction.USE), 50, 90)) == [(Mode.RUN, 0)]
 
 
 def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() -> None:
     ticks = [
-        Tick(k, [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])] if k else [])
+        TickInput(
+            k, [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])] if k else []
+        )
         for k in range(200)
     ]
     outputs = stepped(site(RULE._replace(return_ns=50 * MS)), ticks)
@@ -86,22 +88,22 @@ def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() 
 
 
 def test_a_peer_that_was_never_heard_is_as_old_as_the_run() -> None:
-    outputs = stepped(site(RULE), [Tick(k) for k in range(40)])
+    outputs = stepped(site(RULE), [TickInput(k) for k in range(40)])
     assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
 
 
 def test_a_peer_without_a_share_may_be_as_stale_as_it_likes() -> None:
-    ticks = [Tick(k, [moving(0, k - 1)] if k else []) for k in range(100)]
+    ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
     assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
     assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
 
 
-@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
-def test_diverged_is_final_from_every_mode(action: Stale) -> None:
+@pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
+def test_diverged_is_final_from_every_mode(action: StaleAction) -> None:
     """And forgets what it held: a record that says so holds nothing."""
     made = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
     outputs = stepped(
-        made, [Tick(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else []) for k in range(120)]
+        made, [TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else []) for k in range(120)]
     )
     diverged = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert all(o.mode is Mode.DIVERGED and o.mem == [] for o in outputs[diverged:])
@@ -117,25 +119,29 @@ arrivals = st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(1, 30)),
 @settings(max_examples=60)
 @given(
     heard=arrivals,
-    action=st.sampled_from(list(Stale)),
+    action=st.sampled_from(list(StaleAction)),
     age_ms=st.integers(1, 40),
     return_ms=st.integers(1, 60),
     shares=st.sampled_from([(0.5, 0.5), (0.25, 0.75), (1.0, 0.0)]),
 )
 def test_modes_and_references_are_those_of_the_law(
-    heard: list[tuple[bool, bool]], action: Stale, age_ms: int, return_ms: int, shares: tuple[float, float]
+    heard: list[tuple[bool, bool]],
+    action: StaleAction,
+    age_ms: int,
+    return_ms: int,
+    shares: tuple[float, float],
 ) -> None:
     """Whatever comes and stays away: the edges of `Mode`, and the reference of each mode."""
     made = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
     mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
     for k, flags in enumerate(heard):
-        output = made.step(Tick(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k]))
+        output = made.step(TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k]))
         ages = [k - max(used, 0) for used in output.used]
         stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
-        if action is not Stale.USE:
+        if action is not StaleAction.USE:
             if stale and mode in (Mode.RUN, Mode.RETURN):
-                mode = Mode.HOLD if action is Stale.HOLD else Mode.BRAKE
-                held = before if action is Stale.HOLD else np.array(output.q)
+                mode = Mode.HOLD if action is StaleAction.HOLD else Mode.BRAKE
+                held = before if action is StaleAction.HOLD else np.array(output.q)
             elif not stale and mode in (Mode.HOLD, Mode.BRAKE):
                 mode, since = Mode.RETURN, k
             if mode is Mode.RETURN and k - since >= return_ms:
@@ -160,8 +166,8 @@ def test_modes_and_references_are_those_of_the_law(
 # The way back.
 
 
-@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
-def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own(action: Stale) -> None:
+@pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
+def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
     outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 50, 90, 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
@@ -174,8 +180,8 @@ def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own
 
 
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
-@pytest.mark.parametrize("action", [Stale.HOLD, Stale.BRAKE])
-def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: Stale, k: int) -> None:
+@pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
+def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: StaleAction, k: int) -> None:
     """Whatever its mode was: the records hold what it remembers."""
     rule = RULE._replace(action=action)
     whole = cut(rule, 50, 90)
@@ -186,7 +192,8 @@ def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: Stal
     made.prime(k, in_use, [moving(j, m) for j, m in heard])
     made.resume(whole[k - 2], last)
     ticks = [
-        Tick(n, [moving(j, n - 1) for j in (0, 1) if not (j and 50 <= n - 1 < 90)]) for n in range(k, 200)
+        TickInput(n, [moving(j, n - 1) for j in (0, 1) if not (j and 50 <= n - 1 < 90)])
+        for n in range(k, 200)
     ]
     assert stepped(made, ticks) == whole[k:]
 
@@ -198,7 +205,7 @@ def test_a_ramped_return_takes_the_kick_out_of_a_healed_link() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and hears of it all at once."""
 
     def kick(action: str) -> float:
-        made = trajectories(load("outage", {"on_stale.action": action}))
+        made = trajectories(load_scenario("outage", {"on_stale.action": action}))
         healed = made.sites["s"].t_s >= made.scenario.links["m1->s"].outages_s[0][1]
         return float(np.abs(made.sites["s"].qd[healed]).max())
 

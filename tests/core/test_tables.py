@@ -6,10 +6,10 @@ import pytest
 from tests.core.channels import channel, due
 from tests.core.kinds import KINDS, POINTS
 from trilat_net.core.channel import LOST
-from trilat_net.core.delay import LIMIT_US, longest_us
+from trilat_net.core.delay import MAX_DELAY_US, max_delay_us
 from trilat_net.core.link import calendar_pages
-from trilat_net.core.tables import stacked, tables_of
-from trilat_net.scenario import load
+from trilat_net.core.site_arrays import build_site_arrays, stack_site_arrays
+from trilat_net.scenario import load_scenario
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -19,14 +19,14 @@ def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
     due_ns = due(channel([model], 3, points=POINTS), 5000)
     kept = due_ns != LOST
     delay_us = (due_ns[kept] - np.arange(5000)[kept] * 1_000_000) / 1000
-    longest = longest_us([model], traces)
-    assert delay_us.max() <= longest <= LIMIT_US
+    longest = max_delay_us([model], traces)
+    assert delay_us.max() <= longest <= MAX_DELAY_US
 
 
 def test_known_delays_take_few_pages_and_unbounded_ones_all() -> None:
     def pages(**changes: object) -> int:
-        scenario = load("free", {key.replace("__", "."): value for key, value in changes.items()})
-        return stacked([scenario.setup(name) for name in scenario.names]).samples.shape[2]
+        scenario = load_scenario("free", {key.replace("__", "."): value for key, value in changes.items()})
+        return stack_site_arrays([scenario.setup(name) for name in scenario.names]).samples.shape[2]
 
     assert pages(link__delay_ms=200.0) == 256
     assert pages(link__delay_ms=0.0) <= 16
@@ -38,11 +38,11 @@ def test_known_delays_take_few_pages_and_unbounded_ones_all() -> None:
 
 
 def test_stacked_tables_hold_each_site_s_own() -> None:
-    scenario = load("windup")
+    scenario = load_scenario("windup")
     setups = [scenario.setup(name) for name in scenario.names]
-    whole = stacked(setups)
+    whole = stack_site_arrays(setups)
     for n, setup in enumerate(setups):
-        own = tables_of(setup)
+        own = build_site_arrays(setup)
         assert whole.site[n].tobytes() == own.site.tobytes()
         assert whole.links[n].tobytes() == own.links.tobytes()
         assert whole.ramps[n].tobytes() == own.ramps.tobytes()

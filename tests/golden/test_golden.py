@@ -13,9 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilat_net.core.fingerprint import fingerprint
-from trilat_net.experiment import compare_with_virtual, open_log, simulate, verify
-from trilat_net.replay.difference import TOLERANCE
+from trilat_net.api import simulate
+from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.execution.difference import TOLERANCE
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
 
 from .digests import COMMAND
 
@@ -44,7 +47,7 @@ def test_a_golden_log_is_what_virtual_time_gives_today(path: Path) -> None:
 
 
 def test_only_the_newest_has_the_arithmetic_of_today() -> None:
-    same = [path.stem for path in GOLDEN if open_log(path).session["fingerprint"] == fingerprint()]
+    same = [path.stem for path in GOLDEN if open_log(path).session["fingerprint"] == compute_fingerprint()]
     assert same == ["v3-own-sines"]
 
 

@@ -4,10 +4,10 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from trilat_net.log.chunks import Walk
-from trilat_net.log.names import active
-from trilat_net.log.reader import Log, open_log
-from trilat_net.log.recover import Recovery, recover
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.mcap_reader import McapReader
+from trilat_net.log.recover import Recovery, recover_log
 from trilat_net.net.clock import SystemClock
 
 from .processes import Session, Stage
@@ -57,8 +57,8 @@ def killed(stage: Stage, after_s: float, *more: str) -> Killed:
         session.processes[name].signal(signal.SIGINT)
     for name in SITES:
         assert session.processes[name].code() == 130
-    torn = active(session.log)
-    recovery = recover(torn)
+    torn = active_path(session.log)
+    recovery = recover_log(torn)
     log = open_log(recovery.output)
     return Killed(
         recovery,
@@ -71,7 +71,7 @@ def killed(stage: Stage, after_s: float, *more: str) -> Killed:
 
 def _messages(path: Path) -> list[tuple[str, bytes]]:
     with path.open("rb") as stream:
-        return [(item.topic, item.payload) for item in Walk(stream, str(path)).messages()]
+        return [(item.topic, item.payload) for item in McapReader(stream, str(path)).messages()]
 
 
 def _newest(log: Log) -> list[int]:

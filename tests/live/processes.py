@@ -9,10 +9,11 @@ from pathlib import Path
 
 from tests.cli.running import COMMAND, PLAIN
 from tests.net.waiting import until
-from trilat_net.experiment import compare_with_virtual, verify
-from trilat_net.log.names import active
-from trilat_net.log.reader import Log, open_log
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.connection import find_free_endpoints
 
 BEGUN = "the session begins"
 PATIENCE_S = 60.0
@@ -119,7 +120,7 @@ class Session:
     def __init__(self, stage: Stage, scenario: str, sites: Sequence[str], *options: str) -> None:
         self._stage, self._scenario, self._options = stage, scenario, options
         self.sites = tuple(sites)
-        *self.endpoints, self.recorder_endpoint = free_endpoints(len(sites) + 1)
+        *self.endpoints, self.recorder_endpoint = find_free_endpoints(len(sites) + 1)
         self.log = stage.folder / "run.mcap"
         self.processes: dict[str, Process] = {}
 
@@ -174,7 +175,7 @@ def recorded(log: Path) -> None:
 
 def size(log: Path) -> int:
     """Bytes of a log, finished or not; 0 where there is none."""
-    for path in (active(log), log):
+    for path in (active_path(log), log):
         with contextlib.suppress(FileNotFoundError):
             return path.stat().st_size
     return 0

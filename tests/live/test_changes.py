@@ -1,7 +1,7 @@
 """Changes while a session runs, by its timeline and by `trilat set`: the run is reproduced bit for bit."""
 
 from tests.cli.running import trilat
-from trilat_net.core.tick import Mode
+from trilat_net.core.ticks import Mode
 
 from .processes import Session, Stage, connections, equal_to_virtual_time, executed_again, whole
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-import recorder.process
+import recorder.record_process
 from tests.cli.running import trilat
-from trilat_net.experiment import record_virtual
-from trilat_net.log.parts import Storage
-from trilat_net.scenario import load
+from trilat_net.execution.virtual import record_virtual
+from trilat_net.log.log_writer import LogStorage
+from trilat_net.scenario import load_scenario
 
 from .processes import Session, Stage
 
@@ -32,14 +32,14 @@ def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None
 def test_a_run_that_diverged_fails_though_its_log_is_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def recorded(_session: str, storage: Storage, *others: object) -> int:
-        assert not record_virtual(load("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path)
+    def recorded(_session: str, storage: LogStorage, *others: object) -> int:
+        assert not record_virtual(load_scenario("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path)
         *_, afterwards = others
         assert isinstance(afterwards, Callable)
         afterwards()
         return 0
 
-    monkeypatch.setattr(recorder.process, "record_session", recorded)
+    monkeypatch.setattr(recorder.record_process, "record_session", recorded)
     done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
     assert "FAIL" not in done.out
     done.refuses("x.mcap", "diverged at t = ", code=1)

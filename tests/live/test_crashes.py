@@ -6,10 +6,10 @@ import signal
 import pytest
 from mcap.reader import make_reader
 
-from trilat_net.experiment import verify
-from trilat_net.log.names import active
-from trilat_net.log.reader import open_log
-from trilat_net.log.recover import recover
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.recover import recover_log
 
 from .killing import SITES, killed
 from .processes import Session, Stage, connections, executed_again
@@ -85,7 +85,7 @@ def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(
         session.processes[name].signal(signal.SIGINT)
     assert again.code() == 0, again
     assert [session.processes[name].code() for name in SITES] == [130, 130, 130]
-    torn = recover(active(session.log))
+    torn = recover_log(active_path(session.log))
     assert torn.lossless
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.net.waiting import until
-from trilat_net.experiment import verify
-from trilat_net.log.reader import open_log
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
 
 from .processes import Process, Stage, gone, recorded
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 
 from tests.truth import judged, members, offset_errors
-from trilat_net.experiment import compare_with_virtual
-from trilat_net.log.reader import Log
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
 from trilat_net.net.clock import SystemClock
 
 from .namespaces import Machines, NoNamespaces, bridged, machines, pairs, reaches, starred

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.experiment import compare_with_virtual
-from trilat_net.log.reader import open_log
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
 
 from .processes import PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
 

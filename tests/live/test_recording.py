@@ -4,9 +4,9 @@ import signal
 from pathlib import Path
 
 from tests.net.waiting import until
-from trilat_net.experiment import verify
-from trilat_net.log.names import active
-from trilat_net.log.reader import Log, open_log
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
 from .processes import (
@@ -89,7 +89,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_
     assert late.t_ns > 0
     events = {event.kind for event in log.events if event.member == "m"}
     assert {"epoch", "start", "setup", "lost", "back", "end"} <= events
-    torn = open_log(active(session.log))
+    torn = open_log(active_path(session.log))
     assert not torn.complete
     assert verify(torn).passed
 

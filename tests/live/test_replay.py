@@ -3,11 +3,11 @@
 import signal
 from pathlib import Path
 
-from tests.playback.logs import session_payloads
-from trilat_net.log.reader import open_log
-from trilat_net.net.endpoints import free_endpoints
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from tests.recorder.play.logs import session_payloads
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.connection import find_free_endpoints
+from trilat_net.scenario import load_scenario
 
 from .processes import Process, Session, Stage, executed_again
 
@@ -19,7 +19,7 @@ class Again:
 
     def __init__(self, stage: Stage, log: Path) -> None:
         self._stage, self._log = stage, log
-        (self.endpoint,) = free_endpoints(1)
+        (self.endpoint,) = find_free_endpoints(1)
 
     def replay(self, *options: str, called: str = "replay", listen: str = "") -> Process:
         return self._stage.start(
@@ -61,7 +61,7 @@ def virtual_log(folder: Path) -> Path:
     """A second of two sites."""
     path = folder / "run.mcap"
     with path.open("wb") as stream:
-        virtual.record(load("two_sites", {"duration_s": 1.0}), stream)
+        virtual.write_virtual_log(load_scenario("two_sites", {"duration_s": 1.0}), stream)
     return path
 
 
@@ -72,7 +72,7 @@ def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(st
     replay = again.replay("--loop")
     replay.prints("playing")
     ping = stage.start("ping", "ping", "--session", "again", "--connect", again.endpoint, "--count", "5")
-    (elsewhere,) = free_endpoints(1)
+    (elsewhere,) = find_free_endpoints(1)
     other = again.replay("--connect", again.endpoint, called="other replay", listen=elsewhere)
     second = stage.folder / "second.mcap"
     recorder = again.recorder(second)

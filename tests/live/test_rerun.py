@@ -3,8 +3,8 @@
 from itertools import combinations
 
 from tests.cli.running import trilat
-from trilat_net.replay.comparison import late_samples
-from trilat_net.whatif.rerun import rerun
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.virtual_comparison import find_late_samples
 
 from .processes import Session, Stage, connections, whole
 
@@ -33,7 +33,7 @@ def test_any_sites_of_a_session_are_what_they_were(stage: Stage) -> None:
     trilat(*to, "link", "m1->s", "--delay", "30ms", cwd=stage.folder).succeeds()
     assert set(session.codes().values()) == {0}
     log = whole(session.log)
-    assert late_samples(log)
+    assert find_late_samples(log)
     assert "hold" in {state.mode for state in log["m2"].states}
     assert log.changes("s")
     for count in (1, 2, 3):

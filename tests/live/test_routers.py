@@ -3,9 +3,9 @@
 import signal
 
 from tests.net.certificates import Certificates
-from trilat_net.experiment import verify
-from trilat_net.log.reader import open_log
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.connection import find_free_endpoints
 
 from .processes import BEGUN, Process, Stage, equal_to_virtual_time, executed_again, recorded, whole
 
@@ -17,7 +17,7 @@ class Routed:
 
     def __init__(self, stage: Stage, duration: str, protocol: str = "tcp", *options: str) -> None:
         self._stage, self._duration, self._options = stage, duration, options
-        (endpoint,) = free_endpoints(1)
+        (endpoint,) = find_free_endpoints(1)
         self.endpoint = endpoint.replace("tcp", protocol)
         self.log = stage.folder / "run.mcap"
         self.members: dict[str, Process] = {}

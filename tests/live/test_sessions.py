@@ -3,13 +3,14 @@
 import signal
 
 from tests.net.waiting import until
-from trilat_net.experiment import compare_with_virtual, verify
-from trilat_net.log.reader import open_log
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
 from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .processes import BEGUN, Session, Stage, connections, equal_to_virtual_time, executed_again, whole
 
@@ -41,7 +42,7 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
     session = Session(stage, "paper", PAPER, "--duration", "8", "--set", 'scheme="digital"')
     session.all("recorder", "s", "m2", "m1")
     session.begun()
-    (elsewhere,) = free_endpoints(1)
+    (elsewhere,) = find_free_endpoints(1)
     second = session.site("m1", *connections(session.endpoints), called="second m1", listen=elsewhere)
     junk = [b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000]
     clock = SystemClock()
@@ -193,4 +194,4 @@ def test_another_scenario_is_refused_with_both_hashes(stage: Stage) -> None:
     assert leader.code() == 130
     (error,) = (line for line in other.text().splitlines() if line.startswith("error: "))
     for overrides in ({}, {"control.Kd": 5}):
-        assert load("two_sites", overrides).sha256[:16] in error
+        assert load_scenario("two_sites", overrides).sha256[:16] in error

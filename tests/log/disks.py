@@ -5,8 +5,8 @@ import io
 import os
 from pathlib import Path
 
-from trilat_net.log.container import Container
-from trilat_net.log.logfile import LogFile
+from trilat_net.log.log_file import LogFile
+from trilat_net.log.mcap_writer import McapWriter
 
 
 class SmallDisk:
@@ -81,9 +81,9 @@ def sent(count: int) -> list[Sent]:
     return [(1 + n % 2, 10 * n, os.urandom(40), 10 * n + 1, n) for n in range(count)]
 
 
-def begun(file: LogFile) -> Container:
+def begun(file: LogFile) -> McapWriter:
     """A file with two channels, flushed."""
-    container = Container(file, "lib")
+    container = McapWriter(file, "lib")
     schema = container.register_schema("S", "jsonschema", b"{}")
     for name in "ab":
         container.register_channel(f"/{name}", "msgpack", schema)

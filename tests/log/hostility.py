@@ -12,17 +12,15 @@ import lz4.frame
 import msgpack
 import zstandard
 
+from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.log_editing import edited
-from trilat_net.analysis.overview import overview
+from trilat_net.analysis.file_overview import describe_files
 from trilat_net.errors import TrilatError
-from trilat_net.log.framing import Framing
-from trilat_net.log.packed import unpacked
-from trilat_net.log.reader import open_log
-from trilat_net.log.recover import recover
-from trilat_net.log.soundness import soundness
-from trilat_net.playback.loading import load
-from trilat_net.playback.selection import Selection
-from trilat_net.replay.verify import verify
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.mcap_records import RecordScanner, unpack_chunk
+from trilat_net.log.recover import recover_log
+from trilat_net.log.session_check import check_log
 
 LENGTHS = (0, 1, 7, 22, 255, 1 << 16, 1 << 20, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 NUMBERS = (
@@ -137,7 +135,7 @@ def lengthened(data: bytes, draws: Draws) -> bytes:
 
 def record_lengthened(data: bytes, draws: Draws) -> bytes:
     """The length of a record of the file is another."""
-    frames = list(Framing(io.BytesIO(data)).frames())
+    frames = list(RecordScanner(io.BytesIO(data)).frames())
     frame = one_of(draws, frames)
     changed = bytearray(data)
     length = one_of(draws, (*LENGTHS, frame.length + 1, max(0, frame.length - 1), len(data)))
@@ -164,13 +162,13 @@ def chunk(
 
 def repacked(data: bytes, draws: Draws, change: Callable[[bytes, Draws], bytes]) -> bytes:
     """What is inside a chunk is changed, and its checksum is right."""
-    framing = Framing(io.BytesIO(data))
+    framing = RecordScanner(io.BytesIO(data))
     chunks = [frame for frame in framing.frames() if frame.opcode == 6]
     if not chunks:
         return data
     frame = one_of(draws, chunks)
     try:
-        inside = change(unpacked(framing.content(frame)), draws)
+        inside = change(unpack_chunk(framing.content(frame)), draws)
     except Exception:  # it is damaged already
         return data
     new = chunk(inside, compression=one_of(draws, ("zstd", "lz4", "")))
@@ -330,16 +328,16 @@ def _recovered(path: Path) -> None:
     output = path.with_name("made.mcap")
     output.unlink(missing_ok=True)
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):  # no disk is under test here
-        recover(path, output)
+        recover_log(path, output)
 
 
 READERS: dict[str, Callable[[Path], object]] = {
     "arrays": _arrays,
     "verify": _executed,
-    "info": lambda path: overview([path]),
-    "check": lambda path: soundness([path]),
+    "info": lambda path: describe_files([path]),
+    "check": lambda path: check_log([path]),
     "recover": _recovered,
-    "replay": lambda path: load([path], Selection(), 64 << 20),
+    "replay": lambda path: preload_messages([path], PlaySelection(), 64 << 20),
 }
 """Everybody who reads a log, by name."""
 

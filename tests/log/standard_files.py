@@ -3,33 +3,32 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from trilat_net.core.tick import Output
-from trilat_net.log.container import Sink
-from trilat_net.log.parts import LogParts, Storage
-from trilat_net.log.reader import open_log
-from trilat_net.log.recover import recover
-from trilat_net.log.ros2 import export_ros2
-from trilat_net.log.writer import LogWriter
+from trilat_net.core.ticks import TickRecord
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
+from trilat_net.log.mcap_writer import Sink
+from trilat_net.log.recover import recover_log
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.reporting.ros2_bag import export_ros2
+from trilat_net.scenario import load_scenario
 
 EPOCH_NS = 1_700_000_000_000_000_000
-SCENARIO = load("two_sites", {"duration_s": 0.5})
+SCENARIO = load_scenario("two_sites", {"duration_s": 0.5})
 KINDS = ("virtual", "live", "first part", "last part", "recovered")
 VIEWS_HZ = 100.0
 
 
-def outputs() -> dict[str, list[Output]]:
+def outputs() -> dict[str, list[TickRecord]]:
     """What each site does."""
-    made: dict[str, list[Output]] = {name: [] for name in SCENARIO.names}
-    for step in virtual.run(SCENARIO):
+    made: dict[str, list[TickRecord]] = {name: [] for name in SCENARIO.names}
+    for step in virtual.execute_virtual(SCENARIO):
         made[step.site.name].append(step.output)
     return made
 
 
-def live(storage: Storage) -> None:
+def live(storage: LogStorage) -> None:
     """Records a session as the recorder does: records that were sent late and came later."""
 
     def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
@@ -38,7 +37,7 @@ def live(storage: Storage) -> None:
         )
 
     with LogParts(storage, begin) as log:
-        for step in virtual.run(SCENARIO):
+        for step in virtual.execute_virtual(SCENARIO):
             name, k, t_ns = step.site.name, step.output.tick, step.output.t_ns
             sent_ns, log_ns = t_ns + 80_000, EPOCH_NS + t_ns + 300_000
             payload = encode_state(name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns)
@@ -68,13 +67,13 @@ def made(folder: Path) -> dict[str, Path]:
     """Makes every kind of file, and the bag of the live one."""
     whole = folder / "virtual.mcap"
     with whole.open("wb") as stream:
-        virtual.record(SCENARIO, stream, views_hz=VIEWS_HZ)
-    live(Storage(folder / "live.mcap"))
-    live(Storage(folder / "parts.mcap", split_ns=200_000_000))
+        virtual.write_virtual_log(SCENARIO, stream, views_hz=VIEWS_HZ)
+    live(LogStorage(folder / "live.mcap"))
+    live(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
     parts = sorted(folder.glob("parts-*.mcap"))
     torn = folder / "torn.mcap"
     torn.write_bytes((folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10])
-    recover(torn, folder / "recovered.mcap")
+    recover_log(torn, folder / "recovered.mcap")
     bag = folder / "live-ros2.mcap"
     export_ros2(open_log(folder / "live.mcap"), bag)
     found = (whole, folder / "live.mcap", parts[0], parts[-1], folder / "recovered.mcap")

@@ -13,8 +13,15 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from trilat_net.log import cdr
-from trilat_net.log.cdr import Dimension, JointStates, Level, float_arrays, log_message, string_message
+from trilat_net.log.ros2 import cdr
+from trilat_net.log.ros2.cdr import (
+    ArrayDimension,
+    JointStatePacker,
+    RosLogLevel,
+    make_float_array_packer,
+    pack_log,
+    pack_string,
+)
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
@@ -24,7 +31,7 @@ stamps_ns = st.integers(0, (1 << 31) * 10**9 - 1)
 
 def decoded(name: str, data: bytes) -> Any:
     """By mcap-ros2-support, from the schema text that stands in our files."""
-    schema = Schema(id=1, name=name, encoding="ros2msg", data=cdr.SCHEMAS[name])
+    schema = Schema(id=1, name=name, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[name])
     decoder = DecoderFactory().decoder_for("cdr", schema)
     assert decoder is not None
     return decoder(data)
@@ -53,11 +60,11 @@ def bits(numbers: Any) -> list[bytes]:
     return [struct.pack("<d", number) for number in numbers]
 
 
-@pytest.mark.parametrize("name", list(cdr.SCHEMAS))
+@pytest.mark.parametrize("name", list(cdr.ROS2_SCHEMAS))
 def test_a_schema_text_is_complete_and_the_type_itself(name: str) -> None:
     """Its hash, by which ROS 2 tells types apart, is that of the type."""
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(cdr.SCHEMAS[name].decode(), name))
+    store.register(get_types_from_msg(cdr.ROS2_SCHEMAS[name].decode(), name))
     assert store.hash_rihs01(name) == STORE.hash_rihs01(name)
 
 
@@ -73,7 +80,7 @@ def joint_states(draw: st.DrawFn) -> SimpleNamespace:
         position=draw(row),
         velocity=draw(row) if velocity else [],
         effort=draw(row) if effort else [],
-        packer=lambda frame_id: JointStates(names, frame_id, velocity=velocity, effort=effort),
+        packer=lambda frame_id: JointStatePacker(names, frame_id, velocity=velocity, effort=effort),
     )
 
 
@@ -98,16 +105,16 @@ def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> No
 
 
 @st.composite
-def arrays(draw: st.DrawFn) -> tuple[list[Dimension], list[float]]:
-    dimensions = draw(st.lists(st.builds(Dimension, words, st.integers(0, 3)), max_size=3))
+def arrays(draw: st.DrawFn) -> tuple[list[ArrayDimension], list[float]]:
+    dimensions = draw(st.lists(st.builds(ArrayDimension, words, st.integers(0, 3)), max_size=3))
     count = math.prod(dimension.size for dimension in dimensions)
     return dimensions, draw(st.lists(floats, min_size=count, max_size=count))
 
 
 @given(arrays())
-def test_arrays_are_read_as_they_were_written(case: tuple[list[Dimension], list[float]]) -> None:
+def test_arrays_are_read_as_they_were_written(case: tuple[list[ArrayDimension], list[float]]) -> None:
     dimensions, numbers = case
-    data = float_arrays(*dimensions)(*numbers)
+    data = make_float_array_packer(*dimensions)(*numbers)
     strides = [math.prod(d.size for d in dimensions[n:]) for n in range(len(dimensions))]
     for message in (decoded(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
         assert bits(message.data) == bits(numbers)
@@ -122,14 +129,16 @@ def test_arrays_are_read_as_they_were_written(case: tuple[list[Dimension], list[
 
 @given(words)
 def test_a_string_is_read_as_it_was_written(text: str) -> None:
-    data = string_message(text)
+    data = pack_string(text)
     assert decoded(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
     assert data == serialized(cdr.STRING, type_of(cdr.STRING)(data=text))
 
 
-@given(stamps_ns, st.sampled_from(Level), words, words)
-def test_a_line_of_a_log_is_read_as_it_was_written(stamp_ns: int, level: Level, name: str, text: str) -> None:
-    data = log_message(stamp_ns, level, name, text)
+@given(stamps_ns, st.sampled_from(RosLogLevel), words, words)
+def test_a_line_of_a_log_is_read_as_it_was_written(
+    stamp_ns: int, level: RosLogLevel, name: str, text: str
+) -> None:
+    data = pack_log(stamp_ns, level, name, text)
     for message in (decoded(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
         assert message.stamp.sec * 10**9 + message.stamp.nanosec == stamp_ns
         assert (message.level, message.name, message.msg, message.line) == (level, name, text, 0)
@@ -140,5 +149,5 @@ def test_a_line_of_a_log_is_read_as_it_was_written(stamp_ns: int, level: Level, 
 
 
 def test_a_stamp_beyond_what_ros_2_can_say_is_its_last_second() -> None:
-    message = by_rosbags(cdr.JOINT_STATE, JointStates(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
+    message = by_rosbags(cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
     assert message.header.stamp.sec == 2**31 - 1

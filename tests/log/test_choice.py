@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from trilat_net.errors import UsageError
-from trilat_net.log.choice import ALL, Choice, choice
-from trilat_net.log.writer import LogWriter
-from trilat_net.net.bus import matches
-from trilat_net.scenario import load
+from trilat_net.log.log_layout import ALL_CHANNELS, ChannelFilter, parse_channel_filter
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.net.bus import matches_key
+from trilat_net.scenario import load_scenario
 
 CHUNKS = st.text("abm1", min_size=1, max_size=3)
 KEYS = st.lists(CHUNKS, min_size=1, max_size=4).map("/".join)
@@ -34,37 +34,39 @@ def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: 
         known = zenoh.KeyExpr(expression)
     except zenoh.ZError:  # another spelling of one that is known
         assume(False)
-    assert matches(expression, key) == known.includes(zenoh.KeyExpr(key))
+    assert matches_key(expression, key) == known.includes(zenoh.KeyExpr(key))
 
 
 @given(include=st.lists(PATTERNS, max_size=2), exclude=st.lists(PATTERNS, max_size=2), key=KEYS)
 def test_taken_is_what_is_included_and_not_excluded(include: list[str], exclude: list[str], key: str) -> None:
-    taken = Choice(tuple(include), tuple(exclude)).takes(key)
+    taken = ChannelFilter(tuple(include), tuple(exclude)).takes(key)
     assert taken == (
-        (not include or any(matches(text, key) for text in include))
-        and not any(matches(text, key) for text in exclude)
+        (not include or any(matches_key(text, key) for text in include))
+        and not any(matches_key(text, key) for text in exclude)
     )
 
 
 @pytest.mark.parametrize("text", ["", "a//b", "a*", "***", "a/$", "a?", "#", "*m1/**"])
 def test_what_is_no_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is a key expression like"):
-        choice([text], [])
+        parse_channel_filter([text], [])
     with pytest.raises(UsageError, match="--exclude is"):
-        choice([], [text])
+        parse_channel_filter([], [text])
 
 
 def test_a_leading_slash_is_fine() -> None:
-    assert choice(["/trilat/**"], ["/**/m$*/link"]) == Choice(("trilat/**",), ("**/m$*/link",))
+    assert parse_channel_filter(["/trilat/**"], ["/**/m$*/link"]) == ChannelFilter(
+        ("trilat/**",), ("**/m$*/link",)
+    )
 
 
 def test_what_is_not_chosen_has_no_channel_and_no_account_and_the_file_says_so() -> None:
     stream = io.BytesIO()
-    chosen = Choice(("trilat/*/m$*/**",), ("**/link",))
-    writer = LogWriter(stream, load("paper"), "lab", "live", 0, choice=chosen)
+    chosen = ChannelFilter(("trilat/*/m$*/**",), ("**/link",))
+    writer = LogWriter(stream, load_scenario("paper"), "lab", "live", 0, choice=chosen)
     kept = [f"trilat/lab/{site}/{channel}" for site in ("m1", "m2") for channel in ("state", "event")]
     assert sorted(writer.keys) == sorted(kept)
-    every = LogWriter(io.BytesIO(), load("paper"), "lab", "live", 0, choice=ALL).keys
+    every = LogWriter(io.BytesIO(), load_scenario("paper"), "lab", "live", 0, choice=ALL_CHANNELS).keys
     for key in every:
         writer.add(key, b"\x80", 0, 0, 0)
     writer.finish({f"/{key}": "received 1" for key in every} | {"dropped: stranger": "3"})

@@ -13,27 +13,32 @@ from mcap.opcode import Opcode
 from tests.log.hostility import chunk
 from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError
-from trilat_net.log import chunks, packed
-from trilat_net.log.chunks import Item, Walk
-from trilat_net.log.framing import HEAD, Frame, Framing
-from trilat_net.log.packed import Unreadable, unpacked
-from trilat_net.scenario import load
-from trilat_net.sim import virtual
+from trilat_net.execution import virtual
+from trilat_net.log import mcap_reader, mcap_records
+from trilat_net.log.mcap_reader import McapMessage, McapReader
+from trilat_net.log.mcap_records import (
+    RECORD_HEAD_BYTES,
+    RecordFrame,
+    RecordScanner,
+    UnreadableRecord,
+    unpack_chunk,
+)
+from trilat_net.scenario import load_scenario
 
 DATA = edited(recorded("paper"), chunk_bytes=4096)
-FRAMES = list(Framing(io.BytesIO(DATA)).frames())
+FRAMES = list(RecordScanner(io.BytesIO(DATA)).frames())
 CHUNKS = [frame for frame in FRAMES if frame.opcode == Opcode.CHUNK]
 
 
-def walked(data: bytes) -> tuple[Walk, list[Item]]:
-    walk = Walk(io.BytesIO(data), "file")
+def walked(data: bytes) -> tuple[McapReader, list[McapMessage]]:
+    walk = McapReader(io.BytesIO(data), "file")
     return walk, list(walk.messages())
 
 
 WALK, ITEMS = walked(DATA)
 
 
-def in_chunk(frame: Frame) -> list[Item]:
+def in_chunk(frame: RecordFrame) -> list[McapMessage]:
     """The messages of one chunk: what is in the file with it, without those without it."""
     _, others = walked(DATA[: frame.offset] + DATA[frame.end :])
     return [item for item in ITEMS if item not in others]
@@ -76,15 +81,17 @@ def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
 def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObject) -> None:
     """A bit that is wrong in the data of a chunk costs that chunk, and no other."""
     frame = CHUNKS[number]
-    head = Framing(io.BytesIO(DATA)).head(frame)
-    place = data.draw(st.integers(frame.offset + HEAD + head.data_offset, frame.end - 1))
+    head = RecordScanner(io.BytesIO(DATA)).head(frame)
+    place = data.draw(st.integers(frame.offset + RECORD_HEAD_BYTES + head.data_offset, frame.end - 1))
     changed = bytearray(DATA)
     changed[place] ^= 1 << data.draw(st.integers(0, 7))
     walk, items = walked(bytes(changed))
     if not walk.damaged:  # a bit that the compression does not look at
         assert items == ITEMS
         return
-    assert [(part.offset, part.length) for part in walk.damaged] == [(frame.offset, HEAD + frame.length)]
+    assert [(part.offset, part.length) for part in walk.damaged] == [
+        (frame.offset, RECORD_HEAD_BYTES + frame.length)
+    ]
     assert walk.complete
     assert [item for item in ITEMS if item not in items] == in_chunk(frame)
 
@@ -92,7 +99,7 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
 @settings(max_examples=60)
 @given(st.sampled_from(FRAMES), st.integers(0, (1 << 64) - 1))
 def test_a_record_that_lies_about_its_length_hides_no_more_than_a_chunk_or_two(
-    frame: Frame, length: int
+    frame: RecordFrame, length: int
 ) -> None:
     """Reading goes on at the next chunk that makes sense, and what is between is named."""
     changed = bytearray(DATA)
@@ -111,14 +118,14 @@ def test_a_record_that_lies_about_its_length_hides_no_more_than_a_chunk_or_two(
 
 def test_a_chunk_unpacks_to_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
     """However it is packed, and whatever it says: nothing is unpacked beyond the limit."""
-    monkeypatch.setattr(packed, "UNPACKED_BYTES", 10_000)
+    monkeypatch.setattr(mcap_records, "MAX_UNPACKED_BYTES", 10_000)
     fine, bomb = bytes(10_000), bytes(1_000_000)
     for compression in ("zstd", "lz4", ""):
-        assert unpacked(chunk(fine, compression=compression)[HEAD:]) == fine
+        assert unpack_chunk(chunk(fine, compression=compression)[RECORD_HEAD_BYTES:]) == fine
     for compression in ("zstd", "lz4"):
         for size in (len(bomb), 10_000, 1 << 62, 0):
-            with pytest.raises(Unreadable):
-                unpacked(chunk(bomb, size=size, compression=compression)[HEAD:])
+            with pytest.raises(UnreadableRecord):
+                unpack_chunk(chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:])
 
 
 @pytest.mark.parametrize("claim", [1 << 40, (1 << 63) - 1])
@@ -126,13 +133,13 @@ def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
     """The sizes inside the compressed data are compared before a byte is set aside for them."""
     zstd = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", claim) + b"\x01\x00\x00"
     head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(zstd))
-    with pytest.raises(Unreadable):
-        unpacked(head + zstd)
+    with pytest.raises(UnreadableRecord):
+        unpack_chunk(head + zstd)
     honest = lz4.frame.compress(bytes(100), store_size=True)
     lz4_ = honest[:6] + struct.pack("<Q", claim) + honest[14:]
     head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 3) + b"lz4" + struct.pack("<Q", len(lz4_))
-    with pytest.raises(Unreadable):
-        unpacked(head + lz4_)
+    with pytest.raises(UnreadableRecord):
+        unpack_chunk(head + lz4_)
 
 
 def test_a_file_that_holds_absurdly_much_is_refused_with_the_place() -> None:
@@ -142,17 +149,17 @@ def test_a_file_that_holds_absurdly_much_is_refused_with_the_place() -> None:
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"):
         walked(data)
-    streaming = Walk(io.BytesIO(data), "file", kept=False)
+    streaming = McapReader(io.BytesIO(data), "file", kept=False)
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 1_500_000
 
 
 def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.MonkeyPatch) -> None:
     """The hands of `outage` do not push before 3 s, and its arms know their weight."""
-    monkeypatch.setattr(chunks, "KEPT_BYTES", 0)
+    monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 0)
     stream = io.BytesIO()
-    virtual.record(load("outage", {"duration_s": 1.0}), stream)
+    virtual.write_virtual_log(load_scenario("outage", {"duration_s": 1.0}), stream)
     stream.seek(0)
-    assert sum(1 for _ in Walk(stream, "log").messages()) > 3000
+    assert sum(1 for _ in McapReader(stream, "log").messages()) > 3000
 
 
 def test_a_chunk_in_a_chunk_is_no_message_and_is_not_looked_into() -> None:
@@ -173,7 +180,11 @@ def test_a_channel_is_what_it_was_first_called() -> None:
     lost = struct.pack("<BQHIQQ", 5, 22, 9, 1, 2, 3)
     data = DATA[: CHUNKS[0].offset] + chunk(channel(7, b"/a") + message + channel(7, b"/b") + message + lost)
     _, items = walked(data)
-    assert items == [Item("/a", b"x", 2, 3, 1), Item("/a", b"x", 2, 3, 1), Item("", b"", 2, 3, 1)]
+    assert items == [
+        McapMessage("/a", b"x", 2, 3, 1),
+        McapMessage("/a", b"x", 2, 3, 1),
+        McapMessage("", b"", 2, 3, 1),
+    ]
 
 
 def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
@@ -188,7 +199,7 @@ def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
 
 def test_progress_is_told_up_to_the_end() -> None:
     told: list[tuple[int, int]] = []
-    list(Walk(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
+    list(McapReader(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
     assert told == sorted(told)
     assert {total for _, total in told} == {len(DATA)}
     assert told[-1][0] >= len(DATA) - 8
@@ -199,4 +210,4 @@ def test_zstd_without_a_size_in_its_frame_is_read() -> None:
     records = bytes(range(256)) * 10
     streamed = zstandard.ZstdCompressor(write_content_size=False).compress(records)
     head = struct.pack("<QQQI", 0, 0, len(records), 0) + struct.pack("<I", 4) + b"zstd"
-    assert unpacked(head + struct.pack("<Q", len(streamed)) + streamed) == records
+    assert unpack_chunk(head + struct.pack("<Q", len(streamed)) + streamed) == records

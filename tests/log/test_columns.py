@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.tick import Mode
+from trilat_net.core.ticks import Mode
 from trilat_net.errors import WireError
-from trilat_net.log import columns
+from trilat_net.log import record_columns
 from trilat_net.log.site_log import SiteLog
 from trilat_net.net.messages import READABLE, STATE_VECTORS, State
 from trilat_net.net.wire import decode
@@ -121,7 +121,7 @@ def test_a_column_with_a_value_that_is_none_is_refused_by_the_sites_name(field: 
 @pytest.mark.parametrize("change", [{"v": 4}, {"v": "3"}, {"tick": -1}, {"tick": 2**40}, {"tick": None}])
 def test_a_record_without_version_or_tick_is_refused_at_once(change: dict[str, object]) -> None:
     with pytest.raises(WireError):
-        columns.ticks([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})])
+        record_columns.decode_ticks([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})])
 
 
 def test_what_nobody_asks_for_is_not_looked_at() -> None:
@@ -133,15 +133,15 @@ def test_what_nobody_asks_for_is_not_looked_at() -> None:
 
 def test_a_payload_that_is_too_long_is_refused() -> None:
     with pytest.raises(WireError, match="oversized"):
-        columns.ticks([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})])
+        record_columns.decode_ticks([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})])
 
 
 def test_records_that_came_out_of_order_are_put_in_order_with_their_times() -> None:
-    from trilat_net.log.site_log import Times
+    from trilat_net.log.site_log import MessageTimes
 
     payloads = [msgpack.packb({**GOOD, "tick": tick}) for tick in (4, 2, 3)]
     came = np.array([40, 20, 30])
-    part = SiteLog("m1", PEERS, 1000, payloads, "log", Times(came, came + 1))
+    part = SiteLog("m1", PEERS, 1000, payloads, "log", MessageTimes(came, came + 1))
     assert part.tick.tolist() == [2, 3, 4]
     assert part.log_time_ns.tolist() == [20, 30, 40]
     assert part.publish_time_ns.tolist() == [21, 31, 41]

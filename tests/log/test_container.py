@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from trilat_net.log.container import Container
+from trilat_net.log.mcap_writer import McapWriter
 
 U64 = st.integers(0, 2**64 - 1)
 TEXTS = st.dictionaries(st.text(max_size=8), st.text(max_size=8), max_size=3)
@@ -33,7 +33,7 @@ def begun(file: Any) -> None:
 
 def ours(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     stream = io.BytesIO()
-    file = Container(stream, "lib", chunk_bytes=chunk_bytes)
+    file = McapWriter(stream, "lib", chunk_bytes=chunk_bytes)
     begun(file)
     for name, *arguments in calls:
         getattr(file, name)(*arguments)
@@ -99,7 +99,7 @@ def test_the_same_calls_give_the_same_bytes_and_a_stream_reads_them_in_order(
 
 def test_a_channel_that_comes_later_stands_before_the_messages_that_wait() -> None:
     stream = io.BytesIO()
-    file = Container(stream, "lib")
+    file = McapWriter(stream, "lib")
     begun(file)
     file.add_message(1, 5, b"x", 5)
     late = file.register_channel("/late", "json", 0)
@@ -112,7 +112,7 @@ def test_a_channel_that_comes_later_stands_before_the_messages_that_wait() -> No
 
 def test_the_index_of_a_chunk_takes_bytes_and_no_objects() -> None:
     """Memory: 36 000 chunks an hour must be some megabytes."""
-    file = Container(io.BytesIO(), "lib")
+    file = McapWriter(io.BytesIO(), "lib")
     schema = file.register_schema("S", "jsonschema", b"{}")
     channels = [file.register_channel(f"/{n}", "msgpack", schema) for n in range(12)]
     before = file.owed
@@ -125,4 +125,4 @@ def test_the_index_of_a_chunk_takes_bytes_and_no_objects() -> None:
 
 def test_a_message_of_no_channel_is_refused() -> None:
     with pytest.raises(KeyError):
-        Container(io.BytesIO(), "lib").add_message(1, 0, b"", 0)
+        McapWriter(io.BytesIO(), "lib").add_message(1, 0, b"", 0)

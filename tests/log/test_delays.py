@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from tests.log_editing import edited
-from trilat_net.core.grid import first_tick_at, tick_ns
-from trilat_net.core.site import Site
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError
-from trilat_net.log.delays import measured_rows
-from trilat_net.scenario import load
-from trilat_net.scenario.traces import points_of
-from trilat_net.sim import virtual
-from trilat_net.sim.network import RecordedNetwork
+from trilat_net.execution import virtual
+from trilat_net.execution.virtual_network import RecordedNetwork
+from trilat_net.log.log_reader import read_link_delays
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.delay_traces import parse_trace
 
 TICKS = 400
 OVERRIDES: dict[str, Any] = {"duration_s": TICKS / 1000, "sites.m2.rate_hz": 333, "link.delay_ms": 50.0}
@@ -31,7 +31,7 @@ def delay_us(peer: str, site: str, tick: int) -> int:
 
 def log_bytes() -> bytes:
     """A session in which every sample of every link but the lost ones came after its known delay."""
-    scenario = load("paper", OVERRIDES)
+    scenario = load_scenario("paper", OVERRIDES)
     peers = {name: scenario.peers(name) for name in scenario.names}
     schedule: dict[str, dict[int, list[list[int]]]] = {name: {} for name in scenario.names}
     for site in scenario.names:
@@ -45,7 +45,7 @@ def log_bytes() -> bytes:
                 if tick == 60:  # and once more, later
                     schedule[site].setdefault(at + 9, []).append([index, tick, us + 9000])
     stream = io.BytesIO()
-    virtual.record(scenario, stream, RecordedNetwork(schedule, peers))
+    virtual.write_virtual_log(scenario, stream, RecordedNetwork(schedule, peers))
     return stream.getvalue()
 
 
@@ -65,7 +65,7 @@ def path(data: bytes, tmp_path: Path) -> Path:
 def test_every_sample_has_the_delay_that_its_receiver_recorded(path: Path, peer: str, site: str) -> None:
     """By its own stamp; lost ones as infinity, negative ones as none, the shorter of two."""
     rate_hz = 333 if peer == "m2" else 1000
-    rows = dict(measured_rows(path, f"{peer}->{site}"))
+    rows = dict(read_link_delays(path, f"{peer}->{site}"))
     known = (TICKS - 41) * rate_hz // 1000  # some that were sent later were under way at the end
     for tick in range(known):
         delay_ms = rows.pop((tick * 10**9 // rate_hz // 1000) / 1e6)
@@ -78,7 +78,7 @@ def test_every_sample_has_the_delay_that_its_receiver_recorded(path: Path, peer:
 def test_a_link_that_replays_a_log_gives_each_sample_its_measured_delay(path: Path, rate_hz: int) -> None:
     """In [link] each link reads its own; to the microsecond, at any rate."""
     link = {"model": "trace", "file": str(path)}
-    scenario = load("paper", {**OVERRIDES, "link": link})
+    scenario = load_scenario("paper", {**OVERRIDES, "link": link})
     peer = "m2" if rate_hz == 333 else "m1"
     setup = scenario.setup("s")
     index = scenario.peers("s").index(peer)
@@ -94,17 +94,17 @@ def test_a_link_that_replays_a_log_gives_each_sample_its_measured_delay(path: Pa
 
 def test_each_link_names_the_links_delays_that_it_wants(path: Path) -> None:
     shared = {"model": "trace", "file": str(path), "at_end": "loop"}
-    links = load("paper", {**OVERRIDES, "link": shared, "links.m1->s": {"of": "s->m1"}}).links
+    links = load_scenario("paper", {**OVERRIDES, "link": shared, "links.m1->s": {"of": "s->m1"}}).links
     texts = {name: link.trace for name, link in links.items()}
     assert len(set(texts.values())) == 5
     assert texts["m1->s"] == texts["s->m1"]
-    assert points_of(texts["m1->s"])[0, 1] == delay_us("s", "m1", 0)
+    assert parse_trace(texts["m1->s"])[0, 1] == delay_us("s", "m1", 0)
 
 
 def test_a_scenario_that_ran_does_not_need_the_log_again(path: Path) -> None:
-    scenario = load("paper", {**OVERRIDES, "link": {"model": "trace", "file": str(path)}})
+    scenario = load_scenario("paper", {**OVERRIDES, "link": {"model": "trace", "file": str(path)}})
     path.unlink()
-    assert load(scenario, {"seed": 1}) == scenario
+    assert load_scenario(scenario, {"seed": 1}) == scenario
     assert "run.mcap" not in scenario.text
 
 
@@ -113,7 +113,7 @@ def test_what_may_stand_in_records_that_are_missing_is_left_out(data: bytes, pat
     path.write_bytes(
         edited(data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r)
     )
-    rows = measured_rows(path, "m1->s")
+    rows = read_link_delays(path, "m1->s")
     ticks = {round(t_s * 1000): delay_ms for t_s, delay_ms in rows}
     assert {tick for tick, delay_ms in ticks.items() if math.isinf(delay_ms)} == LOST
     came_in = {t: first_tick_at(t * 10**6 + delay_us("m1", "s", t) * 1000, 1000) for t in range(350)}
@@ -129,7 +129,7 @@ def test_a_link_that_the_log_does_not_have_is_named_with_the_nearest(
     path: Path, link: str, words: str
 ) -> None:
     with pytest.raises(ValueError, match="no link") as error:
-        measured_rows(path, link)
+        read_link_delays(path, link)
     assert words in str(error.value)
 
 
@@ -139,18 +139,18 @@ def test_a_link_over_which_nothing_came_has_no_delays(data: bytes, path: Path) -
 
     path.write_bytes(edited(data, record=silent))
     with pytest.raises(ValueError, match="nothing came over m1->s"):
-        measured_rows(path, "m1->s")
+        read_link_delays(path, "m1->s")
 
 
 @pytest.mark.parametrize("content", [b"", b"t_s,delay_ms\n0,1\n", b"\x89MCAP0\r\n"])
 def test_a_file_that_is_no_log_is_refused_with_the_keys_path(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "run.mcap").write_bytes(content)
     with pytest.raises(ScenarioError) as error:
-        load("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
+        load_scenario("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
     assert error.value.path == "link.file"
 
 
 def test_a_log_that_is_not_there_is_refused_with_the_keys_path(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="No such file") as error:
-        load("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}})
+        load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}})
     assert error.value.path == "links.m1->s.file"

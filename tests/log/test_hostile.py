@@ -22,12 +22,11 @@ from mcap.opcode import Opcode
 
 from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
 from tests.log_editing import edited, opened, recorded
-from trilat_net.analysis.overview import overview
+from trilat_net.analysis.file_overview import describe_files
 from trilat_net.errors import LogError, ScenarioError
-from trilat_net.log.framing import Framing
-from trilat_net.log.packed import unpacked
-from trilat_net.replay.verify import verify
-from trilat_net.scenario import embedded, load
+from trilat_net.execution.verify import verify
+from trilat_net.log.mcap_records import RecordScanner, unpack_chunk
+from trilat_net.scenario import load_scenario, parse_embedded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
 DATA = edited(recorded("paper", SHORT), chunk_bytes=4096)
@@ -61,9 +60,9 @@ def test_several_changes_at_once(seed: int) -> None:
 def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
     """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
     log = edited(WHOLE, scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"))
-    framing = Framing(io.BytesIO(log))
+    framing = RecordScanner(io.BytesIO(log))
     first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
-    inside, names = unpacked(framing.content(first)), b""
+    inside, names = unpack_chunk(framing.content(first)), b""
     channel, at = 0, 0
     while at < len(inside):
         opcode, length = struct.unpack_from("<BQ", inside, at)
@@ -154,26 +153,26 @@ def test_a_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
 )
 def test_a_scenario_of_a_stranger_is_refused_in_a_sentence(text: str, problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem):
-        embedded(text)
+        parse_embedded(text)
 
 
 def test_a_scenario_in_a_log_names_no_file() -> None:
     """It is resolved; a name in it would have the reader open what a stranger likes."""
     constant = re.compile(r'model = "constant"\ndelay_ms = [0-9.]+\n')
-    text = constant.sub('model = "trace"\nfile = "/dev/zero"\n', load("paper").text, count=1)
+    text = constant.sub('model = "trace"\nfile = "/dev/zero"\n', load_scenario("paper").text, count=1)
     with pytest.raises(ScenarioError, match="no file may be named here"):
-        embedded(text)
+        parse_embedded(text)
 
 
 def test_a_trace_that_stands_for_many_links_is_refused() -> None:
     """Written out it would fill the memory; a scenario that ran has every link's own."""
-    text = load("paper").text
+    text = load_scenario("paper").text
     head, _, links = text.partition("[links.")
     points = ", ".join(f"{n} 1" for n in range(0, 90_000, 3))
     assert links
     text = head + f'[link]\nmodel = "trace"\ntrace = "{points}"\n'
     with pytest.raises(ScenarioError, match="not written out"):
-        embedded(text)
+        parse_embedded(text)
 
 
 def test_links_that_would_fill_the_memory_are_refused() -> None:
@@ -182,13 +181,13 @@ def test_links_that_would_fill_the_memory_are_refused() -> None:
     sites = "".join(f"[sites.{name}]\n" for name in names)
     rows = "".join(f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names))
     text = f"name = 'x'\nrate_hz = 20000\n[link]\ndelay_ms = 1.0\n{sites}{rows}"
-    assert embedded(text.replace("20000", "1000")).names == tuple(names)
+    assert parse_embedded(text.replace("20000", "1000")).names == tuple(names)
     with pytest.raises(ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"):
-        embedded(text)
+        parse_embedded(text)
 
 
 def test_json_of_anything_is_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
     path.write_bytes(edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62}))
-    json.dumps(overview([path]), allow_nan=False)
+    json.dumps(describe_files([path]), allow_nan=False)

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from tests.log.dealt import Message, a_file, changed, dealt, messages
 from tests.log_editing import opened, recorded
 from trilat_net.errors import LogError
-from trilat_net.log.reader import Log, open_log
-from trilat_net.log.writer import LogWriter
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import encode
-from trilat_net.replay.verify import verify
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 
 @cache
@@ -104,7 +104,7 @@ def test_parts_that_tell_the_same_differently_are_refused_by_their_names(
         ({"session": "lab"}, None, "session lab, not paper"),
         ({"epoch_unix_ns": "7"}, None, "epoch_unix_ns 7, not 0"),
         ({"driver": "live"}, None, "driver live, not virtual"),
-        ({}, load("free").text, "scenario [0-9a-f]{16}, not "),
+        ({}, load_scenario("free").text, "scenario [0-9a-f]{16}, not "),
     ],
 )
 def test_files_of_different_sessions_are_refused_with_what_differs(
@@ -150,7 +150,7 @@ def test_an_unfinished_end_leaves_the_whole_incomplete() -> None:
 def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
     """A part that a recorder wrote, with what it counted so far."""
     stream = io.BytesIO()
-    scenario = load("free")
+    scenario = load_scenario("free")
     writer = LogWriter(stream, scenario, "lab", "live", 10**18, part={"index": str(part), "previous": ""})
     stats = RecorderStats(boot=recorder, t_ns=at_ns, expected={}, received={}, missing={})
     event = Event(member="recorder", boot=recorder, kind="late", text="late", n=0)

@@ -14,23 +14,23 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from tests.log_editing import edited, opened, recorded
-from trilat_net.core.fingerprint import fingerprint
+from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
-from trilat_net.log.reader import open_log
-from trilat_net.log.writer import LogWriter
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogWriter
 from trilat_net.net.wire import encode_state
-from trilat_net.scenario import load, shipped
-from trilat_net.sim import virtual
+from trilat_net.scenario import list_shipped, load_scenario
 
 TICKS = 120
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
         stream = io.BytesIO()
-        virtual.record(load(name, {"duration_s": 0.3}), stream)
+        virtual.write_virtual_log(load_scenario(name, {"duration_s": 0.3}), stream)
         digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
     assert len(digests) == 1
 
@@ -47,12 +47,12 @@ def test_there_is_no_path_and_no_wall_clock_in_a_virtual_log() -> None:
 
 
 def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
-    scenario = load("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
+    scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
     sent = {
         (site.name, output.tick): encode_state(
             site.name, virtual.virtual_boot(scenario, site.name), site.peers, output, arrivals, 0, 0
         )
-        for site, arrivals, output in virtual.run(scenario)
+        for site, arrivals, output in virtual.execute_virtual(scenario)
     }
     reader = make_reader(io.BytesIO(recorded("paper")), validate_crcs=True)
     found = 0
@@ -103,12 +103,12 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
     reader = make_reader(io.BytesIO(recorded("paper")))
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     session = metadata["trilat.session"]
-    scenario = load("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
+    scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
     assert session["driver"] == "virtual"
     assert session["epoch_unix_ns"] == "0"
     assert session["scenario_sha256"] == scenario.sha256
     assert session["seed"] == "1"
-    assert session["fingerprint"] == fingerprint()
+    assert session["fingerprint"] == compute_fingerprint()
     assert {"commit", "python", "platform", "version_numpy", "version_trilat-net"} <= set(session)
     (attachment,) = reader.iter_attachments()
     assert (attachment.name, attachment.data.decode()) == ("scenario.toml", scenario.text)
@@ -124,16 +124,16 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
 def test_session_and_scenario_stand_before_the_first_message() -> None:
     """So that they survive a crash right after the start."""
     stream = io.BytesIO()
-    LogWriter(stream, load("free"), "lab", "live", 10**18)
+    LogWriter(stream, load_scenario("free"), "lab", "live", 10**18)
     log = opened(stream.getvalue())
-    assert log.scenario == load("free")
+    assert log.scenario == load_scenario("free")
     assert (log.driver, log.complete, log.accounts) == ("live", False, {})
     assert len(log["m1"]) == 0
 
 
 def test_a_live_log_counts_from_its_epoch() -> None:
     stream = io.BytesIO()
-    writer = LogWriter(stream, load("free"), "lab", "live", 10**18, {"mood": "calm"})
+    writer = LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, {"mood": "calm"})
     key = "trilat/lab/m1/state"
     assert key in writer.keys
     assert "trilat/lab/stranger/state" not in writer.keys
@@ -237,7 +237,7 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
     writer = Writer(stream)
     writer.start()
     writer.add_metadata("trilat.session", {})
-    writer.add_attachment(0, 0, "scenario.toml", "application/toml", load("free").text.encode())
+    writer.add_attachment(0, 0, "scenario.toml", "application/toml", load_scenario("free").text.encode())
     writer.finish()
     with pytest.raises(LogError):
         len(opened(stream.getvalue())["m1"])
@@ -276,4 +276,4 @@ class FullDisk(io.BytesIO):
 
 def test_a_disk_that_is_full_is_a_log_error() -> None:
     with pytest.raises(LogError, match="No space left"):
-        virtual.record(load("paper", {"duration_s": 5.0}), FullDisk())
+        virtual.write_virtual_log(load_scenario("paper", {"duration_s": 5.0}), FullDisk())

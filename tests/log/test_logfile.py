@@ -17,11 +17,18 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from trilat_net.errors import LogRefused, NothingSaved, UsageError
-from trilat_net.log import logfile, syncing
-from trilat_net.log.ballast import STEP_BYTES, Ballast
-from trilat_net.log.logfile import MARGIN_BYTES, LogFile, active, closing_log, new_log
-from trilat_net.log.recover import recover
-from trilat_net.log.syncing import SYNC_NS
+from trilat_net.log import log_file
+from trilat_net.log.log_file import (
+    RESERVE_MARGIN_BYTES,
+    RESERVE_STEP_BYTES,
+    SYNC_PERIOD_NS,
+    DiskReserve,
+    LogFile,
+    close_log_file,
+    open_new_log,
+)
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.recover import recover_log
 
 from .disks import Sent, SmallDisk, begun, file_on, sent
 
@@ -41,7 +48,7 @@ def messages(path: Path) -> list[Sent]:
 
 def test_a_log_has_its_name_when_it_is_whole_and_not_before(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with new_log(path) as file:
+    with open_new_log(path) as file:
         container = begun(file)
         container.add_message(1, 0, b"x", 0)
         container.flush()
@@ -58,11 +65,11 @@ def test_what_is_flushed_is_in_the_file_and_what_is_not_is_not(tmp_path: Path) -
     container = begun(file)
     for n, message in enumerate(sent(5)):
         container.add_message(*message)
-        before = active(path).stat().st_size
+        before = active_path(path).stat().st_size
         assert before == file.size
         container.flush()
-        assert active(path).stat().st_size > before
-        with active(path).open("rb") as stream:
+        assert active_path(path).stat().st_size > before
+        with active_path(path).open("rb") as stream:
             found = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
         assert sum(isinstance(record, Message) for record in found) == container.messages == n + 1
     file.close()
@@ -72,7 +79,7 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
     path = tmp_path / "run.mcap"
 
     def fail() -> None:
-        with new_log(path) as file:
+        with open_new_log(path) as file:
             begun(file).add_message(1, 0, b"x", 0)
             _ = 1 / 0
 
@@ -81,16 +88,16 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
     with (
         pytest.raises(UsageError, match=r"never finished.*trilat log recover .*run\.mcap\.active"),
-        new_log(path),
+        open_new_log(path),
     ):
         pass
-    with new_log(path, force=True) as file:
+    with open_new_log(path, force=True) as file:
         begun(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
 
 def test_a_file_into_which_nothing_was_written_is_not_there(tmp_path: Path) -> None:
-    with new_log(tmp_path / "run.mcap") as file:
+    with open_new_log(tmp_path / "run.mcap") as file:
         file.write(b"not flushed")
     assert list(tmp_path.iterdir()) == []
 
@@ -100,10 +107,10 @@ def test_what_exists_is_replaced_only_when_asked_and_only_when_the_new_one_is_wh
     path.write_bytes(b"precious")
     with (
         pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"),
-        new_log(path),
+        open_new_log(path),
     ):
         pass
-    with new_log(path, force=True) as file:
+    with open_new_log(path, force=True) as file:
         container = begun(file)
         assert path.read_bytes() == b"precious"
         container.finish()
@@ -114,14 +121,14 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
 
     def write() -> None:
-        with new_log(path) as file:
+        with open_new_log(path) as file:
             begun(file).finish()
             path.write_bytes(b"precious")
 
     with pytest.raises(UsageError, match=r"exists by now; the finished log is .*run\.mcap\.active"):
         write()
     assert path.read_bytes() == b"precious"
-    assert messages(active(path)) == []
+    assert messages(active_path(path)) == []
 
 
 def test_where_there_are_no_links_a_log_gets_its_name_all_the_same(
@@ -131,7 +138,7 @@ def test_where_there_are_no_links_a_log_gets_its_name_all_the_same(
         raise OSError(errno.EPERM, "no links here")
 
     monkeypatch.setattr(os, "link", link)
-    with new_log(tmp_path / "run.mcap") as file:
+    with open_new_log(tmp_path / "run.mcap") as file:
         begun(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
@@ -148,9 +155,9 @@ def test_a_file_that_cannot_be_made_is_bad_input(name: str, tmp_path: Path) -> N
 @pytest.fixture
 def unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of files, of which none need survive the loss of power; and little room for accounts."""
-    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)
-    monkeypatch.setattr(logfile, "MARGIN_BYTES", 1000)
+    monkeypatch.setattr(log_file, "RESERVE_MARGIN_BYTES", 1000)
 
 
 @in_this_folder
@@ -159,7 +166,7 @@ def test_a_disk_that_takes_little_at_a_time_takes_all(count: int, most: int, tmp
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     wanted = sent(count)
-    with closing_log(file_on(SmallDisk(1 << 20, most=most), path)) as file:
+    with close_log_file(file_on(SmallDisk(1 << 20, most=most), path)) as file:
         container = begun(file)
         for message in wanted:
             container.add_message(*message)
@@ -198,7 +205,7 @@ def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_give
     for capacity in range(4000, 7000, 5):
         disk = SmallDisk(capacity)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, closing_log(file_on(disk, path)) as file:
+        with pytest.raises(LogRefused) as refusal, close_log_file(file_on(disk, path)) as file:
             recorded(file, wanted, flushed)
         text = str(refusal.value)
         assert refusal.value.exit_code == 5
@@ -207,7 +214,7 @@ def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_give
         found = messages(path)
         assert found == wanted[: len(flushed) + CHUNK]
         assert f"{len(found)} other messages" in text
-        assert not active(path).exists()
+        assert not active_path(path).exists()
         seen.add(len(found))
         path.unlink()
     assert len(seen) > 4  # the chunk that did not fit was not always the same
@@ -221,26 +228,26 @@ def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
     """At every byte of a chunk and of the end: cut where the last flush ended."""
     path = tmp_path / "run.mcap"
     wanted = sent(3 * CHUNK)
-    with closing_log(file_on(SmallDisk(1 << 20), path)) as file:
+    with close_log_file(file_on(SmallDisk(1 << 20), path)) as file:
         recorded(file, wanted, [])
     whole = path.stat().st_size
     path.unlink()
     head = 200
     for capacity in range(head, whole, 3 if error == errno.ENOSPC else 97):
-        active(path).unlink(missing_ok=True)
+        active_path(path).unlink(missing_ok=True)
         disk = SmallDisk(capacity, error)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, closing_log(file_on(disk, path, room=False)) as file:
+        with pytest.raises(LogRefused) as refusal, close_log_file(file_on(disk, path, room=False)) as file:
             recorded(file, wanted, flushed)
         assert refusal.value.exit_code == 5
         assert not path.exists()
-        assert active(path).stat().st_size == file.size
-        assert f"trilat log recover {active(path)}" in str(refusal.value)
+        assert active_path(path).stat().st_size == file.size
+        assert f"trilat log recover {active_path(path)}" in str(refusal.value)
         if not flushed:
             with pytest.raises(NothingSaved):
-                recover(active(path))
+                recover_log(active_path(path))
             continue
-        assert recover(active(path)).lossless
+        assert recover_log(active_path(path)).lossless
         assert messages(path) == flushed
         path.unlink()
 
@@ -253,7 +260,7 @@ def test_room_is_kept_for_what_is_pending_and_for_the_end(tmp_path: Path) -> Non
         container.add_message(*message)
     before = file.size
     container.flush()
-    assert disk.kept >= file.size - before + container.owed + MARGIN_BYTES
+    assert disk.kept >= file.size - before + container.owed + RESERVE_MARGIN_BYTES
     container.finish()
     file.close()
     assert disk.kept == 0
@@ -269,10 +276,10 @@ def test_a_real_ballast_takes_room_that_nobody_sees_and_gives_it_back(
                 raise OSError(errno.EOPNOTSUPP, "not here")
 
             monkeypatch.setattr(os, "posix_fallocate", refuse)
-        ballast = Ballast(tmp_path)
+        ballast = DiskReserve(tmp_path)
         ballast.grow(1)
-        ballast.grow(STEP_BYTES + 1)
-        assert ballast.size == 2 * STEP_BYTES
+        ballast.grow(RESERVE_STEP_BYTES + 1)
+        assert ballast.size == 2 * RESERVE_STEP_BYTES
         assert ballast._file is not None
         assert os.fstat(ballast._file.fileno()).st_blocks * 512 >= ballast.size
         assert list(tmp_path.iterdir()) == []
@@ -286,7 +293,7 @@ def test_a_folder_that_takes_no_ballast_does_without(tmp_path: Path, monkeypatch
         raise OSError(errno.EACCES, "not here")
 
     monkeypatch.setattr(os, "posix_fallocate", refuse)
-    ballast = Ballast(tmp_path)
+    ballast = DiskReserve(tmp_path)
     ballast.grow(1)
     assert ballast.size == 0
 
@@ -295,12 +302,12 @@ LIMITED = """
 import os, resource, sys
 from pathlib import Path
 from trilat_net.errors import LogRefused
-from trilat_net.log.container import Container
-from trilat_net.log.logfile import new_log
+from trilat_net.log.mcap_writer import McapWriter
+from trilat_net.log.log_file import open_new_log
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 try:
-    with new_log(Path(sys.argv[1])) as file:
-        container = Container(file, "lib")
+    with open_new_log(Path(sys.argv[1])) as file:
+        container = McapWriter(file, "lib")
         channel = container.register_channel("/a", "msgpack", 0)
         try:
             for n in range(10_000):
@@ -318,9 +325,9 @@ def test_a_file_that_is_as_long_as_it_may_be_is_cut_at_a_chunk_and_recovered(tmp
     path = tmp_path / "run.mcap"
     done = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60)
     assert done.returncode == 5, done
-    assert f"{active(path)}: the file system takes no longer file" in done.stdout
+    assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
     assert "--split-size" in done.stdout
-    assert recover(active(path)).lossless
+    assert recover_log(active_path(path)).lossless
     assert [message[1] for message in messages(path)] == list(range(len(messages(path))))
     assert len(messages(path)) > 900
 
@@ -332,10 +339,10 @@ def test_what_is_flushed_is_synced_every_second_and_with_durable_every_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
-    monkeypatch.setattr(syncing, "_datasync", synced.append)
+    monkeypatch.setattr(log_file, "_datasync", synced.append)
     for durable, expected in ((False, 3), (True, 31)):
         synced.clear()
-        times_ns = iter(range(0, 1000 * SYNC_NS, SYNC_NS // 10))
+        times_ns = iter(range(0, 1000 * SYNC_PERIOD_NS, SYNC_PERIOD_NS // 10))
         file = LogFile(tmp_path / f"{durable}.mcap", durable=durable, now_ns=times_ns.__next__)
         for _ in range(31):
             file.write(b"x")
@@ -351,12 +358,12 @@ def test_a_disk_that_refuses_what_it_had_taken_ends_the_log(
     def refuse(_: int) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(syncing, "_datasync", refuse)
+    monkeypatch.setattr(log_file, "_datasync", refuse)
     path = tmp_path / "run.mcap"
-    times_ns = iter(range(0, 1000 * SYNC_NS, SYNC_NS))
+    times_ns = iter(range(0, 1000 * SYNC_PERIOD_NS, SYNC_PERIOD_NS))
 
     def write() -> None:
-        with closing_log(LogFile(path, now_ns=times_ns.__next__)) as file:
+        with close_log_file(LogFile(path, now_ns=times_ns.__next__)) as file:
             recorded(file, sent(100), [])
 
     with pytest.raises(LogRefused, match="the disk fails; the log ends there, finished, with") as refusal:
@@ -370,10 +377,10 @@ def test_a_disk_that_refuses_what_it_had_taken_ends_the_log(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from trilat_net.log.logfile import LogFile
-from trilat_net.log.container import Container
+from trilat_net.log.log_file import LogFile
+from trilat_net.log.mcap_writer import McapWriter
 file = LogFile(Path(sys.argv[1]))
-container = Container(file, "lib")
+container = McapWriter(file, "lib")
 channel = container.register_channel("/a", "msgpack", 0)
 container.flush()
 for n in range(int(sys.argv[2])):
@@ -389,6 +396,6 @@ def test_what_was_flushed_survives_a_kill(count: int, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     done = subprocess.run([sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    result = recover(active(path))
+    result = recover_log(active_path(path))
     assert result.lossless
     assert [message[2] for message in messages(path)] == [b"%d" % n for n in range(count // 7 * 7)]

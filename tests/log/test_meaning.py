@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from trilat_net.log.meaning import meanings
+from trilat_net.log.data_tables import read_field_docs
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
 
 KINDS = (State, LinkStats, Event, RecorderStats)
@@ -11,7 +11,7 @@ KINDS = (State, LinkStats, Event, RecorderStats)
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_field_has_a_meaning(kind: type[msgspec.Struct]) -> None:
-    said = meanings(kind)
+    said = read_field_docs(kind)
     assert list(said) == list(kind.__struct_fields__)
     for field, (_, text, json_type) in said.items():
         assert len(text) > 5, field
@@ -22,13 +22,13 @@ def test_every_field_has_a_meaning(kind: type[msgspec.Struct]) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_name_that_ends_in_a_unit_has_that_unit(kind: type[msgspec.Struct]) -> None:
     units = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
-    for field, (unit, _, _) in meanings(kind).items():
+    for field, (unit, _, _) in read_field_docs(kind).items():
         if ending := units.get(field.rpartition("_")[2]):
             assert unit == ending, field
 
 
 def test_units_are_the_schemas() -> None:
-    said = meanings(State)
+    said = read_field_docs(State)
     assert [said[field].unit for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x")] == [
         "rad", "rad/s", "rad", "rad/s", "N m", "N m",
     ]  # fmt: skip

@@ -15,8 +15,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from trilat_net.core.tick import Mode
-from trilat_net.log.reader import Log, open_log
+from trilat_net.core.ticks import Mode
+from trilat_net.log.log_reader import Log, open_log
 
 from .programs import PYMCAP, RERUN, printed, rerun_faults
 from .standard_files import EPOCH_NS, KINDS, SCENARIO, made, outputs

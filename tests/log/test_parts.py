@@ -11,20 +11,18 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.log import logfile
-from trilat_net.log.choice import ALL
-from trilat_net.log.container import Sink
-from trilat_net.log.logfile import LogFile
-from trilat_net.log.names import existing, part_path
-from trilat_net.log.parts import LogParts, Storage, storage
-from trilat_net.log.reader import open_log
-from trilat_net.log.writer import LogWriter
+from trilat_net.log import log_file
+from trilat_net.log.log_file import LogFile
+from trilat_net.log.log_layout import ALL_CHANNELS, find_parts, part_path
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, make_log_storage
+from trilat_net.log.mcap_writer import Sink
 from trilat_net.net import topics
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .disks import SmallDisk, file_on
 
-SCENARIO = load("two_sites")
+SCENARIO = load_scenario("two_sites")
 KEYS = [topics.key("t", site, channel) for site in ("m", "s") for channel in ("state", "event")]
 Message = tuple[str, bytes, int, int]
 """Key, payload, log time, sequence."""
@@ -32,7 +30,7 @@ Message = tuple[str, bytes, int, int]
 
 @pytest.fixture(autouse=True)
 def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
@@ -53,7 +51,7 @@ def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
     return found, metadata
 
 
-def written(place: Storage, messages: list[Message], flush_every: int = 7) -> None:
+def written(place: LogStorage, messages: list[Message], flush_every: int = 7) -> None:
     with LogParts(place, begin) as log:
         log.so_far = lambda: {"so far": "yes"}
         for n, (key, payload, log_ns, number) in enumerate(messages):
@@ -91,9 +89,9 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
     for n, (key, length, step_ns) in enumerate(steps):
         log_ns += step_ns
         messages.append((key, os.urandom(length), log_ns, n))
-    place = Storage(path, split_bytes=size, split_ns=duration_ns)
+    place = LogStorage(path, split_bytes=size, split_ns=duration_ns)
     written(place, messages)
-    parts = existing(path)
+    parts = find_parts(path)
     if not place.splits:
         assert list(tmp_path.iterdir()) == [path]
         assert read(path)[0] == messages
@@ -120,7 +118,7 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
 def test_a_part_opens_as_a_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80" * 900, 10**18 + k * 10**8, k) for k in range(40)]
     path = tmp_path / "run.mcap"
-    written(Storage(path, split_ns=10**9), messages)
+    written(LogStorage(path, split_ns=10**9), messages)
     names = ["run-001.mcap", "run-002.mcap", "run-003.mcap", "run-004.mcap"]
     assert [part.name for part in sorted(tmp_path.iterdir())] == names
     for name in names:
@@ -149,7 +147,7 @@ def test_to_continue_is_to_write_the_next_part(
 ) -> None:
     for name in there:
         (tmp_path / name).write_bytes(b"precious")
-    place = Storage(tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None)
+    place = LogStorage(tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None)
     written(place, [(KEYS[0], b"\x80", 10**18, 0)])
     _, metadata = read(tmp_path / expected)
     assert metadata.get("trilat.part", {}).get("previous") == previous
@@ -160,30 +158,30 @@ def test_to_continue_is_to_write_the_next_part(
 @pytest.mark.parametrize("there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"])
 def test_a_name_that_is_taken_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_bytes(b"precious")
-    place = Storage(tmp_path / "run.mcap", split_ns=1)
+    place = LogStorage(tmp_path / "run.mcap", split_ns=1)
     with pytest.raises(UsageError, match=f"{there}.* exists.*--force"):
         LogParts(place, begin)
     assert (tmp_path / there).read_bytes() == b"precious"
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
-    written(Storage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
+    written(LogStorage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
     assert [path.name for path in sorted(tmp_path.iterdir())] == [f"run-00{n}.mcap" for n in (1, 2, 3)]
 
 
 def test_a_log_without_parts_leaves_the_parts_of_others_alone(tmp_path: Path) -> None:
     (tmp_path / "run-002.mcap").write_bytes(b"precious")
     for force in (False, True):
-        written(Storage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)])
+        written(LogStorage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)])
     assert (tmp_path / "run-002.mcap").read_bytes() == b"precious"
 
 
 @pytest.mark.parametrize("name", ["run[1].mcap", "a*b.mcap", "run", "r?n.bag.mcap"])
 def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
-    place = Storage(tmp_path / name, split_ns=1)
+    place = LogStorage(tmp_path / name, split_ns=1)
     (tmp_path / "run1-001.mcap").write_bytes(b"")
     written(place, messages)
-    assert sorted(existing(place.path)) == [1, 2, 3]
-    assert [message for path in existing(place.path).values() for message in read(path)[0]] == messages
+    assert sorted(find_parts(place.path)) == [1, 2, 3]
+    assert [message for path in find_parts(place.path).values() for message in read(path)[0]] == messages
 
 
 @pytest.mark.parametrize(
@@ -198,7 +196,9 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
 def test_what_cannot_be_meant_is_refused(options: dict[str, Any], problem: str, tmp_path: Path) -> None:
     asked: dict[str, Any] = {"split_mib": None, "split_s": None, "force": False, "carry_on": False, **options}
     with pytest.raises(UsageError, match=problem):
-        storage(tmp_path / "run.mcap", choice=ALL, durable=False, views_hz=0.0, **asked).first()
+        make_log_storage(
+            tmp_path / "run.mcap", choice=ALL_CHANNELS, durable=False, views_hz=0.0, **asked
+        ).first()
 
 
 def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:
@@ -211,7 +211,7 @@ def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]
         return file_on(disks[-1], part)
 
     def record() -> None:
-        with LogParts(Storage(path, split_ns=5 * 10**8), begin, opened) as log:
+        with LogParts(LogStorage(path, split_ns=5 * 10**8), begin, opened) as log:
             try:
                 for message in messages:
                     key, payload, log_ns, number = message
@@ -235,13 +235,13 @@ def test_a_disk_that_is_full_at_a_seam_keeps_the_parts_before(tmp_path: Path) ->
     for room in range(80_000, 200_000, 2900):
         path = cleared(tmp_path)
         taken = recorded_on(room, path, messages)
-        found = [message for _, part in sorted(existing(path).items()) for message in read(part)[0]]
+        found = [message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]]
         assert found == taken
         assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
 
 
 def test_who_adds_after_the_end_is_told(tmp_path: Path) -> None:
-    with LogParts(Storage(tmp_path / "run.mcap"), begin) as log:
+    with LogParts(LogStorage(tmp_path / "run.mcap"), begin) as log:
         log.finish({})
         assert log.ended
         with pytest.raises(LogRefused, match="is finished"):

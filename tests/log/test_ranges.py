@@ -5,14 +5,14 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.log.ranges import Ranges
+from trilat_net.log.accounting import RangeSet
 
 APPENDED = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 5)), max_size=12)
 """Distance from the range before, and how many numbers."""
 
 
-def filled(parts: list[tuple[int, int]], most: int = 1000) -> tuple[Ranges, set[int]]:
-    ranges, numbers, end = Ranges(most), set[int](), 0
+def filled(parts: list[tuple[int, int]], most: int = 1000) -> tuple[RangeSet, set[int]]:
+    ranges, numbers, end = RangeSet(most), set[int](), 0
     for apart, count in parts:
         first = end + apart
         end = first + count
@@ -21,7 +21,7 @@ def filled(parts: list[tuple[int, int]], most: int = 1000) -> tuple[Ranges, set[
     return ranges, numbers
 
 
-def inside(ranges: Ranges) -> set[int]:
+def inside(ranges: RangeSet) -> set[int]:
     return {number for first, last in ranges for number in range(first, last + 1)}
 
 

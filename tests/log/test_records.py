@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.log import records
-from trilat_net.log.records import ByTick, Records
+from trilat_net.log import site_log
+from trilat_net.log.site_log import LazyRecords, RecordsByTick
 from trilat_net.net.messages import STATE_VECTORS, State
 
 EMPTY = State(
@@ -28,8 +28,8 @@ def decoded(payloads: Sequence[bytes]) -> list[State]:
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records, "BLOCK", 4)
-    monkeypatch.setattr(records, "HELD", 8)
+    monkeypatch.setattr(site_log, "BLOCK_RECORDS", 4)
+    monkeypatch.setattr(site_log, "MAX_DECODED_RECORDS", 8)
 
 
 counts = st.integers(0, 30)
@@ -39,7 +39,7 @@ counts = st.integers(0, 30)
 def test_records_are_the_list_of_them(count: int, looks: list[int | slice]) -> None:
     payloads = [str(n).encode() for n in range(count)]
     every = decoded(payloads)
-    some = Records(payloads, decoded)
+    some = LazyRecords(payloads, decoded)
     assert (len(some), list(some), list(reversed(some))) == (count, every, every[::-1])
     for look in looks:
         try:
@@ -58,21 +58,21 @@ def test_only_the_blocks_looked_at_last_are_held() -> None:
         asked.append(int(payloads[0]))
         return decoded(payloads)
 
-    some = Records([str(n).encode() for n in range(16)], counted)
+    some = LazyRecords([str(n).encode() for n in range(16)], counted)
     for n in (0, 1, 4, 0, 8, 0, 4):  # 4 was looked at longest ago when 8 came
         assert some[n].tick == n
     assert asked == [0, 4, 8, 4]
 
 
 def test_few_records_are_a_list() -> None:
-    assert isinstance(records.records([b"1"] * 8, decoded), list)
-    assert isinstance(records.records([b"1"] * 9, decoded), Records)
+    assert isinstance(site_log.decode_records([b"1"] * 8, decoded), list)
+    assert isinstance(site_log.decode_records([b"1"] * 9, decoded), LazyRecords)
 
 
 @given(st.lists(st.integers(0, 20), max_size=20).map(sorted))
 def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
     states = [msgspec.structs.replace(state(tick), late_us=n) for n, tick in enumerate(ticks)]
-    by_tick = ByTick(states, np.array(ticks, dtype=np.int64))
+    by_tick = RecordsByTick(states, np.array(ticks, dtype=np.int64))
     assert dict(by_tick) == {s.tick: s for s in states}
     assert len(by_tick) == len(set(ticks))
     assert [by_tick.get(tick) for tick in range(-1, 22)] == [

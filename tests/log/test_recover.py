@@ -21,12 +21,12 @@ from mcap.writer import CompressionType, Writer
 from tests.cli.running import trilat
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError, NothingSaved, UsageError
-from trilat_net.log import logfile
-from trilat_net.log.container import Container
-from trilat_net.log.names import active
-from trilat_net.log.reader import open_log
-from trilat_net.log.recover import Recovery, recover, recovered_path
-from trilat_net.replay.verify import verify
+from trilat_net.execution.verify import verify
+from trilat_net.log import log_file
+from trilat_net.log.log_layout import active_path
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.mcap_writer import McapWriter
+from trilat_net.log.recover import Recovery, recover_log, recovered_path
 
 anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 positions = st.floats(0, 1, exclude_max=True)
@@ -34,7 +34,7 @@ positions = st.floats(0, 1, exclude_max=True)
 
 @pytest.fixture(autouse=True)
 def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logfile, "sync_folder", lambda _: None)
+    monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
@@ -86,7 +86,7 @@ def log() -> bytes:
     data = recorded("paper")
     reader = make_reader(io.BytesIO(data))
     stream = io.BytesIO()
-    file = Container(stream, "lib", chunk_bytes=8000)
+    file = McapWriter(stream, "lib", chunk_bytes=8000)
     channels: dict[str, int] = {}
     schemas: dict[str, int] = {}
     for entry in reader.iter_metadata():
@@ -129,7 +129,7 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
         path.unlink()
     path = folder / name
     path.write_bytes(data)
-    result = recover(path)
+    result = recover_log(path)
     assert path.read_bytes() == data
     assert sorted(folder.iterdir()) == sorted({path, result.output})
     return result, result.output.read_bytes()
@@ -385,11 +385,11 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
     torn.write_bytes(log()[:-100])
     (tmp_path / "run.mcap").write_bytes(b"precious")
     with pytest.raises(UsageError, match=r"run\.mcap: exists"):
-        recover(torn)
+        recover_log(torn)
     with pytest.raises(UsageError, match="is the file itself"):
-        recover(torn, torn, force=True)
+        recover_log(torn, torn, force=True)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
-    recover(torn, force=True)
+    recover_log(torn, force=True)
     assert messages((tmp_path / "run.mcap").read_bytes()) == messages(log())
     assert torn.read_bytes() == log()[:-100]
 
@@ -399,10 +399,10 @@ def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(NothingSaved, match="there is nothing in it that could be saved"):
-        recover(path)
+        recover_log(path)
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(LogError, match="cannot be read"):
-        recover(tmp_path)
+        recover_log(tmp_path)
 
 
 # The command.
@@ -440,7 +440,7 @@ def test_the_exit_code_says_what_came_of_it(
     assert facts["lossless"] == (code == 0)
     assert facts["output"] == "other.mcap"
     assert facts["messages"] == len(messages((tmp_path / "other.mcap").read_bytes()))
-    assert not active(tmp_path / "other.mcap").exists()
+    assert not active_path(tmp_path / "other.mcap").exists()
     trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses("run.mcap: exists", "--force")
 
 

@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 
 from tests.log_editing import edited, opened, recorded
 from trilat_net.errors import LogError
-from trilat_net.log.ros2 import export_ros2
+from trilat_net.reporting.ros2_bag import export_ros2
 
 RECORDS = 3 * 120
 

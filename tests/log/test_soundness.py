@@ -18,16 +18,14 @@ from mcap.writer import Writer
 from tests.log.hostility import chunk
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError
+from trilat_net.execution.verify import verify
 from trilat_net.log.accounting import Account
-from trilat_net.log.chunks import Walk
-from trilat_net.log.framing import HEAD, MAGIC, Frame, Framing
-from trilat_net.log.packed import unpacked
-from trilat_net.log.parts import LogParts, Storage
-from trilat_net.log.reader import open_log
-from trilat_net.log.recover import recover
-from trilat_net.log.soundness import Soundness, soundness
-from trilat_net.log.writer import LogWriter
-from trilat_net.replay.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
+from trilat_net.log.mcap_reader import McapReader
+from trilat_net.log.mcap_records import MAGIC, RECORD_HEAD_BYTES, RecordFrame, RecordScanner, unpack_chunk
+from trilat_net.log.recover import recover_log
+from trilat_net.log.session_check import LogCheckResult, check_log
 
 WHOLE = recorded("paper")
 DATA = edited(WHOLE, chunk_bytes=8192)
@@ -35,20 +33,20 @@ BUILT = {"whole", "checksums", "records", "index"}
 OURS = {"sequence", "accounts", "schema", "times", "rates", "scenario"}
 
 
-def judged(folder: Path, *files: bytes) -> Soundness:
+def judged(folder: Path, *files: bytes) -> LogCheckResult:
     paths = []
     for n, data in enumerate(files):
         paths.append(folder / f"part{n}.mcap")
         paths[-1].write_bytes(data)
-    return soundness(paths)
+    return check_log(paths)
 
 
-def failed(found: Soundness) -> set[str]:
+def failed(found: LogCheckResult) -> set[str]:
     return {finding.check for finding in found.findings if not finding.passed}
 
 
-def frames(data: bytes, opcode: int) -> list[Frame]:
-    return [frame for frame in Framing(io.BytesIO(data)).frames() if frame.opcode == opcode]
+def frames(data: bytes, opcode: int) -> list[RecordFrame]:
+    return [frame for frame in RecordScanner(io.BytesIO(data)).frames() if frame.opcode == opcode]
 
 
 def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
@@ -57,7 +55,7 @@ def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
     return bytes(changed)
 
 
-def cut_out(data: bytes, frame: Frame) -> bytes:
+def cut_out(data: bytes, frame: RecordFrame) -> bytes:
     return data[: frame.offset] + data[frame.end :]
 
 
@@ -69,7 +67,7 @@ def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
     assert {finding.check for finding in found.findings} == BUILT | OURS
 
 
-def first(opcode: int) -> Frame:
+def first(opcode: int) -> RecordFrame:
     return frames(DATA, opcode)[0]
 
 
@@ -82,19 +80,31 @@ WRONG: dict[str, tuple[bytes, set[str]]] = {
     "without its last mark": (DATA[:-8], {"whole"}),
     "more behind the end": (DATA + b"more", {"whole"}),
     "a byte of a chunk": (poked(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records", "sequence"}),
-    "the checksum of a chunk": (poked(DATA, CHUNK.offset + HEAD + 24), {"checksums", "sequence"}),
+    "the checksum of a chunk": (
+        poked(DATA, CHUNK.offset + RECORD_HEAD_BYTES + 24),
+        {"checksums", "sequence"},
+    ),
     "a byte of the scenario": (poked(DATA, first(Opcode.ATTACHMENT).end - 99), {"checksums", "index"}),
-    "a number in the statistics": (poked(DATA, STATISTICS.offset + HEAD), {"index", "checksums"}),
-    "the place of a chunk": (poked(DATA, CHUNK_INDEX.offset + HEAD + 16), {"index", "checksums"}),
-    "the length of a chunk": (poked(DATA, CHUNK_INDEX.offset + HEAD + 24), {"index", "checksums"}),
-    "the place of metadata": (
-        poked(DATA, first(Opcode.METADATA_INDEX).offset + HEAD),
+    "a number in the statistics": (
+        poked(DATA, STATISTICS.offset + RECORD_HEAD_BYTES),
         {"index", "checksums"},
     ),
-    "where the index begins": (poked(DATA, FOOTER.offset + HEAD), {"index", "checksums"}),
+    "the place of a chunk": (
+        poked(DATA, CHUNK_INDEX.offset + RECORD_HEAD_BYTES + 16),
+        {"index", "checksums"},
+    ),
+    "the length of a chunk": (
+        poked(DATA, CHUNK_INDEX.offset + RECORD_HEAD_BYTES + 24),
+        {"index", "checksums"},
+    ),
+    "the place of metadata": (
+        poked(DATA, first(Opcode.METADATA_INDEX).offset + RECORD_HEAD_BYTES),
+        {"index", "checksums"},
+    ),
+    "where the index begins": (poked(DATA, FOOTER.offset + RECORD_HEAD_BYTES), {"index", "checksums"}),
     "the checksum of the index": (poked(DATA, FOOTER.end - 1), {"checksums"}),
     "an entry of a message index": (poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1), {"index"}),
-    "the times of a chunk": (poked(DATA, CHUNK.offset + HEAD + 8), {"index"}),
+    "the times of a chunk": (poked(DATA, CHUNK.offset + RECORD_HEAD_BYTES + 8), {"index"}),
 }
 
 
@@ -114,7 +124,7 @@ def test_no_bit_of_a_file_can_be_changed_unseen(place: int, bit: int) -> None:
     """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
     found = _of(poked(WHOLE, place, 1 << bit))
     frame = next((f for f in _FRAMES if f.offset <= place < f.end), None)
-    inside = place - (frame.offset + HEAD) if frame is not None else 0
+    inside = place - (frame.offset + RECORD_HEAD_BYTES) if frame is not None else 0
     free = frame is not None and (
         # the header's words, the entries of metadata, and a CRC of 0 for "none" are under no checksum
         frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.DATA_END)
@@ -125,10 +135,10 @@ def test_no_bit_of_a_file_can_be_changed_unseen(place: int, bit: int) -> None:
     assert free or not found.passed
 
 
-_FRAMES = list(Framing(io.BytesIO(WHOLE)).frames())
+_FRAMES = list(RecordScanner(io.BytesIO(WHOLE)).frames())
 
 
-def _of(data: bytes) -> Soundness:
+def _of(data: bytes) -> LogCheckResult:
     with tempfile.TemporaryDirectory() as folder:
         return judged(Path(folder), data)
 
@@ -198,7 +208,7 @@ def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
 def split(folder: Path, *, refilled: range) -> list[Path]:
     """A log in three parts, into which some records of `s` came later than others, out of its memory."""
     scenario = opened(WHOLE).scenario
-    items = [item for item in Walk(io.BytesIO(WHOLE), "log").messages() if item.topic]
+    items = [item for item in McapReader(io.BytesIO(WHOLE), "log").messages() if item.topic]
     kept_back = [i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled]
     items = [item for item in items if item not in kept_back]
     items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
@@ -207,7 +217,7 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     def told() -> dict[str, str]:
         return {topic: account.as_text() for topic, account in accounts.items()}
 
-    place = Storage(folder / "run.mcap", split_ns=40_000_000)
+    place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
     now_ns = 0
     with LogParts(
         place, lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part)
@@ -226,7 +236,7 @@ def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
     """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
     parts = split(tmp_path, refilled=range(30, 50))
     assert len(parts) >= 3
-    found = soundness(parts)
+    found = check_log(parts)
     assert found.passed, found.findings
     assert "20 came late" in next(f.text for f in found.findings if f.check == "sequence")
     verdict = verify(open_log(*parts))
@@ -236,8 +246,8 @@ def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
 def test_a_part_alone_is_judged_from_where_it_begins(tmp_path: Path) -> None:
     """What came before is in the parts before; what it lacks itself is missing all the same."""
     parts = split(tmp_path, refilled=range(0))
-    assert soundness(parts[1:2]).passed
-    first_and_last = soundness([parts[0], parts[2]])
+    assert check_log(parts[1:2]).passed
+    first_and_last = check_log([parts[0], parts[2]])
     assert failed(first_and_last) == {"sequence", "accounts"}
     assert verify(open_log(parts[0], parts[2])).gaps
 
@@ -246,9 +256,9 @@ def test_a_recovered_file_is_sound_but_for_what_was_lost(tmp_path: Path) -> None
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(DATA[: len(DATA) // 2])
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
-        made = recover(torn).output
-    assert "whole" in failed(soundness([torn]))
-    found = soundness([made])
+        made = recover_log(torn).output
+    assert "whole" in failed(check_log([torn]))
+    found = check_log([made])
     assert failed(found) & BUILT == set(), found.findings
     assert "accounts" not in failed(found), found.findings
     verdict = verify(open_log(made))
@@ -276,7 +286,7 @@ def test_a_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
 
 def test_what_a_chunk_may_not_hold_is_told(tmp_path: Path) -> None:
     """A chunk in a chunk, a message of no channel, a channel that is two things."""
-    records = unpacked(Framing(io.BytesIO(DATA)).content(CHUNK))
+    records = unpack_chunk(RecordScanner(io.BytesIO(DATA)).content(CHUNK))
     lost = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)
     for more, text in ((lost, "channel 999"), (chunk(b""), "kind 6")):
         new = chunk(records + more)
@@ -292,7 +302,7 @@ def test_what_is_no_mcap_file_is_not_sound(data: bytes, tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
-        soundness([tmp_path / "none.mcap"])
+        check_log([tmp_path / "none.mcap"])
 
 
 def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ import pytest
 from tests.analysis import logs
 from tests.log.dealt import a_file, changed, messages
 from tests.log_editing import edited, opened, recorded
-from trilat_net.core.grid import NS_PER_S
+from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError
-from trilat_net.log.reader import Log
-from trilat_net.log.table import SUFFIXES, Column, named
-from trilat_net.log.tables import all_tables
+from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, add_unit_suffix, iterate_tables
+from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats
 
 
@@ -29,7 +28,7 @@ LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.si
 @pytest.mark.parametrize("which", LOGS)
 def test_names_are_unique_end_in_their_unit_and_every_column_says_what_it_is(which: str) -> None:
     log = LOGS[which]()
-    for table in all_tables(log):
+    for table in iterate_tables(log):
         names = [column.name for column in table.columns]
         assert len(set(names)) == len(names)
         for column in table.columns:
@@ -39,7 +38,8 @@ def test_names_are_unique_end_in_their_unit_and_every_column_says_what_it_is(whi
             assert column.source
             if column.unit and column.unit != "tick":
                 assert (
-                    column.name.split("_", 1)[-1].endswith(SUFFIXES[column.unit]) or column.name in SUFFIXES
+                    column.name.split("_", 1)[-1].endswith(UNIT_SUFFIXES[column.unit])
+                    or column.name in UNIT_SUFFIXES
                 )
 
 
@@ -170,11 +170,11 @@ def test_times_are_the_files() -> None:
 
 
 def test_a_name_has_its_unit_once() -> None:
-    assert named("q1", "rad") == "q1_rad"
-    assert named("late_us", "us") == "late_us"
-    assert named("tick", "tick") == "tick"
-    assert named("slew_ppb", "ns/s") == "slew_ppb"
-    assert named("kind", "") == "kind"
+    assert add_unit_suffix("q1", "rad") == "q1_rad"
+    assert add_unit_suffix("late_us", "us") == "late_us"
+    assert add_unit_suffix("tick", "tick") == "tick"
+    assert add_unit_suffix("slew_ppb", "ns/s") == "slew_ppb"
+    assert add_unit_suffix("kind", "") == "kind"
 
 
 def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:

@@ -17,16 +17,16 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from trilat_net.core.tick import Mode, Output
-from trilat_net.log.envelope import columns_of, envelope
-from trilat_net.log.views import FULL, Views
-from trilat_net.log.writer import LogWriter
+from trilat_net.core.ticks import Mode, TickRecord
+from trilat_net.execution import virtual
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.ros2.ros2_messages import stack_signals
+from trilat_net.log.ros2.viz_channels import FULL_RATE_HZ, VizChannels, decimate_min_max
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode_state
-from trilat_net.scenario import Scenario, load
-from trilat_net.sim import virtual
+from trilat_net.scenario import Scenario, load_scenario
 
-SCENARIO = load("two_sites", {"duration_s": 0.5})
+SCENARIO = load_scenario("two_sites", {"duration_s": 0.5})
 KEY = "trilat/lab/m/state"
 EPOCH_NS = 1_700_000_000_000_000_000
 BUCKET = 20  # ticks of a site at 1 kHz, at 100 Hz
@@ -50,7 +50,7 @@ class Desk:
 
     def __init__(self, views_hz: float, scenario: Scenario = SCENARIO, epoch_ns: int = 0) -> None:
         self.seen: list[Seen] = []
-        self.views = Views(scenario, "lab", epoch_ns, views_hz, self._put)
+        self.views = VizChannels(scenario, "lab", epoch_ns, views_hz, self._put)
 
     def _put(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
         channel = self.views.channels[topic]
@@ -71,9 +71,9 @@ class Desk:
 def decoder_of(kind: str) -> Any:
     from mcap.records import Schema
 
-    from trilat_net.log import cdr
+    from trilat_net.log.ros2 import cdr
 
-    schema = Schema(id=1, name=kind, encoding="ros2msg", data=cdr.SCHEMAS[kind])
+    schema = Schema(id=1, name=kind, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[kind])
     return DecoderFactory().decoder_for("cdr", schema)
 
 
@@ -89,23 +89,23 @@ def numbers_of(kind: str, data: bytes) -> list[float]:
     return list(message.data)
 
 
-def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> Output:
+def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRecord:
     """A record whose numbers are these, from q to theta_hat."""
     n = iter(numbers)
     vectors = [[next(n) for _ in range(size)] for size in (2, 2, 2, 2, 2, 2, 5)]
     q, qd, q_des, qd_des, tau, tau_x, theta_hat = vectors
-    return Output(tick, tick * 10**6, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, [-1], 0, [], [])
+    return TickRecord(tick, tick * 10**6, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, [-1], 0, [], [])
 
 
-def joint_row(one: Output) -> list[float]:
+def joint_row(one: TickRecord) -> list[float]:
     return [x for name in CURVES for x in getattr(one, name)]
 
 
-def error_row(one: Output) -> list[float]:
+def error_row(one: TickRecord) -> list[float]:
     return [a - b for a, b in zip(one.q, one.q_des, strict=True)]
 
 
-def slow_row(one: Output) -> list[float]:
+def slow_row(one: TickRecord) -> list[float]:
     return [*one.tau_x, *one.theta_hat, float(one.mode)]
 
 
@@ -132,14 +132,14 @@ def test_the_envelope_of_a_column_is_its_extremes_in_the_order_in_which_they_cam
     rows: list[list[float]],
 ) -> None:
     columns = list(zip(*rows, strict=True))
-    first, second = envelope(columns)
+    first, second = decimate_min_max(columns)
     for a, b, column in zip(first, second, columns, strict=True):
         assert {a, b} == {min(column), max(column)}
         assert column.index(a) <= column.index(b)
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> list[Output]:
+def runs(draw: st.DrawFn) -> list[TickRecord]:
     """Some ticks of a second, in any order, with small or arbitrary numbers."""
     ticks = draw(st.lists(st.integers(0, 450), unique=True, min_size=1, max_size=120))
     if draw(st.booleans()):
@@ -152,15 +152,15 @@ def runs(draw: st.DrawFn) -> list[Output]:
     ]
 
 
-def buckets(records: Iterable[Output], length: int) -> dict[int, list[Output]]:
-    by: dict[int, list[Output]] = defaultdict(list)
+def buckets(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
+    by: dict[int, list[TickRecord]] = defaultdict(list)
     for one in records:
         by[one.tick // length].append(one)
     return by
 
 
 @given(runs())
-def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: list[Output]) -> None:
+def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: list[TickRecord]) -> None:
     """In whatever order the records come."""
     desk = Desk(100.0)
     desk.take(records)
@@ -184,7 +184,7 @@ def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: lis
 
 
 @given(runs())
-def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records: list[Output]) -> None:
+def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
     desk.finish()
@@ -199,7 +199,7 @@ def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records
 
 
 @given(runs(), st.randoms(use_true_random=False))
-def test_disorder_within_a_bucket_does_not_show(records: list[Output], chance: random.Random) -> None:
+def test_disorder_within_a_bucket_does_not_show(records: list[TickRecord], chance: random.Random) -> None:
     in_order = sorted(records, key=lambda one: one.tick)
     shuffled = sorted(in_order, key=lambda one: (one.tick // BUCKET, chance.random()))
     desks = Desk(100.0), Desk(100.0)
@@ -243,21 +243,21 @@ def test_a_live_recorder_sees_one_message_every_ten_ms_on_either_clock() -> None
     assert [s.log_ns for s in seen] == list(range(20, 1000, 10))
 
 
-@pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL])
+@pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL_RATE_HZ])
 def test_full_is_every_record_as_it_was(views_hz: float) -> None:
     records = [record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
     desk = Desk(views_hz)
     desk.take(records)
     desk.finish()
     assert joint_arrays(desk) == [(one.t_ns, joint_row(one)) for one in records]
-    if views_hz == FULL:
+    if views_hz == FULL_RATE_HZ:
         assert slow_arrays(desk) == [(one.t_ns, slow_row(one)) for one in records]
 
 
 @given(runs())
-def test_a_record_of_the_wire_and_one_of_the_simulation_look_the_same(records: list[Output]) -> None:
+def test_a_record_of_the_wire_and_one_of_the_simulation_look_the_same(records: list[TickRecord]) -> None:
     states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
-    assert columns_of(states) == columns_of(records)
+    assert stack_signals(states) == stack_signals(records)
 
 
 def test_what_waits_is_bounded_by_the_bucket_and_not_by_the_silence() -> None:
@@ -328,7 +328,7 @@ def test_an_event_before_the_epoch_has_the_time_of_its_arrival() -> None:
 
 def recorded(views_hz: float, name: str = "paper") -> bytes:
     stream = io.BytesIO()
-    virtual.record(load(name, {"duration_s": 0.5}), stream, views_hz=views_hz)
+    virtual.write_virtual_log(load_scenario(name, {"duration_s": 0.5}), stream, views_hz=views_hz)
     return stream.getvalue()
 
 
@@ -366,8 +366,8 @@ def test_a_log_without_views_has_no_channel_of_them() -> None:
 
 def test_a_part_ends_with_all_that_it_has_seen() -> None:
     """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
-    scenario = load("two_sites", {"duration_s": 0.2})
-    outputs = [step.output for step in virtual.run(scenario) if step.site.name == "m"]
+    scenario = load_scenario("two_sites", {"duration_s": 0.2})
+    outputs = [step.output for step in virtual.execute_virtual(scenario) if step.site.name == "m"]
     shown = []
     for part in (outputs[:77], outputs[77:]):
         stream = io.BytesIO()
@@ -388,7 +388,7 @@ def test_a_part_ends_with_all_that_it_has_seen() -> None:
 
 
 def test_a_site_with_an_odd_rate_is_shown_no_less_often_than_asked() -> None:
-    scenario = load("two_sites", {"sites.m.rate_hz": 333})
+    scenario = load_scenario("two_sites", {"sites.m.rate_hz": 333})
     desk = Desk(100.0, scenario)
     desk.take(record(k, [0.0] * 17) for k in range(333))
     desk.finish()

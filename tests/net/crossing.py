@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from trilat_net.net.offset import Limit
+from trilat_net.net.offset import OffsetLimit
 
 S = 1_000_000_000
 Delay = Callable[[random.Random], int]
@@ -32,19 +32,19 @@ class Other:
         return round(own_ns + self.offset(own_ns))
 
 
-def ceiling(other: Other, sent_ns: int, delay_ns: int) -> Limit:
+def ceiling(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
     """What a message from here says that took so long."""
-    return Limit(sent_ns, other.reads(sent_ns + delay_ns) - sent_ns)
+    return OffsetLimit(sent_ns, other.reads(sent_ns + delay_ns) - sent_ns)
 
 
-def floor(other: Other, sent_ns: int, delay_ns: int) -> Limit:
+def floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
     """What a message from there says that was sent at an instant of the own clock and took so long."""
-    return Limit(sent_ns + delay_ns, other.reads(sent_ns) - sent_ns - delay_ns)
+    return OffsetLimit(sent_ns + delay_ns, other.reads(sent_ns) - sent_ns - delay_ns)
 
 
 def second(
     other: Other, begin_ns: int, there: Delay, back: Delay, rnd: random.Random, messages: int = 50
-) -> tuple[Limit, Limit]:
+) -> tuple[OffsetLimit, OffsetLimit]:
     """The tightest of a second of messages both ways, all of which have come before it is over."""
     ceilings, floors = [], []
     for n in range(messages):

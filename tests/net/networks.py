@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from trilat_net.net.bus import Bus, LocalNetwork
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus, read_zenoh_file
 
 from .certificates import Certificates
@@ -41,7 +41,7 @@ class Mesh:
 
     def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
         self.own = own
-        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in free_endpoints(SEATS)]
+        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)]
         self._members: list[Bus] = []
 
     def join(self) -> Bus:
@@ -60,7 +60,7 @@ class Routed:
     """Zenoh sessions that reach a router and nothing else."""
 
     def __init__(self) -> None:
-        self._endpoints = free_endpoints(1)
+        self._endpoints = find_free_endpoints(1)
         self._router = ZenohBus(self._endpoints, mode="router")
         self._members: list[Bus] = []
 

@@ -9,9 +9,9 @@ from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, ManualClock
+from trilat_net.net.membership import EventPublisher
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.session import Epoch, Joining
-from trilat_net.net.voice import Voice
+from trilat_net.net.session import Epoch, SessionJoin
 from trilat_net.net.wire import decode
 
 SESSION = "t"
@@ -44,8 +44,8 @@ class Member:
         self.info = info
         self.bus = bus
         self.epoch: Epoch | None = None
-        self.voice = Voice(bus, SESSION, info)
-        self.joining = Joining(bus, clock, SESSION, self.voice, sites)
+        self.voice = EventPublisher(bus, SESSION, info)
+        self.joining = SessionJoin(bus, clock, SESSION, self.voice, sites)
 
     def poll(self) -> None:
         """One round of what a process does: join, and once it has the epoch, answer."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.clock import Clock, ManualClock, SkewedClock, SystemClock, system_clock
+from trilat_net.net.clock import Clock, ManualClock, SkewedClock, SystemClock, make_system_clock
 
 CLOCKS = {
     "system": SystemClock,
@@ -130,6 +130,6 @@ def test_a_skewed_clock_says_how_it_is_skewed_and_is_no_other_clock() -> None:
 
 
 def test_the_machines_clock_is_skewed_only_where_it_is_asked_for() -> None:
-    assert type(system_clock()) is SystemClock
-    clock = system_clock(1.5, -20.5)
+    assert type(make_system_clock()) is SystemClock
+    clock = make_system_clock(1.5, -20.5)
     assert "skewed by 1500000000 ns and -20500 ns/s since" in clock.identity()

@@ -4,17 +4,22 @@ import pytest
 
 from trilat_net.errors import SessionError, UsageError
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.connection import Connection, member_connection, open_bus, router_connection
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import (
+    Connection,
+    find_free_endpoints,
+    open_bus,
+    resolve_member_connection,
+    resolve_router_connection,
+)
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.net.zenoh_file import ZenohFile, understood
+from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
 
 HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
 A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"
 
 
 def file(**stated: object) -> ZenohFile:
-    return understood("mine.json5", stated, lambda _: "")
+    return check_zenoh_file("mine.json5", stated, lambda _: "")
 
 
 def member(
@@ -23,7 +28,7 @@ def member(
     routers: list[str] | None = None,
     own: ZenohFile | None = None,
 ) -> Connection:
-    return member_connection(listen, connect, routers, own, HERE, THERE)
+    return resolve_member_connection(listen, connect, routers, own, HERE, THERE)
 
 
 def test_who_names_nothing_is_on_this_machine() -> None:
@@ -89,13 +94,15 @@ def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
 
 
 def test_a_router_listens_where_it_is_told_and_may_connect_to_others() -> None:
-    assert router_connection(None, None, None, HERE) == Connection(HERE, (), "router", {})
-    assert router_connection([A], [B], file(mode="router"), HERE) == Connection([A], [B], "router", {})
+    assert resolve_router_connection(None, None, None, HERE) == Connection(HERE, (), "router", {})
+    assert resolve_router_connection([A], [B], file(mode="router"), HERE) == Connection(
+        [A], [B], "router", {}
+    )
     places = {"router": [C], "peer": [B]}
-    assert router_connection(None, None, file(listen={"endpoints": places}), HERE).listen == [C]
+    assert resolve_router_connection(None, None, file(listen={"endpoints": places}), HERE).listen == [C]
     for mode in ("peer", "client"):
         with pytest.raises(UsageError, match=f"mine.json5: mode: {mode} must be router here"):
-            router_connection(None, None, file(mode=mode), HERE)
+            resolve_router_connection(None, None, file(mode=mode), HERE)
 
 
 class Answering(ManualClock):
@@ -118,7 +125,7 @@ class Answering(ManualClock):
 
 
 def test_a_router_that_comes_later_is_waited_for() -> None:
-    endpoints = free_endpoints(1)
+    endpoints = find_free_endpoints(1)
     clock, said = Answering(endpoints, comes_after=3), []
     bus = open_bus(Connection((), endpoints, "client"), clock, clock.stopped, 5.0, said.append)
     assert bus is not None
@@ -130,7 +137,7 @@ def test_a_router_that_comes_later_is_waited_for() -> None:
 
 
 def test_a_router_that_never_comes_is_said_and_a_signal_ends_the_waiting() -> None:
-    endpoints = free_endpoints(2)
+    endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     connection = Connection((), endpoints, "client")
     with pytest.raises(SessionError, match=f"no router answers at {', '.join(endpoints)} within 1 s"):
@@ -141,7 +148,7 @@ def test_a_router_that_never_comes_is_said_and_a_signal_ends_the_waiting() -> No
 
 
 def test_a_peer_waits_for_nobody() -> None:
-    endpoints = free_endpoints(2)
+    endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     bus = open_bus(Connection(endpoints[:1], endpoints[1:]), clock, clock.stopped, 0.0, lambda _: None)
     assert bus is not None

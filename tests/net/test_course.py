@@ -5,13 +5,12 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.net.course import BEND_NS, Course
-from trilat_net.net.offset import Estimate, OffsetEstimator, known
+from trilat_net.net.offset import SLEW_NS, OffsetEstimate, OffsetEstimator, SlewedOffset, exact_offset
 
 from .crossing import Other, S, queueing, second
 
 estimates = st.builds(
-    lambda offset_ns, drift, below, above: Estimate(
+    lambda offset_ns, drift, below, above: OffsetEstimate(
         0, offset_ns, drift, offset_ns - below, offset_ns + above, drift - 1000, drift + 1000
     ),
     st.integers(-(10**15), 10**15),
@@ -22,23 +21,23 @@ estimates = st.builds(
 
 
 @given(st.lists(st.tuples(estimates, st.integers(1, 3 * S)), min_size=1, max_size=6))
-def test_it_is_continuous_whatever_estimates_come_and_when(bends: list[tuple[Estimate, int]]) -> None:
-    course, now_ns = Course(known(5)), 0
+def test_it_is_continuous_whatever_estimates_come_and_when(bends: list[tuple[OffsetEstimate, int]]) -> None:
+    course, now_ns = SlewedOffset(exact_offset(5)), 0
     for estimate, passed_ns in bends:
         now_ns += passed_ns
         before = course.at(now_ns)
         course.bend(now_ns, estimate._replace(at_ns=now_ns))
         assert abs(course.at(now_ns) - before) <= 1 + abs(estimate.offset_ns - before) * 1e-12
-        for at_ns in (now_ns, now_ns + BEND_NS // 3, now_ns + BEND_NS, now_ns + 2 * BEND_NS):
+        for at_ns in (now_ns, now_ns + SLEW_NS // 3, now_ns + SLEW_NS, now_ns + 2 * SLEW_NS):
             steps = [course.at(at_ns + n) for n in range(3)]
-            assert max(steps) - min(steps) <= 3 + 3 * abs(estimate.offset_ns - before) / BEND_NS
+            assert max(steps) - min(steps) <= 3 + 3 * abs(estimate.offset_ns - before) / SLEW_NS
 
 
 @given(estimates)
-def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: Estimate) -> None:
-    course = Course(known(0))
+def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstimate) -> None:
+    course = SlewedOffset(exact_offset(0))
     course.bend(0, estimate)
-    for at_ns in (BEND_NS, 2 * BEND_NS, 10 * BEND_NS):
+    for at_ns in (SLEW_NS, 2 * SLEW_NS, 10 * SLEW_NS):
         assert abs(course.at(at_ns) - estimate.offset_at(at_ns)) <= 2
 
 
@@ -50,7 +49,7 @@ def test_the_truth_is_inside_its_bound_at_every_instant(seed: int, offset_ns: in
     estimator.add(*second(other, 0, queueing(300, 1000), queueing(50, 1000), rnd, 3))
     first = estimator.estimate(S)
     assert first is not None
-    course, now_ns = Course(first), S
+    course, now_ns = SlewedOffset(first), S
     for silence in (False,) * 8 + (True,):
         for _ in range(20):
             at_ns = now_ns + rnd.randrange(60 * S if silence else 3 * S)
@@ -61,11 +60,11 @@ def test_the_truth_is_inside_its_bound_at_every_instant(seed: int, offset_ns: in
         assert estimate is not None
         bent_ns = now_ns + rnd.randrange(1_000_000)
         course.bend(bent_ns, estimate)
-        assert course.bound_at(bent_ns + BEND_NS) == course.bound_ns
+        assert course.bound_at(bent_ns + SLEW_NS) == course.bound_ns
         now_ns = bent_ns
 
 
 def test_of_one_clock_it_is_exact_for_ever() -> None:
-    course = Course(known(0))
+    course = SlewedOffset(exact_offset(0))
     assert [course.at(at_ns) for at_ns in (-S, 0, 10**16)] == [0, 0, 0]
     assert [course.bound_at(at_ns) for at_ns in (0, 10**16)] == [0, 0]

@@ -4,11 +4,11 @@ import socket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.endpoints import (
+from trilat_net.net.connection import (
+    choose_session_endpoints,
     default_endpoint,
     default_endpoints,
-    free_endpoints,
-    session_endpoints,
+    find_free_endpoints,
 )
 
 NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=40)
@@ -44,7 +44,7 @@ def test_most_sessions_do_not_share_ports() -> None:
 
 
 def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
-    endpoints = free_endpoints(8)
+    endpoints = find_free_endpoints(8)
     assert len(set(endpoints)) == 8
     sockets = [socket.socket() for _ in endpoints]
     try:
@@ -59,10 +59,10 @@ def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
     """So that `trilat set` and `trilat ping` find it without being told."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
-    assert session_endpoints("endpoints-test", sites) == places
+    assert choose_session_endpoints("endpoints-test", sites) == places
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port(places[1])))
         taken.listen()
-        others = session_endpoints("endpoints-test", sites)
+        others = choose_session_endpoints("endpoints-test", sites)
     assert len(set(others)) == 3
     assert not set(others) & set(places)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.grid import SLEW_LIMIT, Grid
+from trilat_net.net.timing import SLEW_LIMIT, TickSchedule
 
 from .crossing import Other, S
 
@@ -13,7 +13,7 @@ EPOCH_NS = 5_000_000_123
 
 @given(st.integers(0, 10**9), st.integers(1, 4000))
 def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(k: int, rate_hz: int) -> None:
-    assert Grid(EPOCH_NS, rate_hz).deadline(k) == EPOCH_NS + k * S // rate_hz
+    assert TickSchedule(EPOCH_NS, rate_hz).deadline(k) == EPOCH_NS + k * S // rate_hz
 
 
 @given(
@@ -25,7 +25,7 @@ def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(k: int, rate
 def test_it_never_steps_and_never_slews_beyond_the_limit(
     steers: list[tuple[int, int, float]], rate_hz: int
 ) -> None:
-    grid, k = Grid(EPOCH_NS, rate_hz), 0
+    grid, k = TickSchedule(EPOCH_NS, rate_hz), 0
     for ticks, error_ns, drift in steers:
         k += ticks
         before = grid.deadline(k)
@@ -43,7 +43,7 @@ def test_it_never_steps_and_never_slews_beyond_the_limit(
 def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(drift_ppb: int, begin_ns: int) -> None:
     """From an epoch that was converted wrong by begin_ns, steered ten times a second by the true offset."""
     leader = Other(0, drift_ppb)
-    grid = Grid(begin_ns, 1000)
+    grid = TickSchedule(begin_ns, 1000)
     errors = []
     for k in range(0, 60_000, 100):
         due_ns = grid.deadline(k)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.latecomer import GATHER_NS
+from trilat_net.net.membership import LATE_GATHER_NS
 from trilat_net.net.session import Epoch
 
 from .parties import STEP_NS, Party
@@ -51,7 +51,7 @@ def joined(session: Party, within_ns: int, *clocks: ManualClock) -> Epoch | None
 def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
     session, epoch = running()
     session.start(RECORDER)
-    late = joined(session, GATHER_NS)
+    late = joined(session, LATE_GATHER_NS)
     assert late == epoch._replace(epochs={})
     assert session.kinds().count("start") == 1
 
@@ -68,7 +68,7 @@ def test_on_a_clock_of_its_own_it_finds_the_same_instant(ahead_ns: int, unix_ns:
 
     own = Elsewhere(here.monotonic_ns() + ahead_ns, unix_ns)
     session.start(RECORDER, on_clock=own)
-    late = joined(session, 4 * GATHER_NS, own)
+    late = joined(session, 4 * LATE_GATHER_NS, own)
     assert late is not None
     assert late.mono_ns == epoch.mono_ns + ahead_ns
     assert late.unix_ns == epoch.unix_ns
@@ -78,7 +78,7 @@ def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
     session, epoch = running()
     session.kill("s")
     session.start(RECORDER)
-    assert joined(session, GATHER_NS - 5 * STEP_NS) is None
+    assert joined(session, LATE_GATHER_NS - 5 * STEP_NS) is None
     assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
     assert set(session.members[RECORDER].joining.meeting.met) == {"m1", "m2"}
 
@@ -117,7 +117,7 @@ def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
     while session.clock.monotonic_ns() + STEP_NS < epoch.mono_ns:
         session.round()
         assert deaf.epoch is None
-    late = joined(session, 2 * GATHER_NS)
+    late = joined(session, 2 * LATE_GATHER_NS)
     assert late == epoch._replace(epochs={})
 
 
@@ -137,7 +137,7 @@ def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> N
         voice.info = msgspec.structs.replace(voice.info, **forged)
     session.start(RECORDER)
     with suppress(SessionError):  # a session that runs and does not say since when takes nobody in
-        joined(session, 3 * GATHER_NS)
+        joined(session, 3 * LATE_GATHER_NS)
     assert session.members[RECORDER].epoch is None
 
 
@@ -146,7 +146,7 @@ def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
     other = session.members.pop(RECORDER)
     session.members["other"] = other
     session.start(RECORDER)
-    assert joined(session, 2 * GATHER_NS) == epoch._replace(epochs={})
+    assert joined(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
     assert RECORDER not in session.members[RECORDER].joining.meeting.met
 
 

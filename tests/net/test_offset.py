@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.net.offset import WINDOWS, Limit, OffsetEstimator, known, offset_text
+from trilat_net.net.offset import WINDOWS_KEPT, OffsetEstimator, OffsetLimit, exact_offset, format_offset
 
 from .crossing import Other, S, ceiling, floor, queueing, second
 
@@ -154,34 +154,34 @@ def test_a_clock_that_stepped_is_noticed_and_found_again(step_ns: int) -> None:
 
 def test_limits_that_contradict_each_other_alone_leave_nothing() -> None:
     estimator = OffsetEstimator()
-    estimator.add(Limit(0, 10), Limit(0, 20_000_000))
+    estimator.add(OffsetLimit(0, 10), OffsetLimit(0, 20_000_000))
     assert estimator.estimate(S) is None
     assert estimator.broken == 1
-    estimator.add(Limit(S, 30), Limit(S, 10))
+    estimator.add(OffsetLimit(S, 30), OffsetLimit(S, 10))
     assert estimator.estimate(S) is not None
 
 
 def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
     other, estimator = Other(S, 0), OffsetEstimator()
-    for n in range(3 * WINDOWS):
+    for n in range(3 * WINDOWS_KEPT):
         estimator.add(ceiling(other, n * S, 1000), floor(other, n * S, 1000))
-    assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {WINDOWS}
-    assert estimator._ceilings[0].at_ns == 2 * WINDOWS * S
+    assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {WINDOWS_KEPT}
+    assert estimator._ceilings[0].at_ns == 2 * WINDOWS_KEPT * S
 
 
 def test_one_clock_needs_no_estimate() -> None:
-    one = known(0)
+    one = exact_offset(0)
     assert [one.offset_at(at_ns) for at_ns in (0, 10**15)] == [0, 0]
     assert one.bound_at(10**15, 0) == 0
     assert one.bound_at(10**15, 7) == 7
 
 
 def test_what_contradicts_an_estimate_widens_it() -> None:
-    one = known(5)
-    wider = one.including(Limit(0, -100), None)
+    one = exact_offset(5)
+    wider = one.including(OffsetLimit(0, -100), None)
     assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
     assert one.including(None, None) == one
 
 
 def test_people_read_seconds_and_microseconds() -> None:
-    assert offset_text(3_000_012_345, 84_001) == "offset 3.000012 s +- 85 us"
+    assert format_offset(3_000_012_345, 84_001) == "offset 3.000012 s +- 85 us"

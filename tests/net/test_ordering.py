@@ -7,18 +7,17 @@ from contextlib import closing
 import msgspec
 import pytest
 
-from sites.changes import Changes
+from sites.change_server import ChangeServer
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
-from trilat_net.net.answers import Order, Reply
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import Connection, find_free_endpoints
+from trilat_net.net.discovery import request_change
+from trilat_net.net.membership import EventPublisher
 from trilat_net.net.messages import Info
-from trilat_net.net.ordering import place_order
-from trilat_net.net.voice import Voice
+from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import load, parse
+from trilat_net.scenario import load_scenario, parse_scenario
 
 SESSION = "o"
 CLOCK = SystemClock()
@@ -28,9 +27,9 @@ class Answering:
     """A site `s` that does nothing but answer."""
 
     def __init__(self, *, running: bool, deaf: bool = False) -> None:
-        (self.endpoint,) = free_endpoints(1)
+        (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
-        scenario = load("paper")
+        scenario = load_scenario("paper")
         info = Info(
             member="s",
             boot=1,
@@ -41,9 +40,9 @@ class Answering:
             fingerprint="f",
             running=running,
         )
-        self._voice = Voice(self._bus, SESSION, info)
+        self._voice = EventPublisher(self._bus, SESSION, info)
         questions = self._bus.questions(topics.key(SESSION, "s" if not deaf else "x", topics.SET))
-        self._changes = Changes(scenario, "s", questions)
+        self._changes = ChangeServer(scenario, "s", questions)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._answer)
         self._thread.start()
@@ -58,10 +57,12 @@ class Answering:
         self._thread.join()
         self._bus.close()
 
-    def asked(self, site: str, **order: object) -> Reply:
-        wanted = msgspec.convert({"to": {}, **order}, Order)
+    def asked(self, site: str, **order: object) -> ChangeReply:
+        wanted = msgspec.convert({"to": {}, **order}, ChangeRequest)
         connection = Connection(connect=[self.endpoint])
-        return place_order(connection, CLOCK, SESSION, site, wanted, lambda text: parse(text).names)
+        return request_change(
+            connection, CLOCK, SESSION, site, wanted, lambda text: parse_scenario(text).names
+        )
 
 
 @pytest.fixture

@@ -6,13 +6,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.net import topics
-from trilat_net.net.answers import Pong
-from trilat_net.net.asking import CAPACITY, Asking
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import ManualClock, SkewedClock
 from trilat_net.net.messages import VERSION
-from trilat_net.net.offset import known
-from trilat_net.net.pinging import GLANCE_NS, PACE_NS, PINGS, REST_NS, WINDOW, Pinger, Trips, answer_pings
+from trilat_net.net.offset import exact_offset
+from trilat_net.net.pinging import (
+    GLANCE_NS,
+    PING_PACE_NS,
+    PING_REST_NS,
+    PINGS,
+    PINGS_PER_WINDOW,
+    QUERIES_KEPT,
+    Pinger,
+    RepeatedQuery,
+    RoundTrips,
+    answer_pings,
+)
+from trilat_net.net.requests import Pong
 from trilat_net.net.wire import encode
 
 from .parties import SESSION, told
@@ -100,13 +110,13 @@ def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
     world.member("m2", 5, S)
     world.member("s", 7, 2 * S)
     world.wait(100_000_000, 5)
-    assert world.bus.asked == 100_000_000 // PACE_NS
+    assert world.bus.asked == 100_000_000 // PING_PACE_NS
     assert not world.pinger.know([5])
     world.wait(200_000_000, 5, 7)
     assert world.pinger.know([5, 7])
     asked = world.bus.asked
     world.wait(5 * S, 5, 7)
-    assert world.bus.asked - asked == pytest.approx(5 * S / REST_NS, abs=1)
+    assert world.bus.asked - asked == pytest.approx(5 * S / PING_REST_NS, abs=1)
 
 
 def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
@@ -114,7 +124,7 @@ def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
     world.wait(S)
     assert world.bus.asked == 0
     assert world.pinger.know([])
-    assert world.pinger.estimate(99) == known(0)
+    assert world.pinger.estimate(99) == exact_offset(0)
     assert world.pinger.estimator(99) is None
 
 
@@ -154,13 +164,13 @@ def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
 
 
 def test_a_clock_that_steps_meanwhile_is_not_known_until_enough_agree_again() -> None:
-    trips = Trips(pong(), PINGS)
+    trips = RoundTrips(pong(), PINGS)
     for n in range(PINGS):
         trips.take(n * STEP_NS, pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50), n * STEP_NS + 100)
     assert trips.known
     before = trips.latest
     far_ns = 10 * S
-    for n in range(PINGS, PINGS + WINDOW):
+    for n in range(PINGS, PINGS + PINGS_PER_WINDOW):
         at_ns = n * STEP_NS
         came_ns = at_ns + 50 + far_ns * (n % 2)
         trips.take(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
@@ -171,7 +181,7 @@ def test_a_clock_that_steps_meanwhile_is_not_known_until_enough_agree_again() ->
 def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
     clock, network = ManualClock(S), LocalNetwork()
     questions = network.join().questions("t/a")
-    asking = Asking(network.join(), clock, "t/*")
+    asking = RepeatedQuery(network.join(), clock, "t/*")
     asked = []
     for _ in range(3):
         asked.append(asking.ask())
@@ -189,8 +199,8 @@ def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
 def test_questions_that_are_too_old_are_forgotten() -> None:
     network = LocalNetwork()
     questions = network.join().questions("t/a")
-    asking = Asking(network.join(), ManualClock(), "t/a")
-    for _ in range(CAPACITY + 1):
+    asking = RepeatedQuery(network.join(), ManualClock(), "t/a")
+    for _ in range(QUERIES_KEPT + 1):
         asking.ask()
     questions.poll().answer(b"late")
     assert asking.poll() is None

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.router import POLL_NS, run_router
+from trilat_net.net.connection import ROUTER_POLL_NS, run_router
 
 
 class Played(ManualClock):
@@ -76,7 +76,7 @@ def test_it_stays_until_members_have_come_and_all_have_left_for_so_long() -> Non
     def goes() -> None:
         members[-1].close()
 
-    idle_ns = 4 * POLL_NS
+    idle_ns = 4 * ROUTER_POLL_NS
     nothing = [lambda: None] * 10
     pause = [lambda: None] * 2
     clock = Played(*nothing, comes, *nothing, goes, *pause, comes, *nothing, goes, rest=100)
@@ -84,7 +84,7 @@ def test_it_stays_until_members_have_come_and_all_have_left_for_so_long() -> Non
     assert said[-1] == "nobody has been here for 0.2 s"
     assert len(said) == 5
     assert not clock.over
-    assert clock.monotonic_ns() == (10 + 1 + 10 + 1 + 2 + 1 + 10 + 1 + 4) * POLL_NS
+    assert clock.monotonic_ns() == (10 + 1 + 10 + 1 + 2 + 1 + 10 + 1 + 4) * ROUTER_POLL_NS
 
 
 def test_without_a_time_it_stays_for_ever() -> None:

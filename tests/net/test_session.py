@@ -11,9 +11,9 @@ from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.clock import ManualClock
+from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import VERSION, Event, Info
-from trilat_net.net.session import AHEAD_NS, DECIDE_NS
-from trilat_net.net.voice import new_boot
+from trilat_net.net.session import DECIDE_NS, EPOCH_AHEAD_NS
 from trilat_net.net.wire import encode
 
 from .parties import SESSION, STEP_NS, Member, Party, told
@@ -87,7 +87,7 @@ def test_any_start_order_with_pauses_agrees(order: list[str], pause: int) -> Non
 def test_the_epoch_lies_ahead_of_everybody() -> None:
     session = party(*SITES)
     epoch = session.agreed()
-    assert AHEAD_NS >= 500_000_000
+    assert EPOCH_AHEAD_NS >= 500_000_000
     assert epoch.mono_ns - session.clock.monotonic_ns() >= DECIDE_NS - STEP_NS
 
 
@@ -116,7 +116,7 @@ def test_who_is_not_ready_in_time_gets_another_attempt() -> None:
     while "epoch" not in session.kinds():
         session.round("m1", "m2")
         session.members["s"].voice.answer()  # s is there, and then hangs
-    for _ in range(AHEAD_NS // STEP_NS):
+    for _ in range(EPOCH_AHEAD_NS // STEP_NS):
         session.round("m1", "m2")
     assert session.members["m1"].epoch is None
     session.agreed()
@@ -343,7 +343,7 @@ def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
     for _ in range(200):
         round_of_all(session, remote)
     (announced,) = (event for event in session.listen() if event.kind == "epoch")
-    assert re.search(rf"tick 0 is {(AHEAD_NS + 2 * trip_ns) // 1_000_000} ms from now", announced.text)
+    assert re.search(rf"tick 0 is {(EPOCH_AHEAD_NS + 2 * trip_ns) // 1_000_000} ms from now", announced.text)
     assert all(member.epoch for member in session.members.values())
 
 

@@ -9,12 +9,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.net.clock import ManualClock, SkewedClock
-from trilat_net.net.course import Course
-from trilat_net.net.grid import SLEW_LIMIT
-from trilat_net.net.messages import VERSION, LinkStats, Sample
-from trilat_net.net.meter import FIRST_WINDOW_NS, FIRST_WINDOWS, Meter, Sent
-from trilat_net.net.offset import Estimate, OffsetEstimator, known
-from trilat_net.net.timing import FAULT_EVERY_NS, News, Peer, Timing
+from trilat_net.net.messages import VERSION, LinkStats, PeerSample
+from trilat_net.net.offset import OffsetEstimate, OffsetEstimator, SlewedOffset, exact_offset
+from trilat_net.net.timing import (
+    FAULT_EVERY_NS,
+    FIRST_WINDOW_NS,
+    FIRST_WINDOWS,
+    SLEW_LIMIT,
+    ClockNotice,
+    LinkTimingMonitor,
+    PeerClock,
+    SentStamps,
+    SiteTiming,
+)
 
 from .crossing import Delay, S, queueing
 
@@ -22,8 +29,8 @@ RATE_HZ = 200
 NAMES = ("a", "b")
 
 
-def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> Sample:
-    return Sample(
+def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
+    return PeerSample(
         v=VERSION,
         site="x",
         boot=1,
@@ -41,9 +48,9 @@ class Site:
     """One site of a simulated session: its clock, its time, and what it logged."""
 
     clock: SkewedClock
-    timing: Timing
+    timing: SiteTiming
     errors_ns: list[tuple[int, int, int]] = field(default_factory=list)
-    news: list[News] = field(default_factory=list)
+    news: list[ClockNotice] = field(default_factory=list)
     stats: list[dict[str, object]] = field(default_factory=list)
     ticked_ns: list[int] = field(default_factory=list)
 
@@ -63,14 +70,14 @@ class Session:
         for own, other in ((0, 1), (1, 0)):
             ahead = clocks[other].monotonic_ns() - clocks[own].monotonic_ns()
             now_ns = clocks[own].monotonic_ns()
-            first = Estimate(now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5)
-            peer = Peer(NAMES[other], epochs[other], 0, first, OffsetEstimator())
-            self.sites.append(Site(clocks[own], Timing(epochs[own], RATE_HZ, [peer], "a")))
+            first = OffsetEstimate(now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5)
+            peer = PeerClock(NAMES[other], epochs[other], 0, first, OffsetEstimator())
+            self.sites.append(Site(clocks[own], SiteTiming(epochs[own], RATE_HZ, [peer], "a")))
             self.sites[-1].news += self.sites[-1].timing.opening()
 
     def run(self, seconds: float, cut: range = range(0)) -> None:
         """Lets both tick; what is sent in the ticks of `cut` is lost."""
-        queue: list[tuple[int, int, int, int, Sample | None]] = []
+        queue: list[tuple[int, int, int, int, PeerSample | None]] = []
         order = iter(range(10**9))
         for n in (0, 1):
             heapq.heappush(queue, (self._due(n, 0), next(order), n, 0, None))
@@ -93,7 +100,7 @@ class Session:
         ahead_ns = site.timing.grid.deadline(k) - site.clock.monotonic_ns()
         return self.true.monotonic_ns() + round(ahead_ns / (1 + site.clock._drift_ppb / S)) + 1
 
-    def _tick(self, n: int, k: int) -> Sample:
+    def _tick(self, n: int, k: int) -> PeerSample:
         site = self.sites[n]
         site.ticked_ns.append(self.true.monotonic_ns())
         if n in self.step_at and k == self.step_at[n][0]:
@@ -106,7 +113,7 @@ class Session:
             site.news += site.timing.settle(k + 1, now_ns)
         return sent
 
-    def _take(self, n: int, message: Sample, true_ns: int) -> None:
+    def _take(self, n: int, message: PeerSample, true_ns: int) -> None:
         site, other = self.sites[n], self.sites[1 - n]
         arrived_ns = site.clock.monotonic_ns() + self.step[n]
         (meter,) = site.timing.meters
@@ -198,9 +205,11 @@ def test_a_clock_that_steps_is_a_fault_once_a_second_and_found_again(step_ns: in
         assert abs(last.facts["offset_ns"] - sign * (3 * S + step_ns)) <= last.facts["bound_ns"]
 
 
-def meter(course: Course | None = None, estimator: OffsetEstimator | None = None) -> tuple[Meter, Sent]:
-    sent = Sent(8)
-    return Meter(1000, 3, sent, course or Course(known(0)), estimator), sent
+def meter(
+    course: SlewedOffset | None = None, estimator: OffsetEstimator | None = None
+) -> tuple[LinkTimingMonitor, SentStamps]:
+    sent = SentStamps(8)
+    return LinkTimingMonitor(1000, 3, sent, course or SlewedOffset(exact_offset(0)), estimator), sent
 
 
 def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
@@ -234,7 +243,12 @@ def test_figures_are_of_what_came_since_the_last_and_faults_since_the_start() ->
 
 
 def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:
-    timing = Timing(0, 1000, [Peer("b", 0, 0, known(0), None), Peer("c", 0, 0, known(0), None)], "a")
+    timing = SiteTiming(
+        0,
+        1000,
+        [PeerClock("b", 0, 0, exact_offset(0), None), PeerClock("c", 0, 0, exact_offset(0), None)],
+        "a",
+    )
     one, two = timing.meters
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
         one.take(sample(tick, 0), at_ns)
@@ -245,7 +259,7 @@ def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:
 
 def test_the_first_windows_are_short() -> None:
     estimator = OffsetEstimator()
-    link, sent = meter(Course(known(0)), estimator)
+    link, sent = meter(SlewedOffset(exact_offset(0)), estimator)
     closed = []
     for n in range(400):
         now_ns = n * 10_000_000
@@ -258,7 +272,7 @@ def test_the_first_windows_are_short() -> None:
 
 
 def test_who_shares_the_leaders_clock_is_not_steered() -> None:
-    timing = Timing(5, 1000, [Peer("a", 5, 0, known(0), None)], "a")
+    timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
     for k in range(0, 5000, 100):
         timing.meters[0].take(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.tick import Arrival, Mode, Output
+from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
-from trilat_net.net.answers import Order, Pong, Reply
 from trilat_net.net.messages import (
     READABLE,
     STATE_VECTORS,
@@ -21,13 +20,14 @@ from trilat_net.net.messages import (
     Event,
     Info,
     LinkStats,
-    Sample,
+    PeerSample,
     State,
     json_schema,
 )
+from trilat_net.net.requests import ChangeReply, ChangeRequest, Pong
 from trilat_net.net.wire import MAX_BYTES, MAX_INFO_BYTES, decode, encode, encode_state
 
-KINDS = (State, Sample, LinkStats, Event, Info, Pong, Order, Reply)
+KINDS = (State, PeerSample, LinkStats, Event, Info, Pong, ChangeRequest, ChangeReply)
 PEERS = ("m2", "s")
 LIMITS = [0.0, -0.0, 5e-324, -2.2e-308, math.pi, 1.7976931348623157e308, -1.7976931348623157e308]
 
@@ -41,7 +41,7 @@ def row(length: int) -> st.SearchStrategy[list[float]]:
 
 
 outputs = st.builds(
-    Output,
+    TickRecord,
     tick=ticks,
     t_ns=st.integers(0, 2**59 - 1),
     mode=st.sampled_from(Mode),
@@ -64,17 +64,19 @@ def bits(numbers: Any) -> bytes:
 def payload(**changes: Any) -> bytes:
     """A small record, changed."""
     vectors = {name: [0.5] * length for name, length in STATE_VECTORS.items()}
-    output = Output(tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, cmd=[], mem=[], **vectors)
+    output = TickRecord(
+        tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, cmd=[], mem=[], **vectors
+    )
     record = msgpack.unpackb(encode_state("m1", 9, PEERS, output, [Arrival(1, 6, [0, 0], [0, 0], 2)], 0, 0))
     return msgpack.packb({**record, **changes})
 
 
 @given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
 def test_a_record_comes_back_bit_for_bit(
-    output: Output, came: list[Arrival], boot: int, late_us: int
+    output: TickRecord, came: list[Arrival], boot: int, late_us: int
 ) -> None:
     data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
-    state, sample = decode(data, State), decode(data, Sample)
+    state, sample = decode(data, State), decode(data, PeerSample)
     plain = msgpack.unpackb(data)
     for name in STATE_VECTORS:
         wanted = bits(getattr(output, name))
@@ -94,10 +96,10 @@ instants = st.integers(-(2**59), 2**59 - 1)
 
 @given(output=outputs, sent_ns=instants, echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)))
 def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
-    output: Output, sent_ns: int, echo: list[tuple[int, int, int]]
+    output: TickRecord, sent_ns: int, echo: list[tuple[int, int, int]]
 ) -> None:
     data = encode_state("m1", 1, PEERS, output, [], 0, 0, sent_ns, echo)
-    for kind in (State, Sample):
+    for kind in (State, PeerSample):
         message = decode(data, kind)
         assert message.sent_ns == sent_ns
         assert [tuple(entry) for entry in message.echo] == echo
@@ -116,7 +118,7 @@ def test_a_record_of_the_first_version_is_read_in_files_and_refused_live() -> No
 
 
 @given(output=outputs, came=arrivals)
-def test_msgspec_writes_what_is_read_just_so(output: Output, came: list[Arrival]) -> None:
+def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
     state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
     again = decode(msgspec.msgpack.encode(state), State)
@@ -131,7 +133,7 @@ def test_msgspec_writes_what_is_read_just_so(output: Output, came: list[Arrival]
     entry=st.integers(0, 1),
 )
 def test_what_is_not_finite_is_refused_at_both_ends(
-    output: Output, name: str, value: float, entry: int
+    output: TickRecord, name: str, value: float, entry: int
 ) -> None:
     numbers = [*getattr(output, name)]
     numbers[entry] = value
@@ -140,7 +142,7 @@ def test_what_is_not_finite_is_refused_at_both_ends(
     assert refused.value.reason == "not finite"
     record = msgpack.unpackb(encode_state("m1", 1, PEERS, output, [], 0, 0))
     data = msgpack.packb({**record, name: numbers})
-    for kind in (State, Sample) if name in ("q", "qd") else (State,):
+    for kind in (State, PeerSample) if name in ("q", "qd") else (State,):
         with pytest.raises(WireError) as refused:
             decode(data, kind)
         assert refused.value.reason == "not finite"
@@ -236,7 +238,7 @@ def test_deep_nesting_is_refused(opening: bytes) -> None:
     data = payload(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
     only_wire_errors(data)
     with pytest.raises(WireError):
-        decode(data, Sample)
+        decode(data, PeerSample)
 
 
 def test_lengths_that_promise_more_than_there_is_are_refused() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from trilat_net.errors import UsageError
 from trilat_net.net.bus import Bus
-from trilat_net.net.endpoints import free_endpoints
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 
 from .networks import Routed, encrypted, meet
@@ -15,7 +15,7 @@ from .waiting import received, until
 
 
 def test_a_busy_port_is_the_callers_error_and_named() -> None:
-    (endpoint,) = free_endpoints(1)
+    (endpoint,) = find_free_endpoints(1)
     first = ZenohBus([endpoint])
     try:
         with pytest.raises(UsageError, match=rf"{endpoint}: the port is in use"):
@@ -42,7 +42,7 @@ def test_a_stranger_without_a_certificate_of_the_authority_does_not_get_in(tmp_p
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
     ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
-    (endpoint,) = (place.replace("tcp", "tls") for place in free_endpoints(1))
+    (endpoint,) = (place.replace("tcp", "tls") for place in find_free_endpoints(1))
     router = ZenohBus([endpoint], mode="router", own=ours.own)
     try:
         for own in (theirs.own, None):
@@ -76,7 +76,7 @@ def test_a_router_lets_in_who_has_the_password_and_through_what_is_allowed(tmp_p
     users, file = tmp_path / "users.txt", tmp_path / "router.json5"
     users.write_text("lab:secret\n")
     file.write_text(ACCESS.replace("USERS", str(users)))
-    endpoints = free_endpoints(1)
+    endpoints = find_free_endpoints(1)
     router = ZenohBus(endpoints, mode="router", own=read_zenoh_file(file).settings)
     members: list[ZenohBus] = []
 
@@ -156,7 +156,7 @@ def answered(asker: Bus, key: str) -> tuple[str, bytes] | None:
 
 
 def test_routers_that_connect_to_each_other_are_one() -> None:
-    endpoints = free_endpoints(2)
+    endpoints = find_free_endpoints(2)
     routers = [ZenohBus(endpoints[:1], mode="router"), ZenohBus(endpoints[1:], endpoints[:1], "router")]
     members = [ZenohBus([], [endpoint], "client") for endpoint in endpoints]
     try:

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import UsageError
 from trilat_net.net.zenoh_bus import MAX_DEPTH, read_zenoh_file
-from trilat_net.net.zenoh_config import configuration
-from trilat_net.net.zenoh_file import NEEDS, ZenohFile, understood
+from trilat_net.net.zenoh_config import REQUIREMENTS, ZenohFile, check_zenoh_file, make_zenoh_config
 
 SOURCE = "mine.json5"
 
@@ -32,7 +31,7 @@ def found(settings: Mapping[str, Any], path: str) -> object:
 
 def checked(stated: object) -> ZenohFile:
     """What is in a file, checked, with a Zenoh that takes everything."""
-    return understood(SOURCE, stated, lambda _: "")
+    return check_zenoh_file(SOURCE, stated, lambda _: "")
 
 
 WRONG = {
@@ -52,27 +51,27 @@ WRONG = {
     "qos/network": [{"messages": ["put"], "flows": ["egress"], "overwrite": {"express": True}}],
     "downsampling": [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "**", "freq": 1}]}],
     "low_pass_filter": [{"messages": ["put"], "flows": ["egress"], "key_exprs": ["**"], "size_limit": 1}],
-    **{path: 2 for path in NEEDS if "/queue/size/" in path},
+    **{path: 2 for path in REQUIREMENTS if "/queue/size/" in path},
 }
 
 
 def test_there_is_a_wrong_value_for_every_need() -> None:
-    assert set(WRONG) == set(NEEDS)
+    assert set(WRONG) == set(REQUIREMENTS)
 
 
-@pytest.mark.parametrize("path", NEEDS)
+@pytest.mark.parametrize("path", REQUIREMENTS)
 def test_what_contradicts_a_need_is_refused_with_key_value_and_what_it_must_be(path: str) -> None:
     with pytest.raises(UsageError) as refused:
         checked(nested(path, WRONG[path]))
     assert str(refused.value).startswith(f"{SOURCE}: {path}: ")
-    assert f" must be {NEEDS[path].must}" in str(refused.value)
+    assert f" must be {REQUIREMENTS[path].must}" in str(refused.value)
 
 
 @given(data=st.data())
 def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject) -> None:
     """Whatever a file states: it is refused, or the needs hold in the configuration that comes of it."""
     stated: dict[str, Any] = {}
-    for path in data.draw(st.lists(st.sampled_from(sorted(NEEDS)), max_size=4)):
+    for path in data.draw(st.lists(st.sampled_from(sorted(REQUIREMENTS)), max_size=4)):
         value = data.draw(
             st.sampled_from([WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"])
         )
@@ -81,9 +80,9 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
         file = checked(stated)
     except UsageError:
         return
-    settings = configuration([], [], "peer", file.settings)
-    plain = configuration([], [])
-    for path, need in NEEDS.items():
+    settings = make_zenoh_config([], [], "peer", file.settings)
+    plain = make_zenoh_config([], [])
+    for path, need in REQUIREMENTS.items():
         try:
             value = found(settings, path)
         except KeyError:
@@ -111,7 +110,7 @@ def test_what_a_session_does_not_need_is_taken_as_it_is() -> None:
             "access_control": {"enabled": False},
         }
     ).settings
-    settings = configuration(["tcp/a:1"], ["tcp/b:1"], "peer", own)
+    settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", own)
     assert found(settings, "transport/link/tx/lease") == 9_000
     assert found(settings, "transport/link/protocols") == ["tls"]
     assert found(settings, "transport/unicast/open_timeout") == 700
@@ -227,7 +226,7 @@ def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
     """A configuration of ours is one of Zenoh's: all its keys exist there."""
     path = tmp_path / SOURCE
     for mode in ("peer", "client", "router"):
-        settings = configuration([], [], mode)
+        settings = make_zenoh_config([], [], mode)
         for side in ("listen", "connect"):
             settings[side] = {
                 key: settings[side][key] for key in settings[side] if key in ("endpoints", "retry")
@@ -237,6 +236,6 @@ def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
 
 
 def test_nothing_is_found_that_was_not_named() -> None:
-    settings = configuration(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
+    settings = make_zenoh_config(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
     assert settings["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
     assert settings["transport"]["shared_memory"] == {"enabled": False}

@@ -7,29 +7,29 @@ from typing import Any
 import msgspec
 from mcap.reader import make_reader
 
-from recorder.recording import Recording
-from recorder.report import Report
-from recorder.tap import Tap
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Tick
-from trilat_net.log.reader import Log, open_log
-from trilat_net.log.writer import LogWriter
+from recorder.inbound_queue import InboundQueue
+from recorder.session_recording import RecorderReport, Recording
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import TickInput
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
-from trilat_net.net.answers import Past, Wanted
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.clock import ManualClock
+from trilat_net.net.loop_stats import LoopStats
+from trilat_net.net.membership import EventPublisher, read_events
+from trilat_net.net.messages import Event, Info
+from trilat_net.net.requests import Backfill, BackfillRequest
 from trilat_net.net.session import Epoch
-from trilat_net.net.stats import LoopStats
-from trilat_net.net.voice import Voice, said
-from trilat_net.net.wire import Event, Info, decode, encode, encode_state
-from trilat_net.scenario import Scenario, load
+from trilat_net.net.wire import decode, encode, encode_state
+from trilat_net.scenario import Scenario, load_scenario
 
 SESSION = "t"
 MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
 MS, S = 1_000_000, 1_000_000_000
 BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
 EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
-SCENARIO = load("two_sites", {"duration_s": 0.05})
+SCENARIO = load_scenario("two_sites", {"duration_s": 0.05})
 TICKS = SCENARIO.ticks("m")
 
 
@@ -52,7 +52,7 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
     site = Site(scenario.setup(name))
     boot = BOOTS[name] if boot is None else boot
     return [
-        encode_state(name, boot, site.peers, site.step(Tick(k)), [], 0, 0)
+        encode_state(name, boot, site.peers, site.step(TickInput(k)), [], 0, 0)
         for k in range(scenario.ticks(name))
     ]
 
@@ -60,7 +60,7 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
 def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
     """What it says of its links after a tick."""
     site = Site(scenario.setup(name))
-    stats = LoopStats(site, BOOTS[name], [1000]).take(site.step(Tick(0)))
+    stats = LoopStats(site, BOOTS[name], [1000]).take(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
     return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
 
@@ -91,24 +91,24 @@ class Memory:
         self.name, self.chunk = name, chunk
         self.made: dict[str, Sequence[bytes]] = {"state": [], "link": [], "event": []}
         self.oldest = dict.fromkeys(self.made, 0)
-        self.asked: list[Wanted] = []
+        self.asked: list[BackfillRequest] = []
         self.replies: Callable[[bytes], Sequence[bytes]] = lambda payload: [payload]
         self._questions = network.join().questions(topics.key(SESSION, name, topics.PAST))
 
     def answer(self) -> None:
         """Answers what it has been asked."""
         while (question := self._questions.poll()) is not None:
-            wanted = decode(question.payload, Wanted)
+            wanted = decode(question.payload, BackfillRequest)
             self.asked.append(wanted)
             for payload in self.replies(encode(self.past(wanted))):
                 question.answer(payload)
 
-    def past(self, wanted: Wanted) -> Past:
+    def past(self, wanted: BackfillRequest) -> Backfill:
         """What it still has of what is wanted."""
         made = self.made[wanted.channel]
         first = max(wanted.first, min(self.oldest[wanted.channel], len(made)))
         last = min(wanted.last, first + self.chunk - 1)
-        return Past(
+        return Backfill(
             member=self.name,
             boot=BOOTS[self.name],
             channel=wanted.channel,
@@ -131,13 +131,13 @@ class Desk:
         self._heard: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.EVENT))
         self.reports: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.STATS))
         self.stream = io.BytesIO()
-        self.tap = Tap(self.clock)
+        self.tap = InboundQueue(self.clock)
         own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
         info = told(topics.RECORDER, scenario="", scenario_sha256="")
-        voice = Voice(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
+        voice = EventPublisher(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
         writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
         self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, voice)
-        self.report = Report(
+        self.report = RecorderReport(
             self.bus, self.clock, SESSION, info.boot, epoch, self.recording, self.tap, self.stream.tell
         )
 
@@ -174,7 +174,7 @@ class Desk:
 
     def said(self) -> list[Event]:
         """What the recorder said since the last call."""
-        return list(said(self._heard))
+        return list(read_events(self._heard))
 
     def stored(self) -> list[tuple[str, int]]:
         """What the recorder said it has: (site, ticks)."""

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorder.filling import ANSWER_NS, GIVE_UP_NS, SILENT_NS, VAIN
+from recorder.backfill import ANSWER_NS, GIVE_UP_NS, MAX_VAIN_REQUESTS, SILENT_NS
 from trilat_net.net import topics
-from trilat_net.net.answers import CHUNK, Past
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import Event, RecorderStats, State
+from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill
 from trilat_net.net.wire import decode, encode
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .desk import BOOTS, MONO_NS, MS, SESSION, UNIX_NS, Desk, Memory, S, happening, states, statistics
 
-SLOW = load("two_sites", {"duration_s": 2.0, "rate_hz": 100})
+SLOW = load_scenario("two_sites", {"duration_s": 2.0, "rate_hz": 100})
 TICKS = SLOW.ticks("m")
 EVERY = 10
 MADE = {
@@ -63,7 +63,7 @@ class Way:
 
 def lie(how: str, payload: bytes) -> Sequence[bytes]:
     """What arrives of an answer."""
-    past = decode(payload, Past)
+    past = decode(payload, Backfill)
     wrong = {
         "wrong boot": {"boot": 99},
         "wrong member": {"member": "s"},
@@ -223,7 +223,7 @@ def test_no_more_than_one_question_is_under_way_and_none_asks_for_more_than_a_ch
     run.live(2600 * MS)
     run.until_stored()
     assert most == 1
-    assert all(wanted.last - wanted.first < CHUNK for wanted in run.site.asked)
+    assert all(wanted.last - wanted.first < BACKFILL_MESSAGES for wanted in run.site.asked)
 
 
 def test_what_is_only_late_is_not_asked_for() -> None:
@@ -270,7 +270,7 @@ def test_a_site_that_answers_in_vain_is_left_alone() -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.site.replies = lambda payload: lie("undecodable", payload)
     run.live(20 * S)
-    assert len(run.site.asked) <= 3 * VAIN + 3
+    assert len(run.site.asked) <= 3 * MAX_VAIN_REQUESTS + 3
     assert "missing for good" in run.until_stored().text
 
 
@@ -350,7 +350,7 @@ def test_answers_that_are_too_large_for_the_way_are_made_smaller() -> None:
 
 def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
     run = Run(Way(lost={n for n in range(20, 180) if n % 3}))
-    run.site.replies = lambda payload: [] if decode(payload, Past).channel == "state" else [payload]
+    run.site.replies = lambda payload: [] if decode(payload, Backfill).channel == "state" else [payload]
     run.live(2600 * MS)
     run.desk.rounds(700, run.site)
     accounts = run.desk.recording.accounts

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from recorder.recorder import Recorder
+from recorder.record_process import Recorder
 from sites import realtime
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
 from tests.sites.sessions import Session, in_log, in_virtual_time
-from trilat_net.experiment import verify
-from trilat_net.log.parts import Storage
-from trilat_net.log.reader import open_log
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogStorage
 from trilat_net.net import topics
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S, end, happening, states, statistics
 
@@ -77,7 +77,7 @@ def test_a_recorder_takes_over_from_one_that_ended(
 ) -> None:
     """Real sites, real recorders, in one process; the second one with another clock, too."""
     monkeypatch.setattr(realtime, "prepare", lambda _cpu: {"scheduling": "as it was", "memory": "as it was"})
-    scenario = load("two_sites", {"duration_s": 3.0, "rate_hz": 100})
+    scenario = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 100})
     session = Session(scenario, tmp_path / "first.mcap")
     for name in scenario.names:
         session.site(name)
@@ -90,7 +90,7 @@ def test_a_recorder_takes_over_from_one_that_ended(
     def second(clock: RelayClock) -> str | None:
         own = session._own("later", clock)
         said = session.said.append
-        recorder = Recorder(session.network.join(), own, REAL, 99, Storage(later), lambda: False, said)
+        recorder = Recorder(session.network.join(), own, REAL, 99, LogStorage(later), lambda: False, said)
         epoch = recorder.join(30.0)
         assert epoch is not None
         return recorder.record(epoch).problem()

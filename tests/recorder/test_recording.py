@@ -8,20 +8,21 @@ import msgspec
 import pytest
 from mcap.reader import make_reader
 
-from recorder import tap as tap_module
-from recorder.recorder import Recorder
-from recorder.recording import AWAY_NS, LAST_NS, SETTLE_NS
+from recorder import inbound_queue as tap_module
+from recorder.record_process import Recorder
+from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
 from tests.sites.relay import Relay, RelayClock
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Tick
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import TickInput
 from trilat_net.errors import UsageError
-from trilat_net.experiment import verify
-from trilat_net.log.parts import Storage
-from trilat_net.log.reader import open_log
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogStorage
 from trilat_net.net import topics
 from trilat_net.net.bus import LocalNetwork
-from trilat_net.net.wire import Event, encode, encode_state
-from trilat_net.scenario import load
+from trilat_net.net.messages import Event
+from trilat_net.net.wire import encode, encode_state
+from trilat_net.scenario import load_scenario
 
 from .desk import (
     BOOTS,
@@ -229,7 +230,7 @@ def test_a_site_that_comes_back_in_time_goes_on() -> None:
 @pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, SETTLE_NS), (False, AWAY_NS)])
 def test_a_site_that_is_cut_off_in_a_long_session_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
     """Even if it is the recorder that is cut off: then all sites are gone at once."""
-    desk = Desk(load("two_sites", {"duration_s": 100.0}))
+    desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
     if said_its_end:
         for name in ("m", "s"):
             desk.take(name, topics.EVENT, end(name, 1))
@@ -292,7 +293,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
             clock,
             SESSION,
             BOOTS[topics.RECORDER],
-            Storage(path),
+            LogStorage(path),
             lambda: clock.monotonic_ns() > stop_ns,
             str,
         )
@@ -336,7 +337,7 @@ def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
 
 def after_the_end() -> bytes:
     site = Site(SCENARIO.setup("m"))
-    return encode_state("m", BOOTS["m"], site.peers, site.step(Tick(0))._replace(tick=TICKS), [], 0, 0)
+    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=TICKS), [], 0, 0)
 
 
 OUT_OF_RANGE = {

@@ -1,10 +1,10 @@
 """What a recorder says of its own work: true, once a second, bounded, and in its log."""
 
-from recorder.report import EVERY_NS
+from recorder.session_recording import REPORT_EVERY_NS
 from trilat_net.net import topics
 from trilat_net.net.messages import RecorderStats
 from trilat_net.net.wire import MAX_BYTES, decode, encode
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .desk import MS, SESSION, TICKS, Desk, Memory, S, end, states, statistics
 
@@ -60,7 +60,7 @@ def test_it_says_so_once_a_second_and_writes_it() -> None:
         desk.write()
         desk.report.poll()
     said = heard(desk)
-    assert [stats.t_ns for stats in said] == [EVERY_NS, 2 * EVERY_NS, 3 * EVERY_NS]
+    assert [stats.t_ns for stats in said] == [REPORT_EVERY_NS, 2 * REPORT_EVERY_NS, 3 * REPORT_EVERY_NS]
     assert desk.written()["recorder/stats"] == [encode(stats) for stats in said]
 
 
@@ -75,7 +75,7 @@ def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
 
 def test_it_fits_a_message_however_much_is_missing() -> None:
     names = [f"site-with-a-long-name-{n}" for n in range(12)]
-    scenario = load("two_sites")
+    scenario = load_scenario("two_sites")
     desk = Desk(scenario)
     for key in desk.recording.accounts:
         for number in range(0, 10_000, 2):

@@ -2,14 +2,14 @@
 
 import pytest
 
-from recorder import tap as module
-from recorder.tap import Tap
+from recorder import inbound_queue as module
+from recorder.inbound_queue import InboundQueue
 from trilat_net.net.clock import ManualClock
 
 
 def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
     clock = ManualClock(100)
-    tap = Tap(clock)
+    tap = InboundQueue(clock)
     tap.take("a", b"1")
     clock.sleep_until(250)
     tap.take("b", b"2")
@@ -19,7 +19,7 @@ def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
 
 
 def test_what_comes_while_it_is_drained_comes_out_too() -> None:
-    tap = Tap(ManualClock())
+    tap = InboundQueue(ManualClock())
     tap.take("a", b"1")
     drained = []
     for message in tap.drain():
@@ -31,7 +31,7 @@ def test_what_comes_while_it_is_drained_comes_out_too() -> None:
 
 def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CAPACITY", 5)
-    tap = Tap(ManualClock())
+    tap = InboundQueue(ManualClock())
     for n in range(8):
         tap.take("a", bytes([n]))
     assert tap.overflowed == {"a": 3}

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenario.links import links
-from trilat_net.scenario import load, parse, shipped, shipped_text
+from trilat_net.scenario import list_shipped, load_scenario, parse_scenario, read_shipped
 
-TEXT = shipped_text("paper")
+TEXT = read_shipped("paper")
 NAMES = ("m1", "m2", "s")
 EVERY = [f"{j}->{i}" for i in NAMES for j in NAMES if i != j]
 pair = st.tuples(st.floats(0.01, 50), st.floats(0.01, 50)).map(list)
@@ -74,8 +74,8 @@ overrides = st.fixed_dictionaries(
 @settings(max_examples=200)
 @given(changed=overrides)
 def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) -> None:
-    scenario = parse(TEXT, overrides=changed)
-    again = parse(scenario.text)
+    scenario = parse_scenario(TEXT, overrides=changed)
+    again = parse_scenario(scenario.text)
     assert again.text == scenario.text
     assert again == scenario
     assert msgspec.to_builtins(again.timeline) == msgspec.to_builtins(scenario.timeline)
@@ -86,18 +86,18 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
         assert (one.ramps, one.on_stale, one.gains) == (other.ramps, other.on_stale, other.gains)
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
     """So the hash of an experiment does not change when another feature comes."""
-    text = load("paper", {"expect": {}}).text
+    text = load_scenario("paper", {"expect": {}}).text
     assert not any(word in text for word in ("on_stale", "timeline", "expect", "loss", "playout"))
-    assert ("timeline" in load(name).text) == bool(load(name).timeline)
+    assert ("timeline" in load_scenario(name).text) == bool(load_scenario(name).timeline)
 
 
 def test_350_and_350_point_0_are_one_experiment_in_a_timeline_too() -> None:
     def sha256(delay_ms: float, at_s: float) -> str:
         change = {"at_s": at_s, "link": "m1->s", "to": {"delay_ms": delay_ms}}
-        return load("paper", {"timeline": [change]}).sha256
+        return load_scenario("paper", {"timeline": [change]}).sha256
 
     assert sha256(350, 8) == sha256(350.0, 8.0)
     assert sha256(350, 8) != sha256(351, 8)

@@ -1,9 +1,12 @@
-from trilat_net.scenario import load
-from trilat_net.scenario.differences import differences
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.describe import compare_scenarios
 
 
 def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
-    return {str(one): one.values for one in differences([load(name, sets) for name, sets in scenarios])}
+    return {
+        str(one): one.values
+        for one in compare_scenarios([load_scenario(name, sets) for name, sets in scenarios])
+    }
 
 
 def test_one_experiment_differs_in_nothing_whatever_it_is_called() -> None:

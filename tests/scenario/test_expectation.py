@@ -5,13 +5,12 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import Expect, load, parse, template_text
-from trilat_net.scenario.expectation import fault
-from trilat_net.scenario.window import QUANTITIES, Window
+from trilat_net.scenario import Expect, load_scenario, parse_scenario, read_template
+from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow, find_expect_problem
 
 
 def with_expect(**keys: Any) -> Expect:
-    return load("free", {f"expect.{key}": value for key, value in keys.items()}).expect
+    return load_scenario("free", {f"expect.{key}": value for key, value in keys.items()}).expect
 
 
 def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
@@ -27,7 +26,7 @@ def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
         {"synchronised_by_s": 0.0},
         {"late_samples_max": 0},
         {"no_gaps": True},
-        {"windows": (Window(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0)),)},
+        {"windows": (ExpectWindow(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0)),)},
     ],
     ids=str,
 )
@@ -58,22 +57,22 @@ def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, fact
 
 
 def test_a_pair_of_limits_must_leave_room() -> None:
-    assert fault(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), ["m"]) is None
-    assert fault(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), ["m"]) is not None
+    assert find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), ["m"]) is None
+    assert find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), ["m"]) is not None
 
 
 def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
-    scenario = load("free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False})
-    assert parse(scenario.text).expect == scenario.expect
-    assert scenario.sha256 != load("free").sha256
+    scenario = load_scenario("free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False})
+    assert parse_scenario(scenario.text).expect == scenario.expect
+    assert scenario.sha256 != load_scenario("free").sha256
 
 
 WINDOW = {"from_s": 1.0, "to_s": 2.0, "site": "s", "wall_mean_n": [7, 9]}
 
 
 def test_a_window_is_part_of_the_scenarios_text() -> None:
-    scenario = load("free", {"expect.windows": [WINDOW]})
-    assert parse(scenario.text).expect == scenario.expect
+    scenario = load_scenario("free", {"expect.windows": [WINDOW]})
+    assert parse_scenario(scenario.text).expect == scenario.expect
     assert scenario.expect.windows[0].wall_mean_n == (7.0, 9.0)
     assert "[[expect.windows]]" in scenario.text
 
@@ -106,10 +105,10 @@ def test_a_window_that_asks_nothing_is_refused_and_told_what_it_may_ask() -> Non
 
 
 def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
-    commented = template_text().partition("# [expect]")[2].splitlines()[1:]
-    text = template_text() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
-    written = parse(text).expect
+    commented = read_template().partition("# [expect]")[2].splitlines()[1:]
+    text = read_template() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
+    written = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
-    assert set(named[: -len(Window.__struct_fields__)]) | {"windows"} == set(Expect.__struct_fields__)
-    assert named[-len(Window.__struct_fields__) :] == list(Window.__struct_fields__)
-    assert {key for key, _ in written.windows[0].asked} == set(QUANTITIES)
+    assert set(named[: -len(ExpectWindow.__struct_fields__)]) | {"windows"} == set(Expect.__struct_fields__)
+    assert named[-len(ExpectWindow.__struct_fields__) :] == list(ExpectWindow.__struct_fields__)
+    assert {key for key, _ in written.windows[0].asked} == set(WINDOW_QUANTITIES)

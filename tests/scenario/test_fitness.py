@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load, parse
+from trilat_net.scenario import load_scenario, parse_scenario
 
 OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
 
@@ -25,7 +25,7 @@ def test_a_law_that_cannot_do_its_work_is_refused(
     name: str, overrides: dict[str, Any], path: str, fact: str
 ) -> None:
     with pytest.raises(ScenarioError) as caught:
-        load(name, overrides)
+        load_scenario(name, overrides)
     assert caught.value.path == path
     assert fact in caught.value.problem
 
@@ -42,16 +42,16 @@ def test_a_law_that_cannot_do_its_work_is_refused(
     ids=str,
 )
 def test_a_law_that_needs_no_masses_drives_an_arm_that_nobody_knows(overrides: dict[str, Any]) -> None:
-    scenario = load("two_sites", {**OUTSIDE, **overrides})
+    scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     assert not scenario.setup("s").theta_known
-    assert parse(scenario.text) == scenario
+    assert parse_scenario(scenario.text) == scenario
 
 
 def test_a_known_arm_is_not_mentioned_so_that_older_scenarios_keep_their_hashes() -> None:
-    assert "known" not in load("two_sites").text
-    assert load("two_sites", {"arm.known": True}).sha256 == load("two_sites").sha256
-    assert load("two_sites", OUTSIDE).text.count("known = false") == 1
+    assert "known" not in load_scenario("two_sites").text
+    assert load_scenario("two_sites", {"arm.known": True}).sha256 == load_scenario("two_sites").sha256
+    assert load_scenario("two_sites", OUTSIDE).text.count("known = false") == 1
 
 
 def test_direct_force_reflection_is_for_a_pair() -> None:
-    assert load("two_sites", {"control.law": "p_f"}).setup("s")
+    assert load_scenario("two_sites", {"control.law": "p_f"}).setup("s")

@@ -11,27 +11,26 @@ from hypothesis import strategies as st
 from tests.core.channels import Ints, channel, due
 from tests.scenario.links import links
 from trilat_net.core.channel import LOST
-from trilat_net.core.delay import LIMIT_US, Delay
+from trilat_net.core.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load
-from trilat_net.scenario.link import LinkBase
-from trilat_net.scenario.links import LINKS, NoDelay
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase, NoDelay
 
 
 def link(keys: dict[str, Any]) -> LinkBase:
-    made: LinkBase = load("paper", {"link": keys}).links["m1->s"]
+    made: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
     return made
 
 
 def refused(keys: dict[str, Any]) -> ScenarioError:
     with pytest.raises(ScenarioError) as error:
-        load("paper", {"link": keys})
+        load_scenario("paper", {"link": keys})
     assert error.value.exit_code == 2
     return error.value
 
 
 def test_the_models_are_eleven() -> None:
-    assert set(LINKS) == {
+    assert set(DELAY_MODELS) == {
         *("none", "constant", "uniform", "normal", "gamma", "lognormal", "hyperexponential"),
         *("ar1", "sine", "trace", "measured"),
     }
@@ -42,7 +41,7 @@ def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> Non
     made = link(keys)
     mean_ms, deviation_ms = made.moments()
     if not made.measured and not math.isnan(mean_ms):
-        assert 0.0 <= mean_ms <= LIMIT_US / 1000
+        assert 0.0 <= mean_ms <= MAX_DELAY_US / 1000
         assert 0.0 <= deviation_ms < math.inf
     assert made.describe()
     points = made.points
@@ -82,7 +81,7 @@ def test_a_table_without_a_model_changes_single_keys_and_one_with_a_model_begins
         "m2->s": {"model": "constant", "delay_ms": 7},
         "s->m1": {"preset": "5g"},
     }
-    made = load("paper", {"link": base, "links": own}).links
+    made = load_scenario("paper", {"link": base, "links": own}).links
     assert made["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
     assert made["m2->s"].describe() == "7 ms"
     assert made["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
@@ -91,7 +90,7 @@ def test_a_table_without_a_model_changes_single_keys_and_one_with_a_model_begins
 
 def test_links_draw_from_keys_of_their_own_and_of_the_seed() -> None:
     def keys(seed: int) -> set[int]:
-        scenario = load("paper", {"seed": seed})
+        scenario = load_scenario("paper", {"seed": seed})
         return {link.key for name in scenario.names for link in scenario.setup(name).links}
 
     assert len(keys(1) | keys(2)) == 12
@@ -112,13 +111,16 @@ def test_links_draw_from_keys_of_their_own_and_of_the_seed() -> None:
 def test_whether_anything_is_drawn_and_whether_the_network_decides(
     keys: dict[str, Any], random: bool, measured: bool
 ) -> None:
-    assert (load("paper", {"link": keys}).random, load("paper", {"link": keys}).measured) == (
+    assert (
+        load_scenario("paper", {"link": keys}).random,
+        load_scenario("paper", {"link": keys}).measured,
+    ) == (
         random,
         measured,
     )
     later = [{"at_s": 1, "link": "m1->s", "to": keys}]
     if keys.get("model") != "trace":
-        changed = load("paper", {"timeline": later})
+        changed = load_scenario("paper", {"timeline": later})
         assert (changed.random, changed.measured) == (random, measured)
 
 
@@ -227,12 +229,12 @@ def test_extreme_numbers_are_refused_or_have_moments(
     if model == "ar1":
         keys["correlation"] = 0.5
     try:
-        made = msgspec.convert({"model": model, **keys}, LINKS[model])
+        made = msgspec.convert({"model": model, **keys}, DELAY_MODELS[model])
     except msgspec.ValidationError:
         return
     if made.fault() is None:
         assert all(math.isfinite(number) and number >= 0 for number in made.moments())
-        assert made.core().kind in set(Delay)
+        assert made.core().kind in set(DelayKind)
         assert due(channel([made.core()]), 3).min() >= 0
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import tests.laws
-from trilat_net.core.site import Site
+from trilat_net.core.site_step import Site
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load, parse
+from trilat_net.scenario import load_scenario, parse_scenario
 
 LAW = "tests.laws:Adaptive"
 CODE = """
@@ -30,20 +30,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("module", ["trap_package.trap", "trap_package", "trap_alone"])
 def test_naming_a_law_hashes_its_file_and_runs_nothing(module: str, folder: Path) -> None:
-    scenario = load("two_sites", {"control.law": f"{module}:Law", "control.gain": 3})
+    scenario = load_scenario("two_sites", {"control.law": f"{module}:Law", "control.gain": 3})
     file = folder / f"{module.replace('.', '/')}.py"
     file = file if file.exists() else folder / module / "__init__.py"
     for site in scenario.sites.values():
         assert site.control.source_sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
         assert site.control.settings == {"gain": 3}
-    assert parse(scenario.text) == scenario
+    assert parse_scenario(scenario.text) == scenario
     assert not {"trap_package", "trap_package.trap", "trap_alone"} & set(sys.modules)
 
 
 def test_what_a_log_names_is_imported_only_where_it_defines_a_class_of_that_name(folder: Path) -> None:
     """The hash is that of the file: a class from elsewhere would not be in it."""
     (folder / "borrowed.py").write_text("raise RuntimeError('it ran')\nfrom tests.laws import Adaptive\n")
-    scenario = load("two_sites", {"control.law": "borrowed:Adaptive"})
+    scenario = load_scenario("two_sites", {"control.law": "borrowed:Adaptive"})
     with pytest.raises(ScenarioError, match="defines no class Adaptive"):
         Site(scenario.setup("s"))
 
@@ -63,7 +63,7 @@ def test_what_a_log_names_is_imported_only_where_it_defines_a_class_of_that_name
 )
 def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: str) -> None:
     with pytest.raises(ScenarioError) as caught:
-        load("two_sites", {"sites.s.control.law": law})
+        load_scenario("two_sites", {"sites.s.control.law": law})
     assert caught.value.path == "sites.s.control.law"
     assert fact in str(caught.value)
 
@@ -82,7 +82,7 @@ def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: 
 def test_what_is_no_law_for_its_site_is_refused_as_the_site_is_built(
     overrides: dict[str, object], fact: str
 ) -> None:
-    scenario = load("paper", overrides)
+    scenario = load_scenario("paper", overrides)
     with pytest.raises(ScenarioError) as caught:
         Site(scenario.setup("s"))
     assert fact in str(caught.value)
@@ -91,7 +91,7 @@ def test_what_is_no_law_for_its_site_is_refused_as_the_site_is_built(
 
 @pytest.mark.parametrize(("name", "law"), [("two_sites", "Pair"), ("two_sites", "Few"), ("paper", "Few")])
 def test_a_law_that_says_for_how_many_sites_it_is_is_made_for_them(name: str, law: str) -> None:
-    Site(load(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
+    Site(load_scenario(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
 
 
 def test_a_law_is_not_told_what_nobody_knows() -> None:
@@ -99,14 +99,14 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
     told = []
 
     class Listening(tests.laws.Adaptive):
-        def __init__(self, facts: tests.laws.Facts) -> None:
+        def __init__(self, facts: tests.laws.LawContext) -> None:
             super().__init__(facts)
             told.append(facts.theta)
 
-    Site(load("two_sites", unknown).setup("s")._replace(own=Listening))
-    Site(load("two_sites").setup("s")._replace(own=Listening))
+    Site(load_scenario("two_sites", unknown).setup("s")._replace(own=Listening))
+    Site(load_scenario("two_sites").setup("s")._replace(own=Listening))
     assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
-    scenario = load("two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"})
+    scenario = load_scenario("two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"})
     with pytest.raises(ScenarioError, match=r"needs the arm's parameters, which nobody knows"):
         Site(scenario.setup("s"))
 
@@ -117,12 +117,12 @@ def test_a_file_that_was_edited_while_the_program_runs_is_taken_as_it_is_now(fol
     made = []
     for value in ("1", "2.5"):
         file.write_text(text.format(value))
-        site = Site(load("two_sites", {"control.law": "edited_law:Law"}).setup("s"))
+        site = Site(load_scenario("two_sites", {"control.law": "edited_law:Law"}).setup("s"))
         made.append(site._own.theta_hat0)
     assert made == [1, 2.5]
 
 
-RESOLVED = load("paper", {"control.law": LAW, "control.Kd": 2.0, "sites.m1.control.law": "adaptive"})
+RESOLVED = load_scenario("paper", {"control.law": LAW, "control.Kd": 2.0, "sites.m1.control.law": "adaptive"})
 
 
 @pytest.mark.parametrize(
@@ -141,18 +141,18 @@ RESOLVED = load("paper", {"control.law": LAW, "control.Kd": 2.0, "sites.m1.contr
 def test_overrides_of_a_resolved_scenario_reach_what_a_law_is_made_with(
     overrides: list[str], settings: tuple[dict[str, object], ...]
 ) -> None:
-    changed = load(RESOLVED, overrides)
+    changed = load_scenario(RESOLVED, overrides)
     assert tuple(changed.sites[name].control.settings for name in ("m2", "s")) == settings
     assert changed.sites["s"].control.code == LAW
 
 
 def test_settings_stand_beside_the_name_of_the_law() -> None:
     with pytest.raises(ScenarioError, match=r"stands beside its name, as in control.gain = 5"):
-        load("paper", {"control.law": LAW, "control.settings.Kd": 2})
+        load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 
 def test_a_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
-    other = parse(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
+    other = parse_scenario(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
     RESOLVED.sites["s"].control.check_unchanged("s")
     with pytest.raises(ScenarioError, match=r"is not the one that the scenario names") as caught:
         other.sites["s"].control.check_unchanged("s")

@@ -6,9 +6,9 @@ import tomllib
 import pytest
 from scipy import stats
 
-from trilat_net.scenario import load
-from trilat_net.scenario.distributions import HyperExponential
-from trilat_net.scenario.presets import _FILE, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS, PRESETS
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.delay_models import HyperExponentialDelay
+from trilat_net.scenario.resolve_links import _PRESETS_FILE, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS, PRESETS
 
 ROUND_TRIPS_MS = {
     "frankfurt-bangalore": (144.88, 2.18),
@@ -30,9 +30,9 @@ def test_the_names() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_makes_a_scenario_in_every_place(name: str) -> None:
     for scenario in (
-        load("paper", [f"link.preset={name}"]),
-        load("paper", {"links": {"m1->s": {"preset": name}}}),
-        load("paper", {"timeline": [{"at_s": 1, "link": "m1->s", "to": {"preset": name}}]}),
+        load_scenario("paper", [f"link.preset={name}"]),
+        load_scenario("paper", {"links": {"m1->s": {"preset": name}}}),
+        load_scenario("paper", {"timeline": [{"at_s": 1, "link": "m1->s", "to": {"preset": name}}]}),
     ):
         assert repr(name) not in scenario.text.replace('"', "'")
         assert scenario.setup("s").links[0].models
@@ -40,14 +40,14 @@ def test_a_preset_makes_a_scenario_in_every_place(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "round_trip"), ROUND_TRIPS_MS.items())
 def test_a_pair_of_cities_is_half_a_round_trip_away(name: str, round_trip: tuple[float, float]) -> None:
-    mean_ms, deviation_ms = load("paper", {"link": {"preset": name}}).links["m1->s"].moments()
+    mean_ms, deviation_ms = load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].moments()
     assert 2 * mean_ms == pytest.approx(round_trip[0], abs=0.011)
     assert math.sqrt(2) * deviation_ms == pytest.approx(round_trip[1], abs=0.01)
 
 
 def test_wifi_has_half_of_the_percentiles_that_were_measured() -> None:
     keys = {key: value for key, value in PRESETS["wifi"].items() if key != "model"}
-    link = HyperExponential(**keys)
+    link = HyperExponentialDelay(**keys)
     parts = (stats.expon(link.floor_ms, link.fast_ms), stats.expon(link.floor_ms, link.slow_ms))
     for round_trip_ms, share in ((3, 0.5), (20, 0.9), (250, 0.99)):
         below = [part.cdf(round_trip_ms / 2) for part in parts]
@@ -64,7 +64,7 @@ def test_lan_has_half_of_the_median_and_of_the_quartiles_distance() -> None:
 
 def test_mobile_and_satellite_have_the_numbers_of_their_sources() -> None:
     def described(name: str) -> str:
-        return load("paper", {"link": {"preset": name}}).links["m1->s"].describe()
+        return load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].describe()
 
     assert PRESETS["4g"]["floor_ms"] + 0.8 * 10 + 0.2 * 150 == 53
     assert described("4g") == "hyperexponential 53 +- 87.8 ms"
@@ -76,13 +76,13 @@ def test_mobile_and_satellite_have_the_numbers_of_their_sources() -> None:
 @pytest.mark.parametrize("round_trip_ms", GRID_ROUND_TRIPS_MS)
 @pytest.mark.parametrize("percent", GRID_LOSSES_PERCENT)
 def test_the_grid_is_half_a_round_trip_and_single_losses(round_trip_ms: int, percent: int) -> None:
-    link = load("paper", {"link": {"preset": f"rtt{round_trip_ms}-loss{percent}"}}).links["m1->s"]
+    link = load_scenario("paper", {"link": {"preset": f"rtt{round_trip_ms}-loss{percent}"}}).links["m1->s"]
     assert link.moments() == (round_trip_ms / 2, 0.0)
     assert (link.loss, link.loss_burst) == (percent / 100, 0.0)
 
 
 def test_every_preset_of_the_file_has_a_comment_with_its_source() -> None:
-    text = _FILE.read_text(encoding="utf-8")
+    text = _PRESETS_FILE.read_text(encoding="utf-8")
     for name in tomllib.loads(text):
         head = f'["{name}"]' if name[0].isdigit() else f"[{name}]"
         body = text.split(head, 1)[1].split("\n\n", 1)[0]

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load
-from trilat_net.scenario.actors import HANDS, SURROUNDINGS
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.operators import ENVIRONMENTS, OPERATORS
 
 PULSE = {"kind": "pulse", "start_s": 1.0, "end_s": 2.0, "peak_nm": [1.0, 1.0]}
 SPRING = {"kind": "spring", "stiffness_nm_rad": 100.0}
@@ -21,15 +21,17 @@ GROUPS = {"hands": [PULSE, SPRING, TIP, RECORDED], "environment": [VISCOUS, WALL
 def refused(group: str, entry: Any) -> str:
     """What is said of one table of the last site; the sites before it have none."""
     with pytest.raises(ScenarioError) as error:
-        load("free", {f"sites.s.{group}": [entry]})
+        load_scenario("free", {f"sites.s.{group}": [entry]})
     path, _, problem = str(error.value).removeprefix("free: ").partition(": ")
     return path.removeprefix(f"sites.s.{group}[0]") + ": " + problem
 
 
 def test_every_kind_has_an_example_here_that_is_valid() -> None:
-    for group, kinds in (("hands", HANDS), ("environment", SURROUNDINGS)):
+    for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
         assert [entry["kind"] for entry in GROUPS[group]] == list(kinds)
-        assert len(getattr(load("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group)) == len(kinds)
+        assert len(
+            getattr(load_scenario("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group)
+        ) == len(kinds)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,7 @@ def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key
         (group, {**entry, key: "x"}, key)
         for group, entries in GROUPS.items()
         for entry in entries
-        for key in {**HANDS, **SURROUNDINGS}[entry["kind"]].__struct_fields__
+        for key in {**OPERATORS, **ENVIRONMENTS}[entry["kind"]].__struct_fields__
     ],
     ids=str,
 )
@@ -93,4 +95,4 @@ def test_what_authors_get_wrong(group: str, entry: Any, said: str) -> None:
 
 def test_a_start_pose_that_is_none_is_refused_at_its_own_key() -> None:
     with pytest.raises(ScenarioError, match=r"sites.m1.q0_rad"):
-        load("free", {"sites.m1.q0_rad": ["x", 0.0], "sites.m1.hands": [SPRING, TIP]})
+        load_scenario("free", {"sites.m1.q0_rad": ["x", 0.0], "sites.m1.hands": [SPRING, TIP]})

@@ -10,18 +10,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.delay import Model
-from trilat_net.core.exogenous import Actor, Acts
-from trilat_net.core.setup import Gains, Law, Scheme, Stale, StaleRule
+from trilat_net.core.delay import LinkModel
+from trilat_net.core.exogenous import TorqueKind, TorqueSource
+from trilat_net.core.site_setup import Gains, Law, Scheme, StaleAction, StaleRule
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load, override, parse, shipped, shipped_text, template_text
+from trilat_net.scenario import (
+    apply_overrides,
+    list_shipped,
+    load_scenario,
+    parse_scenario,
+    read_shipped,
+    read_template,
+)
 
-TEXT = shipped_text("paper")
+TEXT = read_shipped("paper")
 
 
 def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
     with pytest.raises(ScenarioError) as error:
-        parse(text, "mine.toml", overrides)
+        parse_scenario(text, "mine.toml", overrides)
     assert str(error.value).startswith("mine.toml: ")
     assert error.value.exit_code == 2
     return error.value
@@ -31,12 +38,12 @@ def test_what_is_shipped() -> None:
     adaptive = ["asymmetric", "free", "paper", "paper_rods", "two_sites", "lyapunov"]
     links = ["4g", "handover", "jitter", "outage"]
     laws = ["box", "contact", "force_sharing", "p_d_margin", "p_d_margin_two", "training", "windup"]
-    assert shipped() == sorted([*adaptive, *links, *laws])
+    assert list_shipped() == sorted([*adaptive, *links, *laws])
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_a_shipped_scenario_loads_and_is_called_by_its_name(name: str) -> None:
-    scenario = load(name)
+    scenario = load_scenario(name)
     assert scenario.name == name
     assert scenario.title
     assert scenario.assumed
@@ -45,22 +52,22 @@ def test_a_shipped_scenario_loads_and_is_called_by_its_name(name: str) -> None:
 
 
 def test_paper_is_section_iv() -> None:
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     assert (scenario.duration_s, scenario.scheme) == (20.0, "second_order")
     assert {link.delay_ms for link in scenario.links.values()} == {200.0}
     assert scenario.alpha.tolist() == [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]
     m1 = scenario.setup("m1")
     assert m1.theta.tolist() == [3.0, 1.0, 1.0, 2.0, 1.0]
-    assert m1.actors == (Actor(Acts.PULSE, 1.0, 6.0, a=(10.0, 10.0)),)
+    assert m1.actors == (TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, 10.0)),)
     assert m1.gains == Gains(Law.ADAPTIVE, (1, 1), (1, 1), (3, 3), (1,) * 5, (0,) * 5)
     assert [link.peer for link in m1.links] == ["m2", "s"]
-    assert m1.links[0].models == (Model(location=200_000.0),)
+    assert m1.links[0].models == (LinkModel(location=200_000.0),)
 
 
 def test_the_template_is_valid_and_its_defaults_are_what_it_says() -> None:
-    scenario = parse(template_text(), "template")
+    scenario = parse_scenario(read_template(), "template")
     assert scenario.name == "mine"
-    spelt_out = "\n".join(line.removeprefix("# ") for line in template_text().splitlines() if "=" in line)
+    spelt_out = "\n".join(line.removeprefix("# ") for line in read_template().splitlines() if "=" in line)
     assert "Kd = 3.0" in spelt_out
     control = scenario.sites["m1"].control
     assert (control.Kd, control.Gamma) == ((3.0, 3.0), (1.0,) * 5)
@@ -93,8 +100,8 @@ changes = st.fixed_dictionaries(
 @settings(max_examples=150)
 @given(overrides=changes)
 def test_the_canonical_text_loads_to_the_same_scenario(overrides: dict[str, Any]) -> None:
-    scenario = parse(TEXT, overrides=overrides)
-    again = parse(scenario.text)
+    scenario = parse_scenario(TEXT, overrides=overrides)
+    again = parse_scenario(scenario.text)
     assert again == scenario
     assert again.text == scenario.text
     assert again.sha256 == scenario.sha256
@@ -102,10 +109,13 @@ def test_the_canonical_text_loads_to_the_same_scenario(overrides: dict[str, Any]
 
 
 def test_the_hash_names_the_experiment() -> None:
-    hashes = [load("paper").sha256, load("free").sha256]
-    hashes += [load("paper", {key: 2}).sha256 for key in ("seed", "control.Kd", "arm.m1_kg", "link.delay_ms")]
+    hashes = [load_scenario("paper").sha256, load_scenario("free").sha256]
+    hashes += [
+        load_scenario("paper", {key: 2}).sha256
+        for key in ("seed", "control.Kd", "arm.m1_kg", "link.delay_ms")
+    ]
     assert len(set(hashes)) == len(hashes)
-    assert load("paper", {"control.Kd": 3}).sha256 == load("paper").sha256
+    assert load_scenario("paper", {"control.Kd": 3}).sha256 == load_scenario("paper").sha256
 
 
 # Overrides and defaults.
@@ -114,7 +124,7 @@ def test_the_hash_names_the_experiment() -> None:
 def test_an_override_reads_key_equals_value() -> None:
     tables: dict[str, Any] = {}
     texts = ["control.Kd=5", "scheme=digital", "sites.m1.q0_rad=[0.1, 2]", 'title="a = b"', "seed = 7"]
-    override(tables, texts)
+    apply_overrides(tables, texts)
     assert tables == {
         "control": {"Kd": 5},
         "scheme": "digital",
@@ -132,27 +142,29 @@ def test_an_override_without_key_or_value_is_refused(text: str) -> None:
 def test_an_override_that_names_a_kind_replaces_what_the_file_says_of_another() -> None:
     """Whatever comes first; other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
-        links = load("paper", texts).links.values()
+        links = load_scenario("paper", texts).links.values()
         assert {link.describe() for link in links} == {"hyperexponential 53 +- 87.8 ms, loss 10 %"}
-    assert load("paper", ["link.model=measured"]).measured
-    assert load("4g", ["link.delay_ms=5", "link.model=constant"]).links["m1->s"].describe() == "5 ms"
+    assert load_scenario("paper", ["link.model=measured"]).measured
+    assert load_scenario("4g", ["link.delay_ms=5", "link.model=constant"]).links["m1->s"].describe() == "5 ms"
 
 
 def test_an_override_of_the_law_takes_that_laws_gains() -> None:
-    scenario = load("paper", ["control.law=p_d", "control.d=7"])
+    scenario = load_scenario("paper", ["control.law=p_d", "control.d=7"])
     gains = scenario.setup("m1").gains
     assert (gains.law, gains.K, gains.d) == (Law.KNOWN, (10.0, 10.0), (7.0, 7.0))
     assert refused(["control.law=p_d", "control.Kp=2"]).path == "control.Kp"
-    mixed = load("paper", {"sites.s.control": {"law": "p_d"}})
+    mixed = load_scenario("paper", {"sites.s.control": {"law": "p_d"}})
     assert [mixed.setup(name).gains.law for name in mixed.names] == [Law.ADAPTIVE, Law.ADAPTIVE, Law.KNOWN]
 
 
 def test_what_to_do_about_a_stale_peer() -> None:
-    assert load("paper").setup("s").on_stale == StaleRule(Stale.USE, 350_000_000, 1_000_000_000)
+    assert load_scenario("paper").setup("s").on_stale == StaleRule(
+        StaleAction.USE, 350_000_000, 1_000_000_000
+    )
     keys = {"on_stale": {"action": "hold", "age_ms": 120.5}, "sites.s.on_stale": {"action": "brake"}}
-    scenario = load("paper", {**keys, "link.delay_ms": 100.0})
-    assert scenario.setup("m1").on_stale == StaleRule(Stale.HOLD, 120_500_000, 1_000_000_000)
-    assert scenario.setup("s").on_stale == StaleRule(Stale.BRAKE, 120_500_000, 1_000_000_000)
+    scenario = load_scenario("paper", {**keys, "link.delay_ms": 100.0})
+    assert scenario.setup("m1").on_stale == StaleRule(StaleAction.HOLD, 120_500_000, 1_000_000_000)
+    assert scenario.setup("s").on_stale == StaleRule(StaleAction.BRAKE, 120_500_000, 1_000_000_000)
     for value in (0, -1, "soon"):
         assert "age_ms" in refused({"on_stale.age_ms": value}).path
     assert refused({"on_stale.return_s": 0}).problem
@@ -164,15 +176,17 @@ def test_an_override_below_a_value_is_refused() -> None:
 
 
 def test_an_override_reaches_into_lists_by_number() -> None:
-    wall = load("contact").sites["s"].environment[0]
-    stiff = load("contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"])
+    wall = load_scenario("contact").sites["s"].environment[0]
+    stiff = load_scenario("contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"])
     assert stiff.sites["s"].environment == (msgspec.structs.replace(wall, stiffness_n_m=500.0),)
-    assert stiff.sites["s"].q0_rad == (load("contact").sites["s"].q0_rad[0], 0.5)
-    assert stiff.sites["m"].hands == load("contact").sites["m"].hands
-    resolved = load(load("contact"), {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5})
+    assert stiff.sites["s"].q0_rad == (load_scenario("contact").sites["s"].q0_rad[0], 0.5)
+    assert stiff.sites["m"].hands == load_scenario("contact").sites["m"].hands
+    resolved = load_scenario(
+        load_scenario("contact"), {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5}
+    )
     assert resolved == stiff
     given: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
-    override(given, ["a.0.b.1=5", "a.1.c=6"])
+    apply_overrides(given, ["a.0.b.1=5", "a.1.c=6"])
     assert given == {"a": [{"b": [1, 5]}, {"c": 6}]}
 
 
@@ -189,23 +203,23 @@ def test_an_override_reaches_into_lists_by_number() -> None:
     ],
 )
 def test_an_entry_that_is_not_in_a_list_is_refused(key: str, path: str, problem: str) -> None:
-    found = refused([f"{key}=1"], shipped_text("contact"))
+    found = refused([f"{key}=1"], read_shipped("contact"))
     assert found.path == path
     assert problem in found.problem
 
 
 def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
-    control = load("paper", {"control.Kd": 5, "control.Gamma": 0.5}).sites["s"].control
+    control = load_scenario("paper", {"control.Kd": 5, "control.Gamma": 0.5}).sites["s"].control
     assert control.Kd == (5.0, 5.0)
     assert control.Gamma == (0.5,) * 5
-    scenario = load("paper", {"sites.m1.q0_rad": 0.25, "sites.m1.control.Kp": [2, 3]})
+    scenario = load_scenario("paper", {"sites.m1.q0_rad": 0.25, "sites.m1.control.Kp": [2, 3]})
     assert scenario.sites["m1"].q0_rad == (0.25, 0.25)
     assert scenario.sites["m1"].control.Kp == (2.0, 3.0)
     assert scenario.sites["m2"].control.Kp == (1.0, 1.0)
 
 
 def test_a_site_overrides_single_keys_of_its_arm_and_a_link_its_delay() -> None:
-    scenario = load(
+    scenario = load_scenario(
         "paper", {"sites.s.arm.m1_kg": 2, "links": {"m1->s": {"delay_ms": 350.0}}, "sites.m2.rate_hz": 500}
     )
     assert scenario.sites["s"].arm.m1_kg == 2.0
@@ -218,23 +232,25 @@ def test_a_site_overrides_single_keys_of_its_arm_and_a_link_its_delay() -> None:
 
 def test_a_delay_is_rounded_to_whole_microseconds() -> None:
     for delay_ms, us in ((0.0004, 0.0), (0.0006, 1.0), (199.0011, 199_001.0)):
-        assert load("paper", {"link.delay_ms": delay_ms}).setup("m1").links[0].models[0].location == us
+        assert (
+            load_scenario("paper", {"link.delay_ms": delay_ms}).setup("m1").links[0].models[0].location == us
+        )
 
 
 def test_each_scheme_has_its_name() -> None:
-    assert load("paper", {"scheme": "digital"}).setup("m1").scheme is Scheme.DIGITAL
-    assert load("paper").setup("m1").scheme is Scheme.SECOND_ORDER
+    assert load_scenario("paper", {"scheme": "digital"}).setup("m1").scheme is Scheme.DIGITAL
+    assert load_scenario("paper").setup("m1").scheme is Scheme.SECOND_ORDER
 
 
 def test_without_hands_is_the_same_experiment_with_nobody_at_the_arms() -> None:
-    scenario = load("paper").without_hands()
+    scenario = load_scenario("paper").without_hands()
     assert all(spec.hands == () for spec in scenario.sites.values())
     assert scenario.setup("m1").actors == ()
-    assert scenario.sites["m1"].control == load("paper").sites["m1"].control
+    assert scenario.sites["m1"].control == load_scenario("paper").sites["m1"].control
 
 
 def test_shares_that_are_not_named_are_zero() -> None:
-    scenario = load("paper", {"dominance.m1": {"s": 1}})
+    scenario = load_scenario("paper", {"dominance.m1": {"s": 1}})
     assert scenario.alpha[0].tolist() == [0.0, 0.0, 1.0]
     assert scenario.beta is not None
 
@@ -242,8 +258,8 @@ def test_shares_that_are_not_named_are_zero() -> None:
 def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
     """Expert and slave locked, trainee following: it runs, and only the certificate is without weights."""
     rows = {"m1": {"s": 1}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 1}}
-    assert load("paper", {"dominance": rows}).beta is None
-    assert np.allclose(load("asymmetric").beta, [0.426, 0.155, 0.419], atol=5e-4)
+    assert load_scenario("paper", {"dominance": rows}).beta is None
+    assert np.allclose(load_scenario("asymmetric").beta, [0.426, 0.155, 0.419], atol=5e-4)
 
 
 # Bad input.
@@ -379,7 +395,7 @@ def test_rows_of_alpha_are_checked(row: dict[str, float], words: str) -> None:
 
 
 def test_rows_of_alpha_may_be_off_by_rounding() -> None:
-    assert load("paper", {"dominance.m1": {"m2": 1 / 3, "s": 2 / 3 + 1e-10}})
+    assert load_scenario("paper", {"dominance.m1": {"m2": 1 / 3, "s": 2 / 3 + 1e-10}})
 
 
 @pytest.mark.parametrize(
@@ -402,7 +418,7 @@ def test_what_is_missing_is_named(text: str, path: str) -> None:
 
 def test_the_smallest_scenario_is_two_sites_and_a_delay() -> None:
     text = 'name = "a"\n[link]\ndelay_ms = 3\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }'
-    scenario = parse(text)
+    scenario = parse_scenario(text)
     assert (scenario.duration_s, scenario.sites["a"].rate_hz) == (20.0, 1000)
 
 
@@ -426,11 +442,11 @@ def test_text_that_is_no_toml_is_refused() -> None:
 
 def test_files_are_read_by_path(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(template_text(), encoding="utf-8")
-    assert load(path) == load(str(path)) == parse(template_text())
-    scenario = load(path)
-    assert load(scenario) is scenario
-    assert load(scenario, {"seed": 5}).seed == 5
+    path.write_text(read_template(), encoding="utf-8")
+    assert load_scenario(path) == load_scenario(str(path)) == parse_scenario(read_template())
+    scenario = load_scenario(path)
+    assert load_scenario(scenario) is scenario
+    assert load_scenario(scenario, {"seed": 5}).seed == 5
 
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
@@ -442,20 +458,20 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
         (latin, "not UTF-8"),
     ):
         with pytest.raises(ScenarioError, match=words) as error:
-            load(path)
+            load_scenario(path)
         assert str(path) in str(error.value)
 
 
 def test_a_name_that_is_not_shipped_is_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
-        load("papre")
+        load_scenario("papre")
     assert "./mine.toml" in str(error.value)
 
 
 def test_a_stale_rule_below_the_links_delay_would_hold_for_ever_and_is_refused() -> None:
     rule = {"on_stale.action": "hold", "on_stale.age_ms": 350.0}
-    assert load("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action == "hold"
+    assert load_scenario("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action == "hold"
     for link in ({"link.delay_ms": 350.0}, {"link.playout_ms": 400.0}):
         with pytest.raises(ScenarioError, match=r"sites\.m1\.on_stale\.age_ms.*never follow"):
-            load("paper", {**rule, **link})
-    load("paper", {"on_stale.age_ms": 1.0})  # nothing follows from it
+            load_scenario("paper", {**rule, **link})
+    load_scenario("paper", {"on_stale.age_ms": 1.0})  # nothing follows from it

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.virtual_runs import Run, trajectories
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 
 def ran(name: str, overrides: dict[str, Any] | None = None) -> Run:
-    return trajectories(load(name, {"expect": {}, **(overrides or {})}))
+    return trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
 
 
 def largest_errors(run: Run) -> np.ndarray:

@@ -3,9 +3,9 @@
 import pytest
 
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
-PAPER = load("paper")
+PAPER = load_scenario("paper")
 
 
 @pytest.mark.parametrize("name", ["paper", "free", "two_sites"])
@@ -28,25 +28,25 @@ def test_it_is_what_the_same_override_gives_as_the_scenario_is_loaded(
     name: str, overrides: dict[str, object]
 ) -> None:
     """Of scenarios whose sites and links have nothing of their own."""
-    assert load(load(name), overrides) == load(name, overrides)
+    assert load_scenario(load_scenario(name), overrides) == load_scenario(name, overrides)
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
     texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][::order]
-    scenario = load(PAPER, texts)
+    scenario = load_scenario(PAPER, texts)
     assert [site.control.Kd[0] for site in scenario.sites.values()] == [5.0, 5.0, 7.0]
     assert {name: link.loss for name, link in scenario.links.items() if link.loss != 0.1} == {"m1->s": 0.2}
 
 
 def test_another_law_has_its_own_gains_from_the_start() -> None:
-    control = load(PAPER, ["control.law=p_d", "control.K=20"]).sites["m2"].control
+    control = load_scenario(PAPER, ["control.law=p_d", "control.K=20"]).sites["m2"].control
     assert (control.K, control.d) == ((20.0, 20.0), (3.0, 3.0))
 
 
 def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
-    mixed = load(PAPER, ["sites.m1.control.law=p_d", "links.m1->s.model=measured"])
-    again = load(mixed, ["control.Kd=5", "control.K=30", "link.delay_ms=50"])
+    mixed = load_scenario(PAPER, ["sites.m1.control.law=p_d", "links.m1->s.model=measured"])
+    again = load_scenario(mixed, ["control.Kd=5", "control.K=30", "link.delay_ms=50"])
     assert again.sites["m1"].control.K == (30.0, 30.0)
     assert again.sites["s"].control.Kd == (5.0, 5.0)
     assert again.links["m1->s"].measured
@@ -72,6 +72,6 @@ def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
 )
 def test_a_key_that_nothing_can_have_is_refused(overrides: list[str], facts: list[str]) -> None:
     with pytest.raises(ScenarioError) as caught:
-        load(PAPER, overrides)
+        load_scenario(PAPER, overrides)
     assert str(caught.value).startswith("paper: ")
     assert all(fact in str(caught.value) for fact in facts), caught.value

@@ -9,22 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenario.links import links
-from trilat_net.core.delay import Delay, Model
-from trilat_net.core.grid import first_tick_at
-from trilat_net.core.tick import Ramp
+from trilat_net.core.delay import DelayKind, LinkModel
+from trilat_net.core.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
+from trilat_net.execution import virtual
 from trilat_net.scenario import (
     Scenario,
-    command,
-    command_from,
-    load,
-    owner,
-    present_links,
+    find_owner,
+    initial_link_tables,
+    load_scenario,
+    parse_core_change,
+    read_shipped,
     resolve_change,
-    shipped_text,
+    to_core_change,
 )
-from trilat_net.scenario.reader import parse
-from trilat_net.sim import virtual
+from trilat_net.scenario.scenario_reader import parse_scenario
 
 S = 10**9
 LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}
@@ -32,30 +31,30 @@ ROW = {"at_s": 10.0, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 2
 
 
 def scripted(*changes: Any, **overrides: Any) -> Scenario:
-    return load("paper", {"timeline": list(changes), **overrides})
+    return load_scenario("paper", {"timeline": list(changes), **overrides})
 
 
 def refused(*changes: Any, **overrides: Any) -> ScenarioError:
     with pytest.raises(ScenarioError) as error:
-        parse(shipped_text("paper"), "mine", {"timeline": list(changes), **overrides})
+        parse_scenario(read_shipped("paper"), "mine", {"timeline": list(changes), **overrides})
     return error.value
 
 
 def test_a_change_of_a_link_is_its_model_from_then_on() -> None:
     setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
     assert setup.links[0].models == (
-        Model(location=200_000.0),
-        Model(from_ns=8 * S, location=350_000.0),
-        Model(from_ns=9 * S, location=350_000.0, loss_good=0.5),
+        LinkModel(location=200_000.0),
+        LinkModel(from_ns=8 * S, location=350_000.0),
+        LinkModel(from_ns=9 * S, location=350_000.0, loss_good=0.5),
     )
-    assert setup.links[1].models == (Model(location=200_000.0),)
+    assert setup.links[1].models == (LinkModel(location=200_000.0),)
 
 
 def test_a_change_of_shares_is_a_ramp() -> None:
     scenario = scripted(LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}})
     assert scenario.setup("s").ramps == (
-        Ramp(10 * S, 12 * S, (0.9, 0.1)),
-        Ramp(11 * S, 11 * S, (0.0, 1.0)),
+        DominanceRamp(10 * S, 12 * S, (0.9, 0.1)),
+        DominanceRamp(11 * S, 11 * S, (0.0, 1.0)),
     )
     assert scenario.setup("m1").ramps == ()
 
@@ -81,7 +80,11 @@ def test_a_trace_may_be_left_and_its_loss_changed_but_no_other_begun() -> None:
         {"at_s": 2, "link": "m1->s", "to": {"preset": "lan"}},
     ]
     links_of_s = scripted(*left, link=base).setup("s").links
-    assert [model.kind for model in links_of_s[0].models] == [Delay.TRACE, Delay.TRACE, Delay.GAMMA]
+    assert [model.kind for model in links_of_s[0].models] == [
+        DelayKind.TRACE,
+        DelayKind.TRACE,
+        DelayKind.GAMMA,
+    ]
     assert [trace is not None for trace in links_of_s[0].traces] == [True, True, False]
     other = {"at_s": 1, "link": "m1->s", "to": {"model": "trace", "trace": "0 8000"}}
     assert refused(other, link=base).path == "timeline[0].to.model"
@@ -141,34 +144,34 @@ def test_changes_stand_in_the_order_of_their_times() -> None:
     assert error.path == "timeline[1].at_s"
     assert "must not be before the change above it, 10 s" in error.problem
     with pytest.raises(ScenarioError, match="list of tables"):
-        load("paper", {"timeline": 5})
+        load_scenario("paper", {"timeline": 5})
 
 
 # By command.
 
 
 def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
-    return resolve_change(scenario, present_links(scenario), written, from_ns)
+    return resolve_change(scenario, initial_link_tables(scenario), written, from_ns)
 
 
 def test_a_command_holds_from_its_tick_and_belongs_to_the_receiver() -> None:
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     change = ordered(scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789)
-    assert (owner(change), change.start_ns) == ("s", 123_456_789)
-    made = command(scenario, change)
-    assert (made.peer, made.model) == (0, Model(from_ns=123_456_789, location=350_000.0, loss_good=0.05))
+    assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
+    made = to_core_change(scenario, change)
+    assert (made.peer, made.model) == (0, LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05))
     change = ordered(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
-    assert owner(change) == "m2"
-    assert command(scenario, change).ramp == Ramp(2 * S, 2_500_000_000, (0.0, 1.0))
+    assert find_owner(change) == "m2"
+    assert to_core_change(scenario, change).ramp == DominanceRamp(2 * S, 2_500_000_000, (0.0, 1.0))
 
 
 @settings(max_examples=60)
 @given(to=links(without=("trace",)), from_ns=st.integers(0, 10**14))
 def test_a_record_that_names_a_command_makes_the_same_command(to: dict[str, Any], from_ns: int) -> None:
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    made = command(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
-    assert command_from(scenario, "m1", made.text) == made
+    made = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    assert parse_core_change(scenario, "m1", made.text) == made
     assert made.model is not None
     assert made.model.from_ns == from_ns
 
@@ -181,16 +184,16 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
     script = {**change, "at_s": at_ns / S, **({"ramp_s": 0.2} if "dominance" in change else {})}
     if "link" in change:
         script["to"] = {"model": "constant", "delay_ms": 60.0}
-    plain, planned = load("free", short), load("free", {**short, "timeline": [script]})
+    plain, planned = load_scenario("free", short), load_scenario("free", {**short, "timeline": [script]})
     written = {key: value for key, value in script.items() if key != "at_s"}
-    made = command(plain, ordered(plain, written, at_ns))
+    made = to_core_change(plain, ordered(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
-    commanded = list(virtual.run(plain, commands={"s": {k: [made]}}))
-    scripted_run = list(virtual.run(planned))
+    commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [made]}}))
+    scripted_run = list(virtual.execute_virtual(planned))
     assert [step.output._replace(cmd=[]) for step in commanded] == [step.output for step in scripted_run]
     named = [step.output for step in commanded if step.output.cmd]
     assert [(output.tick, output.cmd) for output in named] == [(k, [made.text])]
-    assert commanded != list(virtual.run(plain))
+    assert commanded != list(virtual.execute_virtual(plain))
 
 
 @pytest.mark.parametrize(
@@ -209,14 +212,17 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
 )
 def test_an_order_that_cannot_be_is_refused(written: dict[str, Any], words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
-        ordered(load("paper"), written)
+        ordered(load_scenario("paper"), written)
 
 
 def test_a_link_with_a_trace_takes_no_orders_that_a_record_could_not_hold() -> None:
-    scenario = load("paper", {"link": {"model": "trace", "trace": "0 7000"}})
+    scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
     with pytest.raises(ScenarioError, match="can only be given another model"):
         ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
-    assert command(scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})).model is not None
+    assert (
+        to_core_change(scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})).model
+        is not None
+    )
 
 
 good = {"at_s": 1.0, "link": "m1->s", "to": {"model": "constant", "delay_ms": 5.0}}
@@ -247,8 +253,8 @@ row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
     ],
 )
 def test_a_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
-    scenario = load("paper")
+    scenario = load_scenario("paper")
     for valid in (good, row):
-        assert command_from(scenario, "s", json.dumps(valid)).text == msgspec.json.encode(valid).decode()
+        assert parse_core_change(scenario, "s", json.dumps(valid)).text == msgspec.json.encode(valid).decode()
     with pytest.raises(ScenarioError):
-        command_from(scenario, "s", text)
+        parse_core_change(scenario, "s", text)

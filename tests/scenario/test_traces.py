@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.core.channel import LOST
-from trilat_net.core.delay import LIMIT_US, AtEnd
+from trilat_net.core.delay import MAX_DELAY_US, TraceEnd
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load, parse, shipped_text
-from trilat_net.scenario.traces import MAX_POINTS, points_of, read_trace, text_of
+from trilat_net.scenario import load_scenario, parse_scenario, read_shipped
+from trilat_net.scenario.delay_traces import MAX_TRACE_POINTS, format_trace, parse_trace, read_trace
 
 POINTS = [[0, 41_200], [1_000, LOST], [2_500, 0]]
 TEXT = "0 41200, 1000 lost, 2500 0"
@@ -36,11 +36,11 @@ def test_tables_as_people_have_them(tmp_path: Path, content: str) -> None:
     (tmp_path / "delays.csv").write_bytes(content.encode())
     text = read_trace(tmp_path / "delays.csv", "m1->s")
     assert text == TEXT
-    assert points_of(text).tolist() == POINTS
+    assert parse_trace(text).tolist() == POINTS
 
 
 rows = st.lists(
-    st.tuples(st.integers(1, 10**8), st.integers(0, LIMIT_US) | st.just(LOST)), min_size=1, max_size=30
+    st.tuples(st.integers(1, 10**8), st.integers(0, MAX_DELAY_US) | st.just(LOST)), min_size=1, max_size=30
 )
 
 
@@ -51,8 +51,8 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
     table = [
         (t / 1e6, math.inf if us == LOST else us / 1e3) for t, us in zip(t_us.tolist(), delays, strict=True)
     ]
-    text = text_of(table)
-    assert points_of(text).tolist() == [[t - t_us[0], us] for t, us in zip(t_us, delays, strict=True)]
+    text = format_trace(table)
+    assert parse_trace(text).tolist() == [[t - t_us[0], us] for t, us in zip(t_us, delays, strict=True)]
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
 def test_what_is_no_trace_is_refused_where_it_is_wrong(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
     with pytest.raises(ScenarioError) as error:
-        load("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}})
+        load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}})
     assert error.value.path == "links.m1->s.file"
     assert words in error.value.problem
     assert "delays.csv" in error.value.problem
@@ -103,7 +103,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 
 def test_a_trace_that_is_too_long_is_refused() -> None:
     with pytest.raises(ValueError, match="has 200001 points, at most 200000"):
-        text_of([(n / 1000, 5.0) for n in range(MAX_POINTS + 1)])
+        format_trace([(n / 1000, 5.0) for n in range(MAX_TRACE_POINTS + 1)])
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_trace_that_is_too_long_is_refused() -> None:
 )
 def test_a_text_that_is_none_of_ours_is_refused(text: str) -> None:
     with pytest.raises(ScenarioError) as error:
-        load("paper", {"link": {"model": "trace", "trace": text}})
+        load_scenario("paper", {"link": {"model": "trace", "trace": text}})
     assert error.value.path.endswith(".trace")
 
 
@@ -132,8 +132,8 @@ def test_a_text_that_is_none_of_ours_is_refused(text: str) -> None:
 
 
 def scenario(folder: Path, link: str) -> Any:
-    text = shipped_text("paper").replace("[link]\ndelay_ms = 200.0", link)
-    return parse(text, "mine", folder=folder)
+    text = read_shipped("paper").replace("[link]\ndelay_ms = 200.0", link)
+    return parse_scenario(text, "mine", folder=folder)
 
 
 def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
@@ -141,13 +141,13 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
     made = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
     assert {link.trace for link in made.links.values()} == {TEXT}
     assert "delays.csv" not in made.text
-    assert parse(made.text) == made
+    assert parse_scenario(made.text) == made
     (path := tmp_path / "mine.toml").write_text(
-        shipped_text("paper").replace("delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'), "utf-8"
+        read_shipped("paper").replace("delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'), "utf-8"
     )
-    assert load(path).links["m1->s"].trace == TEXT
+    assert load_scenario(path).links["m1->s"].trace == TEXT
     setup = made.setup("s").links[0]
-    assert setup.models[0].at_end == AtEnd.LOOP
+    assert setup.models[0].at_end == TraceEnd.LOOP
     assert setup.traces[0] is not None
     assert setup.traces[0].tolist() == POINTS
 

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import msgpack
 
-from recorder.recorder import Recorder
-from sites.process import Member, Options
-from trilat_net.interrupt import Interrupt
-from trilat_net.log.parts import Storage
-from trilat_net.log.reader import Log, open_log
+from recorder.record_process import Recorder
+from sites.site_process import SiteOptions, SiteProcess
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_writer import LogStorage
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, SkewedClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State
 from trilat_net.net.wire import decode, encode_state
+from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
-from trilat_net.sim import virtual
 
 from .relay import Relay, RelayClock
 
@@ -39,7 +39,7 @@ class Session:
     said: list[str] = field(default_factory=list)
     skews: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Of members on clocks of their own: how far ahead (ns), and how much faster (ns/s)."""
-    storage: Storage | None = None
+    storage: LogStorage | None = None
     """Where the log goes, if not simply to `path`."""
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
@@ -51,12 +51,12 @@ class Session:
 
     def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
         """A site's life, from its connection to its exit code."""
-        options = Options(SESSION, Connection(), 10.0, needs_recorder)
+        options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder)
         interrupt = self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
         bus = self.network.join()
         try:
-            return Member(self.scenario, name, options, bus, own, interrupt, self.said.append).live()
+            return SiteProcess(self.scenario, name, options, bus, own, interrupt, self.said.append).live()
         finally:
             bus.close()
 
@@ -71,7 +71,7 @@ class Session:
             try:
                 own = self._own("recorder", clock)
                 recorder = Recorder(
-                    *(bus, own, SESSION, RECORDER_BOOT, self.storage or Storage(self.path)),
+                    *(bus, own, SESSION, RECORDER_BOOT, self.storage or LogStorage(self.path)),
                     stopped,
                     self.said.append,
                 )
@@ -108,7 +108,7 @@ def computed(state: State) -> bytes:
 def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
     """Per site what every tick computes in plain virtual time."""
     ticks: dict[str, list[bytes]] = {name: [] for name in scenario.names}
-    for site, arrivals, output in virtual.run(scenario):
+    for site, arrivals, output in virtual.execute_virtual(scenario):
         payload = encode_state(site.name, 0, site.peers, output, arrivals, 0, 0)
         ticks[site.name].append(computed(decode(payload, State)))
     return ticks

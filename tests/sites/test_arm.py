@@ -11,18 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.arm import CAPACITY, SILENT_NS, OutsideArm
+from sites.external_arm import MEASUREMENTS_KEPT, SILENCE_LIMIT_NS, ExternalArm
 from trilat_net.errors import RunFailed, SessionError
-from trilat_net.experiment import compare_with_virtual, verify
-from trilat_net.log.reader import Log
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.arm_port import FRESH_NS, ArmPort
 from trilat_net.net.bus import Bus, LocalNetwork, StampingRing
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.measurement import Measurement
 from trilat_net.net.messages import VERSION, Event
+from trilat_net.net.requests import ArmMeasurement
 from trilat_net.net.wire import encode
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
 from .sessions import SESSION, Session
@@ -69,7 +70,7 @@ def driving(sent: list[list[float]], torques: list[tuple[float, ...]], until_ns:
 
 def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
     """A session with that arm, and what became of its sites once it has run."""
-    session = Session(load("two_sites", {**OUTSIDE, **overrides}), folder / "run.mcap")
+    session = Session(load_scenario("two_sites", {**OUTSIDE, **overrides}), folder / "run.mcap")
     ends: dict[str, object] = {}
     live = session.live
 
@@ -132,7 +133,7 @@ def test_an_arm_that_falls_silent_ends_the_session_in_order_and_is_named(tmp_pat
 
 @pytest.mark.usefixtures("unprepared")
 def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
-    session = Session(load("two_sites", OUTSIDE), tmp_path / "run.mcap")
+    session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
     def alone(clock: RelayClock) -> None:
         with pytest.raises(SessionError, match=r"s waited in vain for its arm: .* trilat/t/s/measured"):
@@ -173,9 +174,9 @@ class Heard:
 
     def __init__(self) -> None:
         self.clock = ManualClock()
-        self.ring = StampingRing(self.clock.monotonic_ns, CAPACITY)
+        self.ring = StampingRing(self.clock.monotonic_ns, MEASUREMENTS_KEPT)
         self.dropped: Counter[str] = Counter()
-        self.arm = OutsideArm("s", self.ring, self.clock, self.dropped, "here")
+        self.arm = ExternalArm("s", self.ring, self.clock, self.dropped, "here")
 
     def hear(self, *payloads: bytes) -> None:
         for payload in payloads:
@@ -224,7 +225,7 @@ def test_a_flood_is_bounded_and_what_is_lost_of_it_is_counted() -> None:
     heard.hear(measurement(n=0))
     heard.arm.bind((0.5, 0.25))
     heard.hear(measurement(n=1), *(measurement(n=n) for n in range(2, 502)))
-    assert heard.arm.taken == 1 + CAPACITY
+    assert heard.arm.taken == 1 + MEASUREMENTS_KEPT
     heard.hear(measurement(n=510))
     assert heard.dropped["missing measurement"] == 8
 
@@ -247,7 +248,7 @@ def test_silence_is_what_the_site_itself_could_have_heard() -> None:
     heard.clock.sleep_until(60 * A_SECOND)
     heard.hear()
     assert heard.arm.failure is None
-    for _ in range(SILENT_NS // PERIOD_NS + 1):
+    for _ in range(SILENCE_LIMIT_NS // PERIOD_NS + 1):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
         heard.hear()
     assert "the arm of s was silent" in str(heard.arm.failure)
@@ -307,15 +308,15 @@ def test_a_site_that_is_gone_is_over() -> None:
 
 
 def test_the_example_of_a_message_is_one() -> None:
-    message = Measurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
+    message = ArmMeasurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
     assert encode(message) == measurement()
 
 
 def test_the_page_names_every_field_of_a_message() -> None:
     page = (Path(__file__).parents[2] / "docs" / "external-arm.md").read_text(encoding="utf-8")
     table = page[page.index("| key |") : page.index("The torque stands")]
-    assert set(re.findall(r"`(\w+)`", table)) == set(Measurement.__struct_fields__)
+    assert set(re.findall(r"`(\w+)`", table)) == set(ArmMeasurement.__struct_fields__)
     assert f"| {VERSION}, the version of the messages |" in table
-    for seconds in (SILENT_NS, FRESH_NS):
+    for seconds in (SILENCE_LIMIT_NS, FRESH_NS):
         assert f"{seconds * 1e-9:g} s" in page
-    assert f"at most {CAPACITY} wait" in page
+    assert f"at most {MEASUREMENTS_KEPT} wait" in page

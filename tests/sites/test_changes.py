@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.changes import AHEAD_MS, Changes
-from trilat_net.core.site import MAX_COMMANDS, Site
-from trilat_net.core.tick import Command, Tick
+from sites.change_server import AHEAD_MS, ChangeServer
+from trilat_net.core.site_step import MAX_CHANGES, Site
+from trilat_net.core.ticks import CoreChange, TickInput
 from trilat_net.net import topics
-from trilat_net.net.answers import Order, Reply
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
+from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
-from trilat_net.scenario import Scenario, command_from, load
+from trilat_net.scenario import Scenario, load_scenario, parse_core_change
 
 SESSION = "changes"
 KEY = topics.key(SESSION, "s", topics.SET)
@@ -25,19 +25,19 @@ class Asked:
 
     def __init__(self, scenario: Scenario | None = None) -> None:
         network = LocalNetwork()
-        self.scenario = scenario or load("paper")
+        self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
-        self.changes = Changes(self.scenario, "s", network.join().questions(KEY))
+        self.changes = ChangeServer(self.scenario, "s", network.join().questions(KEY))
 
     def send(self, payload: bytes) -> Inbox:
         return self._client.ask(KEY, payload)
 
-    def ask(self, k: int, **order: Any) -> tuple[list[Command], Reply]:
-        replies = self.send(encode(Order(**order)))
+    def ask(self, k: int, **order: Any) -> tuple[list[CoreChange], ChangeReply]:
+        replies = self.send(encode(ChangeRequest(**order)))
         taken = list(self.changes.take(k))
         answer = replies.poll()
         assert answer is not None
-        return taken, decode(answer[1], Reply)
+        return taken, decode(answer[1], ChangeReply)
 
 
 @given(st.integers(0, 10_000))
@@ -47,7 +47,7 @@ def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k
     (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
     assert reply.accepted
     assert reply.tick == k + AHEAD_MS
-    assert command_from(asked.scenario, "s", taken.text) == taken
+    assert parse_core_change(asked.scenario, "s", taken.text) == taken
     assert taken.model is not None
     assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
     assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)
@@ -55,7 +55,7 @@ def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k
 
 def test_what_a_change_does_not_name_stays_as_it_was_even_by_the_timeline() -> None:
     later = {"at_s": 1.0, "link": "m1->s", "to": {"loss": 0.25}}
-    asked = Asked(load("paper", {"timeline": [later]}))
+    asked = Asked(load_scenario("paper", {"timeline": [later]}))
     (before,), _ = asked.ask(10, link="m1->s", to={"duplicate": 0.5})
     (after,), _ = asked.ask(1000, link="m1->s", to={"delay_ms": 10.0})
     (last,), _ = asked.ask(1001, link="m1->s", to={"playout_ms": 20.0})
@@ -106,18 +106,18 @@ def test_what_cannot_be_is_refused_with_the_reason(order: Mapping[str, Any], say
 
 def test_a_client_of_another_version_is_refused_with_both_versions() -> None:
     asked = Asked()
-    replies = asked.send(encode(Order(v=99, link="m1->s", to={"delay_ms": 1.0})))
+    replies = asked.send(encode(ChangeRequest(v=99, link="m1->s", to={"delay_ms": 1.0})))
     assert asked.changes.take(0) == []
     answer = replies.poll()
     assert answer is not None
-    assert "99" in decode(answer[1], Reply).text
+    assert "99" in decode(answer[1], ChangeReply).text
 
 
 def test_what_is_no_order_is_answered_and_harmless() -> None:
     asked = Asked()
     replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
     assert asked.changes.take(0) == []
-    assert all((answer := r.poll()) and not decode(answer[1], Reply).accepted for r in replies)
+    assert all((answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies)
 
 
 def test_a_change_that_the_run_does_not_live_to_see_is_refused() -> None:
@@ -130,7 +130,7 @@ def test_a_run_takes_a_bounded_number_of_changes() -> None:
     """L6: the site's tables hold every change that was accepted, and one more is refused."""
     asked = Asked()
     site = Site(asked.scenario.setup("s"))
-    for k in range(MAX_COMMANDS):
+    for k in range(MAX_CHANGES):
         (taken,), _ = asked.ask(k, link="m1->s", to={"delay_ms": float(k)})
-        assert site.step(Tick(k, (), [taken])).cmd == [taken.text]
-    assert asked.ask(MAX_COMMANDS, link="m1->s", to={"delay_ms": 1.0})[0] == []
+        assert site.step(TickInput(k, (), [taken])).cmd == [taken.text]
+    assert asked.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []

@@ -6,9 +6,10 @@ import pytest
 
 from sites import realtime
 from tests.truth import judged, members, offset_errors
-from trilat_net.experiment import compare_with_virtual, verify
-from trilat_net.log.reader import Log
-from trilat_net.scenario import load
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
 
 from .relay import Relay
 from .sessions import Session, in_log, in_virtual_time
@@ -21,7 +22,9 @@ def run(
     folder: Path, skews: dict[str, tuple[int, int]], duration_s: float, relay: Relay | None = None
 ) -> tuple[Session, Log]:
     """A session of `asymmetric` in which members are on clocks of their own."""
-    session = Session(load("asymmetric", {"duration_s": duration_s}), folder / "run.mcap", relay or Relay())
+    session = Session(
+        load_scenario("asymmetric", {"duration_s": duration_s}), folder / "run.mcap", relay or Relay()
+    )
     session.skews = skews
     session.recorder()
     for name in session.scenario.names:
@@ -135,7 +138,7 @@ def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: 
 @pytest.mark.usefixtures("unprepared")
 @pytest.mark.parametrize("at_ns", [1_050_000_000, 1_250_000_000])
 def test_a_member_on_another_clock_that_hangs_while_joining_is_waited_for(at_ns: int, tmp_path: Path) -> None:
-    session = Session(load("two_sites", {"duration_s": 0.3}), tmp_path / "run.mcap")
+    session = Session(load_scenario("two_sites", {"duration_s": 0.3}), tmp_path / "run.mcap")
     session.skews = {"s": (S, 50_000)}
     session.recorder()
     for name in session.scenario.names:

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from sites.company import Company
+from sites.peer_monitor import PeerMonitor
 from trilat_net.net import topics
 from trilat_net.net.bus import LocalBus, LocalNetwork
+from trilat_net.net.membership import EventPublisher, liveliness_token, read_events
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.voice import Voice, said, token
 from trilat_net.net.wire import encode
 
 BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
@@ -20,13 +20,13 @@ class Desk:
         self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
         bus = self.network.join()
         info = Info(member="m1", boot=1, scenario_sha256="", scenario="", host="", clock="", fingerprint="")
-        self._voice = Voice(bus, "t", info)
-        self.company = Company(bus, "t", "m1", ("m2", "s"))
+        self._voice = EventPublisher(bus, "t", info)
+        self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
         self.company.admit(BOOTS)
 
     def comes(self, member: str, boot: int) -> LocalBus:
         bus = self.network.join()
-        bus.announce(token("t", member, boot))
+        bus.announce(liveliness_token("t", member, boot))
         return bus
 
     def says(self, member: str, boot: int, kind: str, about: str = "", ticks: int = 0) -> None:
@@ -35,7 +35,7 @@ class Desk:
 
     def told(self) -> Sequence[tuple[str, str]]:
         self.company.watch(self._voice, 0)
-        return [(event.kind, event.about) for event in said(self._heard)]
+        return [(event.kind, event.about) for event in read_events(self._heard)]
 
 
 def test_a_peer_that_goes_without_a_word_is_lost() -> None:

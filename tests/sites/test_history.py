@@ -3,11 +3,11 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.history import EVENTS, KEPT_S, RECORDS, History, Ring
+from sites.retransmit_buffer import EVENTS_KEPT, KEPT_S, RECORDS_KEPT, ChannelBuffer, RetransmitBuffer
 from trilat_net.net import topics
-from trilat_net.net.answers import CHUNK, CHUNK_BYTES, Past, Wanted
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.messages import VERSION
+from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, Backfill, BackfillRequest
 from trilat_net.net.wire import MAX_BYTES, decode, encode
 
 KEY = topics.key("t", "m1", topics.PAST)
@@ -20,7 +20,7 @@ class Desk:
     def __init__(self, rate_hz: int = 1000) -> None:
         network = LocalNetwork()
         self._asker = network.join()
-        self.history = History("m1", BOOT, rate_hz, network.join().questions(KEY))
+        self.history = RetransmitBuffer("m1", BOOT, rate_hz, network.join().questions(KEY))
 
     def ask(self, payload: bytes) -> Inbox:
         replies = self._asker.ask(KEY, payload)
@@ -28,10 +28,10 @@ class Desk:
             pass
         return replies
 
-    def told(self, channel: str, first: int, last: int) -> Past:
-        reply = self.ask(encode(Wanted(channel=channel, first=first, last=last))).poll()  # type: ignore[arg-type]
+    def told(self, channel: str, first: int, last: int) -> Backfill:
+        reply = self.ask(encode(BackfillRequest(channel=channel, first=first, last=last))).poll()  # type: ignore[arg-type]
         assert reply is not None
-        return decode(reply[1], Past)
+        return decode(reply[1], Backfill)
 
 
 @given(
@@ -45,7 +45,7 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
     capacity: int, size_bytes: int, sizes: list[int], first: int, length: int
 ) -> None:
     """Asked again and again from behind what it has told, it tells exactly what is left of a range."""
-    ring = Ring(capacity, size_bytes)
+    ring = ChannelBuffer(capacity, size_bytes)
     payloads = [str(n).encode()[-size:].zfill(size) for n, size in enumerate(sizes)]
     for payload in payloads:
         ring.keep(payload)
@@ -53,8 +53,8 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
     while True:
         begun, chunk = ring.chunk(at, last)
         assert begun == max(at, ring.oldest)
-        assert len(chunk) <= CHUNK
-        assert sum(map(len, chunk)) <= CHUNK_BYTES
+        assert len(chunk) <= BACKFILL_MESSAGES
+        assert sum(map(len, chunk)) <= BACKFILL_BYTES
         if not chunk:
             break
         told += [(begun + n, payload) for n, payload in enumerate(chunk)]
@@ -70,7 +70,7 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
 )
 def test_a_ring_forgets_no_more_than_it_must(capacity: int, size_bytes: int, sizes: list[int]) -> None:
     """What is left fills the memory, but for the piece of a message at its end, or the places."""
-    ring = Ring(capacity, size_bytes)
+    ring = ChannelBuffer(capacity, size_bytes)
     for size in sizes:
         ring.keep(b"x" * size)
     left = ring.made - ring.oldest
@@ -94,12 +94,12 @@ def test_every_channel_is_told_apart() -> None:
 
 def test_memory_holds_a_minute_and_no_more() -> None:
     rings = Desk(1000).history.rings
-    for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS), strict=True):
+    for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS_KEPT), strict=True):
         for _ in range(capacity + 5):
             ring.keep(b"x" * 600)
         assert ring.oldest == 5
     fast = Desk(20_000).history.rings[topics.STATE]
-    for _ in range(RECORDS + 1):
+    for _ in range(RECORDS_KEPT + 1):
         fast.keep(b"x" * 600)
     assert fast.oldest == 1
 
@@ -114,12 +114,12 @@ def test_the_largest_messages_fit_an_answer() -> None:
 
 def test_nobody_is_answered_who_does_not_ask_properly() -> None:
     desk = Desk()
-    good = Wanted(channel="state", first=0, last=3)
+    good = BackfillRequest(channel="state", first=0, last=3)
     for payload in (
         b"",
         b"\xff",
         encode(good)[:-1],
-        encode(Wanted(v=VERSION + 1, channel="state", first=0, last=0)),
+        encode(BackfillRequest(v=VERSION + 1, channel="state", first=0, last=0)),
     ):
         assert desk.ask(payload).poll() is None
     assert desk.ask(encode(good)).poll() is not None

@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.intake import Intake
+from sites.site_loop import PeerInbox
 from trilat_net.core.link import AHEAD_LIMIT_NS
-from trilat_net.core.tick import MAX_ARRIVALS
+from trilat_net.core.ticks import MAX_ARRIVALS
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.course import Course
 from trilat_net.net.messages import VERSION
-from trilat_net.net.meter import Meter, Sent
-from trilat_net.net.offset import known
+from trilat_net.net.offset import SlewedOffset, exact_offset
+from trilat_net.net.timing import LinkTimingMonitor, SentStamps
 from trilat_net.net.wire import MAX_BYTES
 
 PEERS = ("m2", "s")
@@ -51,8 +50,10 @@ class Desk:
         rings = [receiver.stamped(name, self.clock.monotonic_ns, capacity) for name in PEERS]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
-        self.intake = Intake(PEERS, rings, rates, self.dropped)
-        self.meters = [Meter(EPOCH_NS, 0, Sent(), Course(known(0)), None) for _ in PEERS]
+        self.intake = PeerInbox(PEERS, rings, rates, self.dropped)
+        self.meters = [
+            LinkTimingMonitor(EPOCH_NS, 0, SentStamps(), SlewedOffset(exact_offset(0)), None) for _ in PEERS
+        ]
         self.intake.admit(BOOTS, self.meters)
 
     def wait(self, until_ns: int) -> None:

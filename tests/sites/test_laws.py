@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from sites.warming import warm_up
+from sites.warmup import warm_up
 from trilat_net.errors import LawFailed, RunFailed
-from trilat_net.experiment import compare_with_virtual, verify
-from trilat_net.log.reader import Log
-from trilat_net.scenario import load
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
 
 from .sessions import Session, in_log, in_virtual_time
 
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("unprepared")
 
 def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
     """The log of a session, and per site its exit code or what it was ended by."""
-    scenario = load(name, {"duration_s": 1.0, **overrides})
+    scenario = load_scenario(name, {"duration_s": 1.0, **overrides})
     session = Session(scenario, folder / "run.mcap")
     session.recorder()
     ends: dict[str, object] = {}
@@ -41,7 +42,7 @@ def test_a_law_that_repeats_the_papers_is_virtual_time_and_the_papers_bit_for_bi
     log, ends = lived(tmp_path, "two_sites", control=law)
     assert ends == {"m": 0, "s": 0}
     assert in_log(log) == in_virtual_time(log.scenario)
-    assert in_log(log) == in_virtual_time(load("two_sites", {"duration_s": 1.0}))
+    assert in_log(log) == in_virtual_time(load_scenario("two_sites", {"duration_s": 1.0}))
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 2000
@@ -70,6 +71,6 @@ def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) ->
 
 def test_a_law_that_fails_at_rest_is_told_before_the_session() -> None:
     control = {"law": "tests.laws:Failing", "how": "nan", "at": 3}
-    scenario = load("two_sites", {"sites.s.control": control})
+    scenario = load_scenario("two_sites", {"sites.s.control": control})
     with pytest.raises(LawFailed, match=r"of s failed at tick 3: .* this was the rehearsal"):
         warm_up(scenario, "s")

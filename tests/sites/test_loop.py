@@ -7,20 +7,20 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sites.intake import Intake
-from sites.loop import Ports, run_loop
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Mode
+from sites.site_loop import LoopIO, PeerInbox, run_loop
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Mode
 from trilat_net.errors import SessionError
-from trilat_net.experiment import compare_with_virtual, verify
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import ManualClock
+from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import LinkStats, State
-from trilat_net.net.stats import LoopStats
-from trilat_net.net.timing import Timing
+from trilat_net.net.timing import SiteTiming
 from trilat_net.net.wire import decode
-from trilat_net.scenario import Scenario, load
+from trilat_net.scenario import Scenario, load_scenario
 
 from .relay import RelayClock
 from .sessions import SESSION, Session, in_log, in_virtual_time
@@ -46,7 +46,7 @@ class Alone:
     """One site's loop without peers who speak."""
 
     def __init__(self, clock: ManualClock, overrides: dict[str, object] | None = None) -> None:
-        scenario = load("two_sites", {"duration_s": 2.0, **(overrides or {})})
+        scenario = load_scenario("two_sites", {"duration_s": 2.0, **(overrides or {})})
         self.site = Site(scenario.setup("m"))
         self.stats = LoopStats(self.site, 1, [scenario.sites["s"].rate_hz])
         self.states: list[State] = []
@@ -56,10 +56,10 @@ class Alone:
         self._clock, self._ticks = clock, scenario.ticks("m")
 
     def run(self) -> object:
-        ports = Ports(
+        ports = LoopIO(
             self._clock,
-            Intake((), (), (), self.stats.dropped),
-            Timing(EPOCH_NS, self.site.rate_hz, (), "s"),
+            PeerInbox((), (), (), self.stats.dropped),
+            SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s"),
             lambda payload: self.states.append(decode(payload, State)),
             lambda payload: self.links.append(decode(payload, LinkStats)),
             lambda k, t_ns: self.slack.append((k, t_ns)),
@@ -146,7 +146,7 @@ def session_of(scenario: Scenario, folder: Path) -> Session:
 @pytest.mark.usefixtures("unprepared")
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
-    scenario = load(name, SCENARIOS[name])
+    scenario = load_scenario(name, SCENARIOS[name])
     log = session_of(scenario, tmp_path).run()
     assert log.complete
     assert [len(log[site]) for site in log.sites] == [scenario.ticks(site) for site in scenario.names]
@@ -156,7 +156,7 @@ def test_a_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_
 
 @pytest.mark.usefixtures("unprepared")
 def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
-    scenario = load("paper", {"duration_s": 2.0})
+    scenario = load_scenario("paper", {"duration_s": 2.0})
     session = session_of(scenario, tmp_path)
     session.clocks["m2"].stall(3_000_000_000, 190_000_000)
     log = session.run()
@@ -166,7 +166,7 @@ def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unprepared")
 def test_a_stall_beyond_the_delay_changes_nothing_before_the_first_late_sample(tmp_path: Path) -> None:
-    scenario = load("paper", {"duration_s": 2.0})
+    scenario = load_scenario("paper", {"duration_s": 2.0})
     session = session_of(scenario, tmp_path)
     session.clocks["m2"].stall(3_000_000_000, 300_000_000)
     log = session.run()
@@ -198,7 +198,7 @@ def shout(bus: Bus, clock: RelayClock) -> None:
 
 @pytest.mark.usefixtures("unprepared")
 def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Path) -> None:
-    scenario = load("paper", {"duration_s": 1.0})
+    scenario = load_scenario("paper", {"duration_s": 1.0})
     session = session_of(scenario, tmp_path)
     session.stranger(shout)
     session.stranger(lambda bus, _: bus.announce(f"trilat/{SESSION}/m1/alive/no-number"))
@@ -214,7 +214,7 @@ def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Pat
 
 @pytest.mark.usefixtures("unprepared")
 def test_a_token_that_is_no_number_does_not_end_a_loop(tmp_path: Path) -> None:
-    scenario = load("two_sites", {"duration_s": 1.0})
+    scenario = load_scenario("two_sites", {"duration_s": 1.0})
     session = session_of(scenario, tmp_path)
 
     def come_and_go(bus: Bus, clock: RelayClock) -> None:
@@ -229,7 +229,7 @@ def test_a_token_that_is_no_number_does_not_end_a_loop(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unprepared")
 def test_a_site_that_is_asked_to_end_ends_in_order_and_its_exit_code_says_so(tmp_path: Path) -> None:
-    scenario = load("two_sites", {"duration_s": 2.0})
+    scenario = load_scenario("two_sites", {"duration_s": 2.0})
     session = session_of(scenario, tmp_path)
 
     def interrupt(_bus: Bus, _clock: RelayClock) -> None:
@@ -248,7 +248,7 @@ def test_a_site_that_is_asked_to_end_ends_in_order_and_its_exit_code_says_so(tmp
 
 @pytest.mark.usefixtures("unprepared")
 def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
-    session = session_of(load("two_sites", {"duration_s": 2.0}), tmp_path)
+    session = session_of(load_scenario("two_sites", {"duration_s": 2.0}), tmp_path)
     refused: list[str] = []
 
     def come_late(_bus: Bus, clock: RelayClock) -> None:

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
-from sites.overtime import HICCUP_NS, MOST_NS, SHARE, Overtime, thread_use
+from sites.law_watchdog import HICCUP_NS, MOST_NS, SHARE, LawWatchdog, read_thread_usage
 from tests.core.sites import setup
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Tick
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import TickInput
 from trilat_net.errors import LawFailed
 from trilat_net.net.clock import ManualClock, SystemClock
 
@@ -26,23 +26,23 @@ class Steps:
         self.computed_ns = self.evicted = 0
         self._takes_ns, self._computes, self._evicts = takes_ns, computes, evicts
 
-    def step(self, tick: Tick) -> Tick:
+    def step(self, tick: TickInput) -> TickInput:
         took_ns = self._takes_ns(tick.k)
         self.clock.sleep_until(self.clock.monotonic_ns() + took_ns)
         self.computed_ns += int(self._computes * took_ns)
         self.evicted += self._evicts
         return tick
 
-    def overtime(self) -> Overtime:
-        return Overtime(self, "laws:Law", self.clock, lambda: (self.computed_ns, self.evicted))
+    def overtime(self) -> LawWatchdog:
+        return LawWatchdog(self, "laws:Law", self.clock, lambda: (self.computed_ns, self.evicted))
 
 
-def ended(steps: Steps, overtime: Overtime | None = None) -> int | None:
+def ended(steps: Steps, overtime: LawWatchdog | None = None) -> int | None:
     """At which tick the law is too slow; None where it never is."""
     overtime = overtime or steps.overtime()
     for k in range(TICKS):
         try:
-            overtime.step(Tick(k))
+            overtime.step(TickInput(k))
         except LawFailed as failed:
             return failed.tick
     return None
@@ -106,16 +106,16 @@ class Hanging:
 def test_a_law_that_does_not_come_back_is_stopped() -> None:
     site = Site(setup("s", "two_sites")._replace(own=Hanging))
     before = signal.getsignal(signal.SIGALRM)
-    with Overtime(site, "laws:Hanging", SystemClock()) as overtime:
+    with LawWatchdog(site, "laws:Hanging", SystemClock()) as overtime:
         with pytest.raises(LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"):
-            overtime.step(Tick(0))
+            overtime.step(TickInput(0))
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
     assert signal.getsignal(signal.SIGALRM) is before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def test_the_use_of_a_thread_only_grows() -> None:
-    before = thread_use()
+    before = read_thread_usage()
     sum(range(20_000))
-    after = thread_use()
+    after = read_thread_usage()
     assert after >= before

@@ -1,6 +1,6 @@
 """A visitor sees who is there and where their clocks stand; nobody sees the visitor."""
 
-from sites.probe import GATHER_NS, Probe
+from sites.session_ping import GATHER_NS, SessionPing
 from tests.net.parties import SESSION, Member, Party, told
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
@@ -16,9 +16,9 @@ class Visit:
     def __init__(self, party: Party, count: int = 10) -> None:
         self._party = party
         self.begun_ns = party.clock.monotonic_ns()
-        self.probe = Probe(party.network.join(), party.clock, SESSION, count)
+        self.probe = SessionPing(party.network.join(), party.clock, SESSION, count)
 
-    def look(self, timeout_ns: int = S) -> Probe:
+    def look(self, timeout_ns: int = S) -> SessionPing:
         """Looks until it is over, while the members do what they do."""
         for n in range(2_000_000_000):
             if self.probe.over(timeout_ns, self.begun_ns):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from recorder.recorder import Recorder
-from sites.process import Member, Options
-from trilat_net.interrupt import Interrupt
-from trilat_net.log.parts import Storage
+from recorder.record_process import Recorder
+from sites.site_process import SiteOptions, SiteProcess
+from trilat_net.log.log_writer import LogStorage
 from trilat_net.net.connection import Connection
-from trilat_net.scenario import load
+from trilat_net.process import Interrupt
+from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
 from .sessions import RECORDER_BOOT, SESSION, Session
@@ -23,7 +23,7 @@ class Ending:
     """A session of two sites whose recorder works on for a while when it has all."""
 
     def __init__(self, path: Path, stay_s: float, works_ns: int) -> None:
-        self.session = Session(load("two_sites", {"duration_s": 0.2}), path)
+        self.session = Session(load_scenario("two_sites", {"duration_s": 0.2}), path)
         self.left_ns: dict[str, int] = {}
         self.interrupts = {name: Interrupt() for name in ("m", "s")}
         self._stay_s, self._works_ns = stay_s, works_ns
@@ -34,9 +34,11 @@ class Ending:
     def _site(self, name: str) -> Callable[[RelayClock], int]:
         def run(clock: RelayClock) -> int:
             bus = self.session.network.join()
-            options = Options(SESSION, Connection(), 10.0, needs_recorder=True, stay_s=self._stay_s)
+            options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder=True, stay_s=self._stay_s)
             interrupt = self.interrupts[name]
-            member = Member(self.session.scenario, name, options, bus, clock, interrupt, lambda _text: None)
+            member = SiteProcess(
+                self.session.scenario, name, options, bus, clock, interrupt, lambda _text: None
+            )
             try:
                 return member.live()
             finally:
@@ -49,7 +51,7 @@ class Ending:
         bus = self.session.network.join()
         path = self.session.path
         recorder = Recorder(
-            bus, clock, SESSION, RECORDER_BOOT, Storage(path), lambda: False, lambda _text: None
+            bus, clock, SESSION, RECORDER_BOOT, LogStorage(path), lambda: False, lambda _text: None
         )
         epoch = recorder.join(30.0)
         assert epoch is not None

@@ -7,16 +7,15 @@ import pytest
 
 from tests.log.disks import SmallDisk, file_on
 from trilat_net.errors import LogRefused
-from trilat_net.experiment import verify
-from trilat_net.log import parts
-from trilat_net.log.choice import Choice
-from trilat_net.log.chunks import Walk
-from trilat_net.log.names import active, existing
-from trilat_net.log.parts import Storage
-from trilat_net.log.reader import open_log
+from trilat_net.execution.verify import verify
+from trilat_net.log import log_writer
+from trilat_net.log.log_layout import ChannelFilter, active_path, find_parts
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_writer import LogStorage
+from trilat_net.log.mcap_reader import McapReader
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
 from .sessions import SESSION, Session, computed
@@ -26,8 +25,8 @@ MS = 1_000_000
 SITES = ("m", "s")
 
 
-def session_of(path: Path, duration_s: float, storage: Storage | None = None) -> Session:
-    session = Session(load("two_sites", {"duration_s": duration_s}), path, storage=storage)
+def session_of(path: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
+    session = Session(load_scenario("two_sites", {"duration_s": duration_s}), path, storage=storage)
     session.recorder()
     for name in SITES:
         session.site(name)
@@ -37,7 +36,7 @@ def session_of(path: Path, duration_s: float, storage: Storage | None = None) ->
 def records(path: Path) -> dict[str, int]:
     """How many messages of each topic a file has, whole or not."""
     with path.open("rb") as stream:
-        return Counter(item.topic for item in Walk(stream, str(path)).messages())
+        return Counter(item.topic for item in McapReader(stream, str(path)).messages())
 
 
 def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(tmp_path: Path) -> None:
@@ -49,10 +48,10 @@ def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(t
         epoch_ns = 0
         while not path.exists():
             clock.sleep_until(clock.monotonic_ns() + 19 * MS)
-            if not active(path).exists():
+            if not active_path(path).exists():
                 continue
-            with active(path).open("rb") as stream:
-                walk = Walk(stream, "look")
+            with active_path(path).open("rb") as stream:
+                walk = McapReader(stream, "look")
                 count = Counter(item.topic for item in walk.messages())
             epoch_ns = int(walk.metadata["trilat.session"]["epoch_unix_ns"])
             due = min(400, (clock.unix_ns() - 100 * MS - epoch_ns) // MS)
@@ -70,7 +69,7 @@ def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
-    monkeypatch.setattr(parts, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
+    monkeypatch.setattr(log_writer, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
     session = session_of(path, 2.0)
     with pytest.raises(LogRefused, match="the disk is full; the log ends there, finished") as refusal:
         session.run()
@@ -90,10 +89,10 @@ def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
 def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
     whole = session_of(tmp_path / "whole.mcap", 1.0).run()
     path = tmp_path / "run.mcap"
-    session = session_of(path, 1.0, Storage(path, split_ns=300 * MS))
+    session = session_of(path, 1.0, LogStorage(path, split_ns=300 * MS))
     with pytest.raises(Exception, match="No such file"):
         session.run()  # there is no file of that name
-    names = [part.name for part in sorted(existing(path).values())]
+    names = [part.name for part in sorted(find_parts(path).values())]
     assert names == [f"run-00{n}.mcap" for n in range(1, len(names) + 1)]
     assert len(names) >= 4
     log = open_log(*(tmp_path / name for name in names))
@@ -112,8 +111,8 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
 
 def test_what_is_left_out_is_neither_in_the_file_nor_missing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    choice = Choice(("**/m/**", "**/s/event"), ("**/link",))
-    log = session_of(path, 0.3, Storage(path, choice=choice)).run()
+    choice = ChannelFilter(("**/m/**", "**/s/event"), ("**/link",))
+    log = session_of(path, 0.3, LogStorage(path, choice=choice)).run()
     assert len(log["m"]) == 300
     assert len(log["s"]) == 0
     kept = {f"/trilat/{SESSION}/{what}" for what in ("m/state", "m/event", "s/event")}

@@ -6,25 +6,25 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from sites.display import LINE_EVERY, Display
-from sites.watch import Watch
-from trilat_net.core.site import Site
-from trilat_net.core.tick import Tick
+from sites.monitor import LINE_EVERY, SessionDisplay, SessionMonitor
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import TickInput
 from trilat_net.net import topics
 from trilat_net.net.bus import LocalNetwork
-from trilat_net.net.stats import LoopStats
-from trilat_net.net.wire import Event, encode
-from trilat_net.scenario import load
+from trilat_net.net.loop_stats import LoopStats
+from trilat_net.net.messages import Event
+from trilat_net.net.wire import encode
+from trilat_net.scenario import load_scenario
 
-SCENARIO = load("paper")
+SCENARIO = load_scenario("paper")
 SITE = Site(SCENARIO.setup("m1"))
-STATISTICS = LoopStats(SITE, 1, [1000, 1000]).take(SITE.step(Tick(0)))
+STATISTICS = LoopStats(SITE, 1, [1000, 1000]).take(SITE.step(TickInput(0)))
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     network = LocalNetwork()
-    watch = Watch(network.join(), "t", SCENARIO.names)
+    watch = SessionMonitor(network.join(), "t", SCENARIO.names)
     stranger = network.join()
 
     def say(member: str, channel: str, payload: bytes) -> None:
@@ -37,7 +37,7 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
     say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
     out = io.StringIO()
-    with Display(SCENARIO, Console(file=out, force_terminal=terminal, width=120)) as display:
+    with SessionDisplay(SCENARIO, Console(file=out, force_terminal=terminal, width=120)) as display:
         watch.poll()
         assert list(watch.latest) == ["m1"]
         for _ in range(LINE_EVERY):

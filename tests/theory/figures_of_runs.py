@@ -7,34 +7,33 @@ from typing import Any
 
 import pytest
 
-from trilat_net.scenario import load
-from trilat_net.scenario.window import OF_ALL, QUANTITIES
-from trilat_net.trial.collection import run_virtual
-from trilat_net.trial.figures import Figures
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, WINDOW_QUANTITIES
+from trilat_net.studies.trials.measure_run import RunMetrics, measure_virtual_run
 
 Overrides = dict[str, Any]
 
 
-def measured(name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]) -> Figures:
+def measured(name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]) -> RunMetrics:
     """A shipped scenario, changed, in virtual time; its windows are (from, to, site), "" for all sites."""
     asked = [
         {
             "from_s": from_s,
             "to_s": to_s,
             "site": site,
-            **dict.fromkeys(QUANTITIES if site else OF_ALL, (0, 0)),
+            **dict.fromkeys(WINDOW_QUANTITIES if site else ALL_SITES_QUANTITIES, (0, 0)),
         }
         for from_s, to_s, site in windows
     ]
-    return run_virtual(load(name, {**(overrides or {}), "expect": {"windows": asked}}))
+    return measure_virtual_run(load_scenario(name, {**(overrides or {}), "expect": {"windows": asked}}))
 
 
-def peak(figures: Figures, n: int = 0) -> float:
+def peak(figures: RunMetrics, n: int = 0) -> float:
     """Largest |e| of a window."""
     return figures.windows[n]["error_peak_rad"].most
 
 
-def value(figures: Figures, key: str, n: int = 0) -> float:
+def value(figures: RunMetrics, key: str, n: int = 0) -> float:
     """A quantity of a window that has one value."""
     return figures.windows[n][key].most
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.theory.delay_equations import theta_of
 from tests.virtual_runs import Run, run, trajectories
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 G = 9.81
 PERIOD_S = 1e-3
@@ -19,7 +19,7 @@ PERIOD_S = 1e-3
 
 def alone(name: str, **overrides: float) -> Run:
     """A scenario with nobody at the arms."""
-    return trajectories(load(name, overrides).without_hands())
+    return trajectories(load_scenario(name, overrides).without_hands())
 
 
 def angles(made: Run, k: int) -> np.ndarray:
@@ -30,7 +30,7 @@ def angles(made: Run, k: int) -> np.ndarray:
 
 def predicted(name: str, delay_s: float) -> np.ndarray:
     """sin q1 and sin (q1 + q2) in the end, from level arms and estimates of zero, with Gamma = Lambda = 1."""
-    return -theta_of(load(name).sites["s"].arm)[3:] / (G * (1.0 + delay_s))
+    return -theta_of(load_scenario(name).sites["s"].arm)[3:] / (G * (1.0 + delay_s))
 
 
 @pytest.mark.parametrize("name", ["paper", "paper_rods"])
@@ -65,7 +65,7 @@ def test_a_hand_sees_a_spring_of_115_nm_per_rad_and_arm() -> None:
     hands = [{"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}]
     rest = alone("paper_rods", duration_s=20.0)
     pushed = trajectories(
-        load("paper_rods", {"duration_s": 20.0, "sites.m1.hands": hands, "sites.m2.hands": []})
+        load_scenario("paper_rods", {"duration_s": 20.0, "sites.m1.hands": hands, "sites.m2.hands": []})
     )
     there, from_where = angles(pushed, -1), angles(rest, -1)
     assert there[0] == pytest.approx(from_where[0], abs=2e-3)  # equal torques act on q1 + q2 alone

@@ -11,14 +11,14 @@ import pytest
 
 from tests.theory.delay_equations import DelayEquations, equations
 from tests.virtual_runs import run
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 DURATION_S = 20.0
 
 
 @cache
 def exact(name: str) -> DelayEquations:
-    return equations(load(name)).solve(DURATION_S)
+    return equations(load_scenario(name)).solve(DURATION_S)
 
 
 @cache
@@ -39,7 +39,7 @@ def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None
     paper = exact("paper")
     first = paper.rate(0.0, paper.past(-1.0).ravel()).reshape(3, 9)
     assert np.allclose(first[:, 2:4], [-9.81, 9.81], atol=1e-12)
-    halves = equations(load("paper"))
+    halves = equations(load_scenario("paper"))
     halves.edges_s += [float(t) for t in np.arange(0.1, 5.0, 0.2)]  # other pieces, other steps
     times = np.linspace(0.0, 5.0, 501)
     assert np.abs(halves.solve(5.0).at(times) - paper.at(times)).max() < 1e-8

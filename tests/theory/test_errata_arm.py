@@ -7,7 +7,7 @@ import pytest
 import sympy as sp
 
 from tests.theory.symbols import QD, THETA, G, Q, columns, dot, forces, gravity, inertia, pair, plain
-from trilat_net.core.arm import Links, parameters, regressor
+from trilat_net.core.two_link_arm import ArmLinks, regressor, theta_from_links
 
 
 def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
@@ -67,7 +67,7 @@ def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
 def test_the_programs_regressor_is_that_of_the_energies() -> None:
     """Errata 2: Y theta of `core.arm`, with its own theta, against Euler and Lagrange."""
     torque, n = lagrange()
-    links = Links(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07)
+    links = ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07)
     values = {"m1": 1.3, "m2": 0.8, "l1": 0.7, "lc1": 0.4, "lc2": 0.35, "I1": 0.11, "I2": 0.07}
     a = pair("a")
     exact = sp.lambdify([Q, QD, a], torque.subs({n[k]: x for k, x in values.items()} | {G: 9.81}), "numpy")
@@ -75,7 +75,7 @@ def test_the_programs_regressor_is_that_of_the_energies() -> None:
     for _ in range(20):
         q, qd, qdd = rng.normal(size=(3, 2))
         Y = np.array(regressor(9.81, q, qd, qd, qdd))
-        assert Y @ parameters(links) == pytest.approx(exact(q, qd, qdd).ravel(), abs=1e-12)
+        assert Y @ theta_from_links(links) == pytest.approx(exact(q, qd, qdd).ravel(), abs=1e-12)
 
 
 def test_five_parameters_are_four_where_the_length_is_known() -> None:
@@ -90,7 +90,7 @@ def test_five_parameters_are_four_where_the_length_is_known() -> None:
     four[1, 3] = 0.7  # theta_2 from theta_5, l1 = 0.7 m
     assert np.linalg.matrix_rank(stacked) == 5
     assert np.linalg.matrix_rank(stacked @ four) == 4
-    theta = parameters(Links(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07))
+    theta = theta_from_links(ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07))
     assert four @ np.delete(theta, 1) == pytest.approx(theta)
 
 

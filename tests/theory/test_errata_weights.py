@@ -9,8 +9,12 @@ from scipy.optimize import linprog
 
 from tests.theory.energy import balance
 from tests.virtual_runs import run
-from trilat_net.certificate.weights import closed_groups, left_vector, weights
-from trilat_net.core.exogenous import Actor, Acts, rows_of, torque_on_arm
+from trilat_net.analysis.lyapunov_weights import (
+    compute_lyapunov_weights,
+    find_closed_groups,
+    left_perron_vector,
+)
+from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_on_arm, torque_source_rows
 
 A12, A21, A31 = sp.symbols("alpha12 alpha21 alpha31", positive=True)
 ALPHA = sp.Matrix([[0, A12, 1 - A12], [A21, 0, 1 - A21], [A31, 1 - A31, 0]])  # Eq. (7)
@@ -77,9 +81,9 @@ def test_with_ones_v_can_rise() -> None:
 def test_the_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: int) -> None:
     """Errata 6, N sites."""
     alpha = shares(np.random.default_rng(size), size)
-    assert left_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
+    assert left_perron_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
     c = np.linspace(0.3, 10.0, size)
-    beta = weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
+    beta = compute_lyapunov_weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
     assert beta * c / (beta @ c) == pytest.approx(perron(alpha), rel=1e-9)
 
 
@@ -125,8 +129,8 @@ def test_there_is_no_slack_not_even_with_other_weights_in_the_integrals() -> Non
 
 def test_a_wall_that_is_passive_at_its_contact_gives_energy_to_v() -> None:
     """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda e'tau_h > 0."""
-    wall = Actor(Acts.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
-    rows, table = rows_of((wall,))
+    wall = TorqueSource(TorqueKind.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
+    rows, table = torque_source_rows((wall,))
 
     def push(q: Any) -> Any:
         return np.array(torque_on_arm(0.0, q, np.zeros(2), np.ones(2), rows, table, 0))
@@ -207,7 +211,7 @@ def test_four_sites_in_two_closed_groups_have_no_one_beta() -> None:
     """Errata 11, N >= 4."""
     alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
     assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
-    assert closed_groups(alpha) == ((0, 1), (2, 3))
+    assert find_closed_groups(alpha) == ((0, 1), (2, 3))
 
 
 # --- 12: what is not an error but follows ---------------------------------------------------------------

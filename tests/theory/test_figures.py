@@ -5,15 +5,15 @@ import pytest
 
 from tests.theory.delay_equations import theta_of
 from tests.virtual_runs import run, trajectories
-from trilat_net.scenario import load
-from trilat_net.sim.fused import FusedRun
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import load_scenario
 
 Q, QD, Q_DES, THETA_HAT = slice(0, 2), slice(2, 4), slice(4, 6), slice(12, 17)
 """Where they lie in a record's floats."""
 
 
 def ended(name: str, duration_s: float, delay_ms: float = 200.0) -> FusedRun:
-    made = FusedRun(load(name, {"link.delay_ms": delay_ms}))
+    made = FusedRun(load_scenario(name, {"link.delay_ms": delay_ms}))
     made.advance(duration_s)
     return made
 
@@ -47,7 +47,7 @@ def test_errors_and_speeds_of_paper_and_free_decay_as_the_theorem_says() -> None
 @pytest.mark.parametrize(("delay_s", "margin"), [(0.0, 2e-3), (0.2, 4e-3)])
 def test_the_anchor_is_a_function_of_the_first_estimate(delay_s: float, margin: float) -> None:
     """sin q1 ends at sin q1(0) - (th4 - th4_hat(0)) / (Gamma g (1 + Lambda T)); q1 + q2 alike with th5."""
-    theta, g = theta_of(load("paper").sites["m1"].arm), 9.81
+    theta, g = theta_of(load_scenario("paper").sites["m1"].arm), 9.81
     first, both = np.arcsin(-theta[3:] / (g * (1 + delay_s)))
     assert ended("paper", 60.0, 1e3 * delay_s).records[:, Q] == pytest.approx(
         np.tile([first, both - first], (3, 1)), abs=margin

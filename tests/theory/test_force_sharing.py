@@ -5,7 +5,7 @@ import pytest
 
 from tests.theory.energy import left_null_vector
 from tests.theory.figures_of_runs import measured, value
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 LOAD_NM = 5.0
 HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
@@ -14,14 +14,14 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 
 def test_beta_of_three_sites_in_closed_form() -> None:
     """Eq. (20), the left null vector: (1 - a23 a32, 1 - a13 a31, 1 - a12 a21)."""
-    beta = left_null_vector(load("force_sharing"))
+    beta = left_null_vector(load_scenario("force_sharing"))
     closed = np.array([1 - 0.2 * 0.2, 1 - 0.9 * 0.8, 1 - 0.1 * 0.8])
     assert beta == pytest.approx(closed / closed.sum())
 
 
 def test_a_hand_feels_the_load_times_beta_of_the_slave_over_its_own() -> None:
     """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
-    b1, b2, bs = left_null_vector(load("force_sharing"))
+    b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
     made = measured("force_sharing", {}, *HELD)
     felt = [-value(made, "push1_mean_nm", n) for n in range(len(HELD))]
     assert felt == pytest.approx([4.79, 16.4, 5.00], rel=0.02)

@@ -1,11 +1,11 @@
 """What the shipped scenarios expect are the figures, within their last printed digit or 2 %.
 
-That they meet what they expect is tested in `tests/trial/test_shipped.py`.
+That they meet what they expect is tested in `tests/studies/trials/test_shipped.py`.
 """
 
 import pytest
 
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 FIGURES = [
     ("contact", "wall_mean_n", (9.0, 15.0), 8.0, 1.0),
@@ -36,7 +36,7 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 def test_the_limits_of_a_window_are_the_figure_within_its_bar(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
-    asked = {(w.from_s, w.to_s): dict(w.asked) for w in load(name).expect.windows}
+    asked = {(w.from_s, w.to_s): dict(w.asked) for w in load_scenario(name).expect.windows}
     least, most = asked[window][key]
     bar = max(digit, 0.02 * abs(figure))
     assert figure - bar <= least + 1e-12
@@ -46,12 +46,12 @@ def test_the_limits_of_a_window_are_the_figure_within_its_bar(
 
 @pytest.mark.parametrize(("name", "settled_s"), [("free", 11.9), ("outage", 12.4)])
 def test_so_are_the_times_at_which_they_settle(name: str, settled_s: float) -> None:
-    by_s = load(name).expect.synchronised_by_s
+    by_s = load_scenario(name).expect.synchronised_by_s
     assert by_s is not None
     assert settled_s <= by_s <= 1.02 * settled_s
 
 
 def test_paper_ends_where_the_anchor_is() -> None:
-    expect = load("paper").expect
+    expect = load_scenario("paper").expect
     assert set(expect.end_pose_rad.values()) == {(-0.1729, 0.0874)}
     assert expect.end_pose_within_rad <= 0.02 * 0.0874

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.theory.figures_of_runs import measured, peak, printed
-from trilat_net.analysis.envelope import Trend
-from trilat_net.scenario import load
+from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.scenario import load_scenario
 
 CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
 
@@ -16,7 +16,7 @@ CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
 @pytest.mark.parametrize(("name", "margin"), [("p_d_margin", 1.0), ("p_d_margin_two", 2.0)])
 def test_the_margin_is_the_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
     """d = abs(lambda_min(alpha)) K T."""
-    scenario = load(name)
+    scenario = load_scenario(name)
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
     alpha = np.array([[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites])
     assert -np.linalg.eigvals(alpha).real.min() * 10.0 * delay_ms * 1e-3 == pytest.approx(margin)
@@ -25,10 +25,10 @@ def test_the_margin_is_the_smallest_eigenvalue_of_alpha_times_k_t(name: str, mar
 @pytest.mark.parametrize(("name", "d"), [("p_d_margin", 0.9), ("p_d_margin_two", 1.8)])
 def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""
-    shipped = load(name)
+    shipped = load_scenario(name)
     assert shipped.expect.stable
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
-    assert measured(name, {"control.d": d, "duration_s": 40.0}).trend is Trend.GROWS
+    assert measured(name, {"control.d": d, "duration_s": 40.0}).trend is EnvelopeTrend.GROWS
 
 
 def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
@@ -37,8 +37,8 @@ def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -
     alpha = np.array([[row[i].get(j, 0.0) for j in row] for i in row])
     assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
     changes = {"dominance": row, "duration_s": 40.0}
-    assert measured("p_d_margin", {**changes, "control.d": 1.4}).trend is Trend.GROWS
-    assert measured("p_d_margin", {**changes, "control.d": 1.8}).trend is Trend.DECAYS
+    assert measured("p_d_margin", {**changes, "control.d": 1.4}).trend is EnvelopeTrend.GROWS
+    assert measured("p_d_margin", {**changes, "control.d": 1.8}).trend is EnvelopeTrend.DECAYS
 
 
 def test_half_of_the_margin_grows_to_10_rad() -> None:
@@ -54,7 +54,7 @@ def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
 def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
-    assert (jitter.trend, constant.trend) == (Trend.DECAYS, Trend.GROWS)
+    assert (jitter.trend, constant.trend) == (EnvelopeTrend.DECAYS, EnvelopeTrend.GROWS)
     assert peak(jitter) == printed(0.022, 0.001)
     assert peak(constant) == printed(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]
@@ -68,4 +68,4 @@ def test_a_play_out_buffer_makes_jitter_a_constant_delay_and_the_run_leaves_the_
     assert peak(free) == printed(339.0, 1.0)
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
-    assert free.peak_speed_rad_s > load("jitter").sites["s"].limits.qd_limit_rad_s
+    assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s

@@ -5,7 +5,7 @@ import pytest
 
 from tests.theory.figures_of_runs import Overrides, measured, printed, value
 from tests.virtual_runs import run, trajectories
-from trilat_net.scenario import load
+from trilat_net.scenario import load_scenario
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
 EDGE = {
@@ -25,7 +25,7 @@ def test_some_delay_helps_free_motion(delay_ms: float, duration_s: float, settle
 
 def test_the_hands_of_the_paper_hardly_move_joint_1_and_leave_nothing_behind() -> None:
     pushed = run("paper", {"duration_s": 20.0}).stack("q")
-    alone = trajectories(load("paper", {"duration_s": 20.0}).without_hands()).stack("q")
+    alone = trajectories(load_scenario("paper", {"duration_s": 20.0}).without_hands()).stack("q")
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
     assert np.abs(pushed - alone)[..., 0].max() <= 0.003
     assert np.abs(pushed - alone)[:, -1].max() <= 2e-4

@@ -1,1 +1,4 @@
-"""Figures, numbers and the page of a log. Only this package imports matplotlib; only a report imports it."""
+"""A log in numbers: delivery, delays, timeline, health, summary, certificate and metrics.
+
+Invariant: nothing here draws, formats or prints; `reporting` does.
+"""

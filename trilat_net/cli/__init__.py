@@ -1,6 +1,6 @@
-"""The `trilat` command: the composition root, without logic of its own.
+"""The `trilat` command: registers all commands and maps errors to exit codes.
 
-Law: a command parses, builds, calls one function of the library and prints. It exits 0 on success, 1 on a
+Invariant: a command parses, calls one function of the library and prints. It exits 0 on success, 1 on a
 failed run or comparison, 2 on bad input, 128 + n when signal n ended it; an error is one sentence.
 """
 
@@ -14,26 +14,28 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from ..errors import TrilatError
-from ..interrupt import Interrupt
+from ..process import Interrupt
+from ..reporting.terminal_output import err
 from . import (
-    certificates,
-    changes,
-    comparisons,
-    figures,
-    linears,
+    certify,
+    compare,
+    demo,
+    linear,
     log,
-    logs,
-    metering,
-    pings,
-    replays,
-    reruns,
-    routers,
-    scenarios,
-    sessions,
-    sweeps,
-    trials,
+    metrics,
+    ping,
+    record,
+    replay,
+    report,
+    rerun,
+    scenario,
+    sim,
+    site,
+    sweep,
+    test,
+    verify,
 )
-from .options import err
+from . import set as set_command
 
 
 class _Commands(TyperGroup):
@@ -63,22 +65,24 @@ app = typer.Typer(
     help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
     epilog="Begin with: trilat demo paper",
 )
-app.add_typer(sessions.app)
-app.add_typer(routers.app)
-app.add_typer(pings.app)
-app.add_typer(logs.app)
-app.add_typer(certificates.app)
-app.add_typer(metering.app)
-app.add_typer(comparisons.app)
-app.add_typer(figures.app)
-app.add_typer(replays.app)
-app.add_typer(reruns.app)
+app.add_typer(demo.app)
+app.add_typer(site.app)
+app.add_typer(record.app)
+app.add_typer(ping.app)
+app.add_typer(sim.app)
+app.add_typer(verify.app)
+app.add_typer(certify.app)
+app.add_typer(metrics.app)
+app.add_typer(compare.app)
+app.add_typer(report.app)
+app.add_typer(replay.app)
+app.add_typer(rerun.app)
 app.add_typer(log.app, name="log")
-app.add_typer(trials.app)
-app.add_typer(sweeps.app)
-app.add_typer(linears.app)
-app.add_typer(scenarios.app, name="scenario")
-app.add_typer(changes.app, name="set")
+app.add_typer(test.app)
+app.add_typer(sweep.app)
+app.add_typer(linear.app)
+app.add_typer(scenario.app, name="scenario")
+app.add_typer(set_command.app, name="set")
 
 
 def main() -> None:

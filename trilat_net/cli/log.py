@@ -1,11 +1,241 @@
-"""The group `trilat log`: commands that look into a file, mend it, and take it elsewhere."""
+"""`trilat log`: info, check, recover, export, view. None of them executes the log."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
+from rich.table import Table
 
-from . import log_export, log_info, log_recover, log_view
+from ..reporting.overview_tables import print_overview
+from ..reporting.terminal_output import (
+    err,
+    open_with_progress,
+    out,
+    progress_bar,
+    sanitize,
+    warn_if_unfinished,
+)
+from .options import ForceOption, JsonOption, LogArgument, LogsArgument
+
+if TYPE_CHECKING:
+    from ..log.recover import Recovery
+    from ..log.session_check import LogCheckResult
+
 
 app = typer.Typer(no_args_is_help=True, help="Looks into a log, mends it, takes it to other tools.")
-app.add_typer(log_info.app)
-app.add_typer(log_recover.app)
-app.add_typer(log_export.app)
-app.add_typer(log_view.app)
+
+_MAX_PLACES = 10
+"""Places that a failed check names; all of them are in the JSON."""
+
+
+@app.command("info", epilog="Example: trilat log info run.mcap")
+def log_info_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+    """Tells what is in a log: its session, sites, links and channels, with what is missing."""
+    from ..analysis.file_overview import describe_files
+
+    with progress_bar(f"reading {files[0]}") as progress:
+        facts = describe_files(files, progress)
+    if as_json:
+        _print_json(facts)
+        return
+    print_overview(facts)
+    for path in files:
+        warn_if_unfinished(path)
+
+
+@app.command("check", epilog="Example: trilat log check run.mcap")
+def log_check_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+    """Checks how a log is built and whether all of it is there and right; executes nothing.
+
+    Exit code 0: sound; 1: not; 2: no such file. Of an MCAP file of others only how it is built is checked.
+    """
+    from ..log.session_check import check_log
+
+    with progress_bar(f"checking {files[0]}") as progress:
+        found = check_log(files, progress)
+    if as_json:
+        _print_json(_check_json(files, found))
+    else:
+        _print_check(files, found)
+    if not found.passed:
+        raise typer.Exit(1)
+
+
+def _check_json(files: list[Path], found: "LogCheckResult") -> dict[str, Any]:
+    return {
+        "files": [str(path) for path in files],
+        "kind": "trilat" if found.ours else "mcap",
+        "sound": found.passed,
+        "checks": [
+            {**finding._asdict(), "places": [place._asdict() for place in finding.places]}
+            for finding in found.findings
+        ],
+    }
+
+
+def _print_check(files: list[Path], found: "LogCheckResult") -> None:
+    """Prints a line per check, and where it failed."""
+    for finding in found.findings:
+        mark = "[green]ok[/green]  " if finding.passed else "[red]FAIL[/red]"
+        out.print(f"{mark} {finding.check:<9}  {escape(sanitize(finding.text))}", soft_wrap=True)
+        if finding.wrong == 1 and str(finding.places[0]) in finding.text:
+            continue
+        for place in finding.places[:_MAX_PLACES]:
+            where = f"{place.file}: " if len(files) > 1 and place.file else ""
+            out.print(f"       {escape(sanitize(f'{where}{place}'))}", soft_wrap=True)
+        if finding.wrong > _MAX_PLACES:
+            out.print(f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}")
+    if not found.ours:
+        err.print("note: this is no log of trilat-net: only how it is built was checked", soft_wrap=True)
+    for path in files:
+        warn_if_unfinished(path)
+
+
+def _print_json(facts: dict[str, Any]) -> None:
+    typer.echo(json.dumps(facts, indent=2, allow_nan=False))
+
+
+LOSSY_EXIT_CODE = 3
+"""Exit code where something was lost."""
+
+
+@app.command("recover", epilog="Example: trilat log recover run.mcap.active")
+def log_recover_command(
+    file: LogArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Default: FILE without .active, or FILE.recovered.mcap."
+        ),
+    ] = None,
+    force: ForceOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what came of it as JSON.")] = False,
+) -> None:
+    """Makes a whole file of one that is torn or damaged; that one stays as it is.
+
+    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was, and it says what; 1: there was
+    nothing to save.
+    """
+    from ..log.recover import recover_log as make_whole
+
+    with progress_bar(f"reading {file}") as progress:
+        result = make_whole(file, output, force=force, progress=progress)
+    if as_json:
+        out.print_json(json.dumps(_recovery_json(result)))
+    else:
+        _print_recovery(result)
+    if not result.lossless:
+        raise typer.Exit(LOSSY_EXIT_CODE)
+
+
+def _recovery_json(result: "Recovery") -> dict[str, object]:
+    return {
+        "file": str(result.path),
+        "output": str(result.output),
+        "finished": result.finished,
+        "lossless": result.lossless,
+        "messages": result.messages,
+        "records": result.sites,
+        "duration_s": result.duration_s,
+        "salvaged_messages": result.salvaged,
+        "lost_bytes": result.lost_bytes,
+        "lost": result.lost,
+        "missing": result.missing,
+    }
+
+
+def _print_recovery(result: "Recovery") -> None:
+    how = "was finished" if result.finished else "was not finished"
+    out.print(f"{escape(f'{result.output}: made of {result.path}')}, which {how}", soft_wrap=True)
+    table = Table(box=None, pad_edge=False, show_header=False, padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
+    if result.sites:
+        table.add_row("records", ", ".join(f"{site} {count}" for site, count in result.sites.items()))
+    table.add_row("messages", f"{result.messages} in {result.duration_s:.3f} s")
+    for name, told in (("lost", result.lost), ("missing", result.missing)):
+        for n, text in enumerate(told[:MAX_LOSSES] or ["nothing"]):
+            table.add_row("" if n else name, escape(text))
+        if len(told) > MAX_LOSSES:
+            table.add_row("", f"and {len(told) - MAX_LOSSES} more; --json tells all")
+    out.print(table)
+
+
+MAX_LOSSES = 10
+"""Losses that are printed."""
+_FORMATS = ("ros2", "parquet", "csv", "npz", "mat")
+
+
+@app.command("export", epilog="Example: trilat log export run.mcap --to parquet")
+def log_export_command(
+    files: Annotated[
+        list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
+    ],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="|".join(_FORMATS),
+            help="ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file "
+            "per site and kind; npz, mat: one file with an array per column.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="OUT", help="File or folder. Default: beside FILE, by its name."),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Makes files for other tools of a log: names end in their units, numbers are exact."""
+    from ..errors import UsageError
+    from ..reporting.export import Exporter, ExportFormat, default_export_path
+
+    if form not in _FORMATS:
+        raise UsageError(f"--to is one of {', '.join(_FORMATS)}, not {form!r}")
+    chosen = ExportFormat(form)
+    path = output if output is not None else default_export_path(chosen, files[0])
+    exporter = Exporter(chosen, path, force=force)
+    log = open_with_progress(*files)
+    with progress_bar(f"writing {path}") as progress:
+        exporter.export(log, progress)
+    records = sum(len(log[site]) for site in log.sites)
+    out.print(f"{escape(str(path))}: {records} records of {', '.join(log.sites)}", soft_wrap=True)
+
+
+@app.command("view", epilog="Example: trilat log view run.mcap")
+def log_view_command(
+    files: Annotated[
+        list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
+    ],
+    full: Annotated[
+        bool, typer.Option("--full", help="Every record, not the decimated channels beside them.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="In a browser: serves the viewer on this machine.")
+    ] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", metavar="OUT.rrd", help="Do not open it; write what Rerun would show."),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Opens a log in Rerun: every curve with its name, a column per site.
+
+    Of a log without standard channels (--views off), of one that was not finished and of parts it makes them
+    first, in a temporary file.
+    """
+    from ..errors import UsageError
+    from ..reporting.rerun_viewer import ViewerOptions, open_rerun
+
+    if save is not None and save.exists() and not force:
+        raise UsageError(f"{save}: exists; choose another name, or replace it with --force")
+    open_rerun(
+        files,
+        lambda: open_with_progress(*files),
+        ViewerOptions(full=full, web=web, save=save),
+        lambda text: out.print(escape(text), soft_wrap=True),
+    )
+    if save is not None:
+        out.print(f"{escape(str(save))}: open it with: rerun {escape(str(save))}", soft_wrap=True)

@@ -1,12 +1,10 @@
-"""What the commands have in common: their options, and how a scenario is loaded from them."""
+"""Options and arguments that several commands share, and the scenario and connection that they describe."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from ..errors import UsageError
 
@@ -14,8 +12,6 @@ if TYPE_CHECKING:
     from ..net.connection import Connection
     from ..scenario import Scenario
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
 
 ScenarioArgument = Annotated[str, typer.Argument(help="Name of a shipped scenario, or path of a TOML file.")]
 SetOption = Annotated[
@@ -50,34 +46,28 @@ ZenohConfigOption = Annotated[
 ]
 
 
-def say(text: str) -> None:
-    """Prints a line at once, as a process does that others watch."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
-
-
-def session_name(name: str) -> str:
+def check_session_name(name: str) -> str:
     """Refuses what cannot stand in a key."""
     if not name or not all(c.isalnum() or c in "_-." for c in name):
         raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
     return name
 
 
-def finite_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
+def check_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
     """Refuses what is no time to wait."""
     if value is not None and not 0.0 <= value <= 86_400.0:
         raise UsageError(f"{param.opts[0]} is a number of seconds from 0 to 86400, not {value:g}")
     return value
 
 
-def injected_offset(value: float) -> float:
+def check_clock_offset(value: float) -> float:
     """Refuses what no clock can be ahead by."""
     if not -1e6 <= value <= 1e6:
         raise UsageError(f"--clock-offset-s is a number of seconds from -1e6 to 1e6, not {value:g}")
     return value
 
 
-def injected_drift(value: float) -> float:
+def check_clock_drift(value: float) -> float:
     """Refuses a drift that nobody follows."""
     if not -200.0 <= value <= 200.0:
         raise UsageError(f"--clock-drift-ppm is a number from -200 to 200, not {value:g}")
@@ -90,7 +80,7 @@ ClockOffsetOption = Annotated[
         "--clock-offset-s",
         metavar="S",
         help="For tests: a clock that is ahead of the machine's by this, s.",
-        callback=injected_offset,
+        callback=check_clock_offset,
     ),
 ]
 ClockDriftOption = Annotated[
@@ -99,7 +89,7 @@ ClockDriftOption = Annotated[
         "--clock-drift-ppm",
         metavar="PPM",
         help="For tests: a clock that runs faster than the machine's by this, ppm.",
-        callback=injected_drift,
+        callback=check_clock_drift,
     ),
 ]
 
@@ -119,21 +109,21 @@ LogsArgument = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")]
 
 
-def chosen_scenario(
+def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
     """Returns the scenario that a command's options describe."""
-    from ..scenario import load
+    from ..scenario import load_scenario
 
     given = list(overrides or [])
     if duration is not None:
         given.append(f"duration_s={duration!r}")
     if seed is not None:
         given.append(f"seed={seed}")
-    return load(source, given)
+    return load_scenario(source, given)
 
 
-def chosen_connection(
+def resolve_connection(
     listen: list[str] | None,
     connect: list[str] | None,
     routers: list[str] | None,
@@ -142,8 +132,8 @@ def chosen_connection(
     connect_else: Sequence[str] | None,
 ) -> "Connection":
     """Returns how a member takes part by a command's options, and by default."""
-    from ..net.connection import member_connection
+    from ..net.connection import resolve_member_connection
     from ..net.zenoh_bus import read_zenoh_file
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    return member_connection(listen, connect, routers, file, listen_else, connect_else)
+    return resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)

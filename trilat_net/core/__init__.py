@@ -1,5 +1,5 @@
-"""Numbers in, numbers out: the arm, the control law, the links and the one step of a site.
+"""Numbers in, numbers out: the arm, the control laws, the links, and the one step of a site.
 
-Nothing in here reads a clock, opens a file or a socket, logs, or draws a random number that the
-scenario did not seed. It needs the standard library, NumPy and Numba, and no other part of the project.
+Invariant: nothing in this package reads a clock, opens a file or a socket, logs, or draws a random number
+that the scenario does not seed. It depends on the standard library, NumPy, Numba and `errors`.
 """

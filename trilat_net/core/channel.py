@@ -1,8 +1,8 @@
-"""What the network does to each sample of a directed link: when it is due, or that it is lost.
+"""The network's effect on each sample of a directed link: its due time, or its loss.
 
-Law (L4): the fate of sample m is a function of the link's key, m, and the model in force at its stamp.
-What has memory (bursts of loss, correlated delay, order) advances sample by sample, by index, whatever
-arrives and when.
+Invariant (L4): the delivery of sample m is a function of the link's key, m, and the model in force at its
+stamp. All memory (bursts of loss, correlated delay, order) advances sample by sample, by index, in
+whatever order samples arrive.
 """
 
 from .delay import (
@@ -10,23 +10,27 @@ from .delay import (
     DELAY,
     DUPLICATE,
     LOSS,
-    Delay,
-    Points,
-    Row,
-    correlated,
-    drawn_us,
-    sine_us,
-    traced_us,
-    whole_us,
+    DelayKind,
+    clamp_delay_us,
+    draw_delay_us,
+    next_correlated,
+    sine_delay_us,
+    trace_delay_us,
 )
-from .draw import Key, uniforms
-from .grid import tick_ns
 from .jit import leaf
+from .philox import DrawKey, uniforms
+from .ticks import tick_ns
+from .vectors import Points, Row
 
 LOST = -1
 """In the place of a time: the sample is lost."""
 
-_AR1, _SINE, _TRACE, _MEASURED = int(Delay.AR1), int(Delay.SINE), int(Delay.TRACE), int(Delay.MEASURED)
+_AR1, _SINE, _TRACE, _MEASURED = (
+    int(DelayKind.AR1),
+    int(DelayKind.SINE),
+    int(DelayKind.TRACE),
+    int(DelayKind.MEASURED),
+)
 
 
 @leaf
@@ -46,7 +50,7 @@ def _lost(sample: int, fresh: bool, link: Row, model: Row) -> bool:
     """
     if model.loss_good == 0.0 and model.enter == 0.0:
         return False
-    key: Key = link.key
+    key: DrawKey = link.key
     u, v = uniforms(key, sample, LOSS, 0)
     if fresh:
         link.bad = u * (model.enter + model.leave) < model.enter
@@ -61,17 +65,17 @@ def _lost(sample: int, fresh: bool, link: Row, model: Row) -> bool:
 @leaf
 def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
     """Returns the delay of a sample, us; LOST where a trace says so."""
-    key: Key = link.key
+    key: DrawKey = link.key
     if model.kind == _MEASURED:
         return 0
     if model.kind == _TRACE:
-        return traced_us(stamp_ns, model, points)
+        return trace_delay_us(stamp_ns, model, points)
     if model.kind == _SINE:
-        return whole_us(sine_us(stamp_ns, model))
+        return clamp_delay_us(sine_delay_us(stamp_ns, model))
     if model.kind == _AR1:
-        link.memory = correlated(key, sample, model.weight, link.memory, fresh)
-        return whole_us(model.location + model.scale * link.memory)
-    return whole_us(drawn_us(key, sample, DELAY, model))
+        link.memory = next_correlated(key, sample, model.weight, link.memory, fresh)
+        return clamp_delay_us(model.location + model.scale * link.memory)
+    return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
 
 
 @leaf
@@ -82,12 +86,12 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
         return LOST
     if model.duplicate > 0.0:
-        key: Key = link.key
+        key: DrawKey = link.key
         u, _ = uniforms(key, sample, DUPLICATE, 0)
         if u < model.duplicate:
             link.copies += 1
             if model.kind < _AR1:  # models with memory or by time give the copy the same delay
-                delay_us = min(delay_us, whole_us(drawn_us(key, sample, COPY, model)))
+                delay_us = min(delay_us, clamp_delay_us(draw_delay_us(key, sample, COPY, model)))
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         due_ns = max(due_ns, link.due_before)
@@ -96,7 +100,7 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
 
 
 @leaf
-def foresee(sample: int, link: Row, models: Row, samples: Row, points: Points) -> None:
+def schedule_deliveries(sample: int, link: Row, models: Row, samples: Row, points: Points) -> None:
     """Decides the fate of every sample up to one and writes it into its page, `due_ns`.
 
     Args:

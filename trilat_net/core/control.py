@@ -1,21 +1,23 @@
-"""The control laws: the paper's adaptive one, split where its equations are, and the classics beside it.
+"""The control laws: the paper's adaptive one, split as its equations are, and the classics.
 
-Law: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-order
-update explicit.
+Invariant: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-
+order update explicit. Gains are diagonal and stand as vectors.
 
 Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
-Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009); direct
-force reflection after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE Trans. Robotics
-and Automation 9 (1993). Gains are diagonal and stand as vectors.
+Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009);
+direct force reflection after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE
+Trans. Robotics and Automation 9 (1993).
 """
 
-from .arm import gravity
 from .jit import leaf
+from .two_link_arm import gravity
 from .vectors import Five, Pair, Vector
 
 
 @leaf
-def errors(q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector) -> tuple[Pair, Pair, Pair]:
+def control_errors(
+    q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
+) -> tuple[Pair, Pair, Pair]:
     """Returns e, its derivative and r = qd + Lambda e: Eq. (9), (18), (10).
 
     Args:
@@ -44,7 +46,7 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 
 @leaf
-def estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
+def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
     """Returns theta_hat - gain Gamma Y' r, Eq. (15) over a time `gain_s`.
 
     Args:
@@ -63,13 +65,13 @@ def estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Fiv
 
 
 @leaf
-def limited(torque: float, limit: float) -> float:
+def limit_torque(torque: float, limit: float) -> float:
     """Returns a torque held within +-limit, N m."""
     return min(max(torque, -limit), limit)
 
 
 @leaf
-def torque(
+def adaptive_torque(
     Y: tuple[Five, Five], theta_hat: Vector, Kp: Vector, Kd: Vector, r: Vector, ed: Vector, limit: float
 ) -> Pair:
     """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), N m, held within +-limit.
@@ -89,11 +91,11 @@ def torque(
         total_1 += Y[1][p] * theta_hat[p]
     total_0 -= Kp[0] * r[0] + Kd[0] * ed[0]
     total_1 -= Kp[1] * r[1] + Kd[1] * ed[1]
-    return limited(total_0, limit), limited(total_1, limit)
+    return limit_torque(total_0, limit), limit_torque(total_1, limit)
 
 
 @leaf
-def held(value: float, low: float, high: float) -> float:
+def clamp(value: float, low: float, high: float) -> float:
     """Returns a number held within a box."""
     if value < low:
         return low
@@ -101,18 +103,18 @@ def held(value: float, low: float, high: float) -> float:
 
 
 @leaf
-def project(theta_hat: Vector, low: Vector, high: Vector) -> Five:
+def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
     """Returns every parameter held within its box, shape (5,) each.
 
     For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)' Gamma^-1 (theta_hat -
     theta) rise, so that V' <= 0 stands.
     """
     return (
-        held(theta_hat[0], low[0], high[0]),
-        held(theta_hat[1], low[1], high[1]),
-        held(theta_hat[2], low[2], high[2]),
-        held(theta_hat[3], low[3], high[3]),
-        held(theta_hat[4], low[4], high[4]),
+        clamp(theta_hat[0], low[0], high[0]),
+        clamp(theta_hat[1], low[1], high[1]),
+        clamp(theta_hat[2], low[2], high[2]),
+        clamp(theta_hat[3], low[3], high[3]),
+        clamp(theta_hat[4], low[4], high[4]),
     )
 
 
@@ -155,4 +157,4 @@ def damped_torque(
     G = gravity(theta, g, q)
     total_0 = G[0] - K[0] * e[0] - d[0] * qd[0] - Kd[0] * ed[0] + k_f[0] * felt[0]
     total_1 = G[1] - K[1] * e[1] - d[1] * qd[1] - Kd[1] * ed[1] + k_f[1] * felt[1]
-    return limited(total_0, limit), limited(total_1, limit)
+    return limit_torque(total_0, limit), limit_torque(total_1, limit)

@@ -1,25 +1,25 @@
-"""Delay models: how long a sample of a link is under way.
+"""Delay models of a link, as the core computes them.
 
-Law (L4): a delay is a function of the link's key, the sample's index and its stamp, rounded to whole
-microseconds. Only AR1 looks at the sample before; it advances by index, not by arrival.
+Invariant (L4): a delay is a function of the link's key, the sample's index and its stamp, rounded to whole
+microseconds. Only AR1 depends on the sample before; it advances by index, not by arrival.
 """
 
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .draw import Key, normal, standard_gamma, uniforms
 from .jit import leaf
+from .philox import DrawKey, standard_gamma, standard_normal, uniforms
+from .vectors import Points, Row
 
-LIMIT_US = 10_000_000
+MAX_DELAY_US = 10_000_000
 """No delay is longer; what a distribution's tail gives beyond is cut off here."""
 
 
-class Delay(IntEnum):
+class DelayKind(IntEnum):
     """The kinds of delay, and what the four parameters of a `Model` mean in each; times in us.
 
     CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`, drawn again
@@ -42,14 +42,14 @@ class Delay(IntEnum):
     MEASURED = 9
 
 
-class AtEnd(IntEnum):
+class TraceEnd(IntEnum):
     """What a trace does behind its last point: hold it, or begin again."""
 
     HOLD = 0
     LOOP = 1
 
 
-class Model(NamedTuple):
+class LinkModel(NamedTuple):
     """What a link does to the samples from one stamp on.
 
     Attributes:
@@ -72,12 +72,12 @@ class Model(NamedTuple):
     """
 
     from_ns: int = 0
-    kind: int = Delay.CONSTANT
+    kind: int = DelayKind.CONSTANT
     location: float = 0.0
     scale: float = 0.0
     extra: float = 0.0
     weight: float = 0.0
-    at_end: int = AtEnd.HOLD
+    at_end: int = TraceEnd.HOLD
     trace_first: int = 0
     trace_count: int = 0
     loss_good: float = 0.0
@@ -89,19 +89,12 @@ class Model(NamedTuple):
     playout_us: int = 0
 
 
-MODEL = np.dtype(
-    (np.record, [(name, "f8" if kind is float else "i8") for name, kind in Model.__annotations__.items()])
+LINK_MODEL_DTYPE = np.dtype(
+    (np.record, [(name, "f8" if kind is float else "i8") for name, kind in LinkModel.__annotations__.items()])
 )
 
-Row = Any
-"""A row of a structured array; NumPy's types cannot name its fields."""
 
-Points = NDArray[np.int64]
-"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay of -1 is a
-sample lost) and outages (first and last stamp, ns), one after the other."""
-
-
-def longest_us(models: Sequence[Model], traces: Sequence[Points | None]) -> int:
+def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
     """Returns a delay that no sample of a link exceeds, us, play-out included.
 
     Args:
@@ -111,26 +104,26 @@ def longest_us(models: Sequence[Model], traces: Sequence[Points | None]) -> int:
     reaches = []
     for model, trace in zip(models, traces, strict=True):
         bounded = {
-            Delay.CONSTANT: model.location,
-            Delay.UNIFORM: model.location + model.scale,
-            Delay.SINE: model.location + abs(model.scale),
-            Delay.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
-            Delay.MEASURED: 0.0,
-        }.get(Delay(model.kind), float(LIMIT_US))
+            DelayKind.CONSTANT: model.location,
+            DelayKind.UNIFORM: model.location + model.scale,
+            DelayKind.SINE: model.location + abs(model.scale),
+            DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
+            DelayKind.MEASURED: 0.0,
+        }.get(DelayKind(model.kind), float(MAX_DELAY_US))
         reaches.append(max(math.ceil(bounded) + 1, model.playout_us))
-    return min(LIMIT_US, max(reaches))
+    return min(MAX_DELAY_US, max(reaches))
 
 
 LOSS, DUPLICATE, DELAY, COPY = 0, 1, 2, 5
 """Purposes of draws; a delay takes up to three, see `standard_gamma`."""
 
-_UNIFORM, _NORMAL, _GAMMA = int(Delay.UNIFORM), int(Delay.NORMAL), int(Delay.GAMMA)
-_LOG_NORMAL, _HYPER = int(Delay.LOG_NORMAL), int(Delay.HYPER_EXPONENTIAL)
-_LOOP = int(AtEnd.LOOP)
+_UNIFORM, _NORMAL, _GAMMA = int(DelayKind.UNIFORM), int(DelayKind.NORMAL), int(DelayKind.GAMMA)
+_LOG_NORMAL, _HYPER = int(DelayKind.LOG_NORMAL), int(DelayKind.HYPER_EXPONENTIAL)
+_LOOP = int(TraceEnd.LOOP)
 
 
 @leaf
-def drawn_us(key: Key, sample: int, purpose: int, model: Row) -> float:
+def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
     """Returns a draw of a distribution without memory, us, not rounded.
 
     Args:
@@ -147,13 +140,13 @@ def drawn_us(key: Key, sample: int, purpose: int, model: Row) -> float:
         return location + scale * (2.0 * u - 1.0)
     if model.kind == _NORMAL:
         for attempt in range(64):  # the mean is not negative: each attempt suits with 1/2 or more
-            x = location + scale * normal(key, sample, purpose, attempt)
+            x = location + scale * standard_normal(key, sample, purpose, attempt)
             if x >= 0.0:
                 return x
     if model.kind == _GAMMA:
         return scale * standard_gamma(key, sample, purpose, extra)
     if model.kind == _LOG_NORMAL:
-        return math.exp(location + scale * normal(key, sample, purpose, 0))
+        return math.exp(location + scale * standard_normal(key, sample, purpose, 0))
     if model.kind == _HYPER:
         u, v = uniforms(key, sample, purpose, 0)
         return location - (extra if u < model.weight else scale) * math.log(v)
@@ -161,7 +154,7 @@ def drawn_us(key: Key, sample: int, purpose: int, model: Row) -> float:
 
 
 @leaf
-def correlated(key: Key, sample: int, correlation: float, before: float, fresh: bool) -> float:
+def next_correlated(key: DrawKey, sample: int, correlation: float, before: float, fresh: bool) -> float:
     """Returns the next number of an AR(1) sequence: standard normal, whatever the correlation.
 
     Args:
@@ -171,14 +164,14 @@ def correlated(key: Key, sample: int, correlation: float, before: float, fresh: 
         before: the number before.
         fresh: True where there is none.
     """
-    x = normal(key, sample, DELAY, 0)
+    x = standard_normal(key, sample, DELAY, 0)
     if fresh:
         return x
     return correlation * before + math.sqrt(1.0 - correlation * correlation) * x
 
 
 @leaf
-def sine_us(stamp_ns: int, model: Row) -> float:
+def sine_delay_us(stamp_ns: int, model: Row) -> float:
     """Returns T(t) of a sinusoidal delay, us."""
     location: float = model.location
     scale: float = model.scale
@@ -187,7 +180,7 @@ def sine_us(stamp_ns: int, model: Row) -> float:
 
 
 @leaf
-def traced_us(stamp_ns: int, model: Row, points: Points) -> int:
+def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     """Returns the delay of a trace, that of its last point at or before the stamp; -1: the sample is lost.
 
     The last point lasts as long as the one before it; behind that the trace holds it or begins again.
@@ -209,6 +202,6 @@ def traced_us(stamp_ns: int, model: Row, points: Points) -> int:
 
 
 @leaf
-def whole_us(delay_us: float) -> int:
+def clamp_delay_us(delay_us: float) -> int:
     """Returns a delay in whole microseconds, from 0 to `LIMIT_US`."""
     return int(min(max(math.floor(delay_us + 0.5), 0.0), 10_000_000.0))

@@ -1,21 +1,27 @@
-"""The dominance matrix: who follows whom, and by how much.
+"""Dominance: who follows whom, by how much, and the reference that a site derives from its peers.
 
-Law: rows sum to one, the diagonal is zero, and beta is the LEFT null vector of Upsilon.
+Invariant: rows of alpha sum to one, the diagonal is zero, and beta is the LEFT null vector of Upsilon.
+While factors change, they are a function of time and of the ramps alone; between two rows that sum to 1
+every row does. A stale peer brings a step to rest; the way back is smooth: from the held pose to the
+peers along 3 x^2 - 2 x^3.
 
 Source: Eq. (6), (7), (20) of the paper. The paper takes beta = (1, 1, 1); that is the right null vector,
-and a left one only where the columns sum to one as well. The left one of an irreducible matrix is its
-Perron vector, positive and unique up to its length.
+and a left one only if the columns sum to one as well. The left one of an irreducible matrix is its Perron
+vector, positive and unique up to its length.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from .jit import leaf
+from .site_setup import StaleAction
+from .ticks import Mode, tick_ns
+from .two_link_arm import JOINTS
+from .vectors import Array, Row, RowArray, pair, put_pair
 
 ROW_SUM_TOLERANCE = 1e-9
 
 
-def row_fault(row: Array, own: int) -> str | None:
+def find_row_problem(row: Array, own: int) -> str | None:
     """Says what is wrong with one row of alpha, or None: Eq. (7) for N sites.
 
     Args:
@@ -38,7 +44,7 @@ def upsilon(alpha: Array) -> Array:
     return alpha - np.eye(len(alpha))
 
 
-def irreducible(alpha: Array) -> bool:
+def is_irreducible(alpha: Array) -> bool:
     """True where every site reaches every other along the links that carry a share, alpha shape (N, N)."""
     reach = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
     for _ in range(len(alpha).bit_length()):
@@ -46,7 +52,7 @@ def irreducible(alpha: Array) -> bool:
     return bool(reach.all())
 
 
-def perron(alpha: Array) -> Array:
+def perron_vector(alpha: Array) -> Array:
     """Returns beta > 0 with beta' Upsilon = 0 and sum 1, shape (N,), for an irreducible alpha.
 
     By the elimination of Grassmann, Taksar and Heyman (1985): no subtraction occurs, so every entry is
@@ -58,7 +64,7 @@ def perron(alpha: Array) -> Array:
     Raises:
         ValueError: alpha is reducible; then some site's weight would be zero, or beta not unique.
     """
-    if not irreducible(alpha):
+    if not is_irreducible(alpha):
         raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
     a = alpha.copy()
     size = len(a)
@@ -71,3 +77,113 @@ def perron(alpha: Array) -> Array:
         beta[site] = beta[:site] @ a[:site, site]
     normalised: Array = beta / beta.sum()
     return normalised
+
+
+RAMP_COLUMNS = 2
+"""A ramp is a row: start and end, ns, then the share of each peer at its end."""
+
+
+@leaf
+def _between(t_ns: float, start_ns: float, end_ns: float, before: float, after: float) -> float:
+    """Returns the share at a time of one ramp."""
+    if t_ns >= end_ns:
+        return after
+    return before + (after - before) * ((t_ns - start_ns) / (end_ns - start_ns))
+
+
+@leaf
+def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
+    """Writes alpha and its derivative into every link.
+
+    A ramp begins where the one before it is at that time, complete or not.
+
+    Args:
+        t_ns: the time, ns since the epoch.
+        count: how many rows of `ramps` are filled; the first holds the shares at the epoch.
+        ramps: in the order of their starts, shape (R, 2 + P), see `RAMP_COLUMNS`.
+        links: one row per peer, dtype LINK.
+    """
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        column = RAMP_COLUMNS + j
+        before, current = ramps[0, column], 0
+        for n in range(1, count):
+            if t_ns < ramps[n, 0]:
+                break
+            before = _between(
+                ramps[n, 0], ramps[current, 0], ramps[current, 1], before, ramps[current, column]
+            )
+            current = n
+        start_ns, end_ns, after = ramps[current, 0], ramps[current, 1], ramps[current, column]
+        link.alpha = _between(t_ns, start_ns, end_ns, before, after)
+        link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
+
+
+_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_HOLD, _BRAKE, _RETURN = int(Mode.HOLD), int(Mode.BRAKE), int(Mode.RETURN)
+_USE, _ACT_BRAKE = int(StaleAction.USE), int(StaleAction.BRAKE)
+
+
+@leaf
+def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
+    """True where a peer with a share is older than `age_ns`; before its first sample it is as old as t."""
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
+        if link.alpha > 0.0 and t_ns - stamp_ns > age_ns:
+            return True
+    return False
+
+
+@leaf
+def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
+    """Changes the mode where peers became stale or fresh, and the reference where the mode asks for it.
+
+    Args:
+        t_ns: the time, ns since the epoch.
+        site: the site's row; its q_des and qd_des are what the peers give, its q_held what was in force.
+        links: one row per peer, dtype LINK.
+    """
+    if site.on_stale == _USE or site.mode == _DIVERGED:
+        return
+    stale = any_peer_stale(t_ns, site.stale_ns, links)
+    if stale and (site.mode == _RUN or site.mode == _RETURN):
+        braking = site.on_stale == _ACT_BRAKE
+        for i in range(site.q.shape[0]):
+            site.q_held[i] = site.q[i] if braking else site.q_followed[i]
+        site.mode = _BRAKE if braking else _HOLD
+        site.return_from_ns = 0
+    elif not stale and (site.mode == _HOLD or site.mode == _BRAKE):
+        site.mode = _RETURN
+        site.return_from_ns = t_ns
+    if site.mode == _RETURN and t_ns - site.return_from_ns >= site.return_ns:
+        site.mode = _RUN
+    if site.mode == _RUN:
+        return
+    x = (t_ns - site.return_from_ns) / site.return_ns if site.mode == _RETURN else 0.0
+    share = x * x * (3.0 - 2.0 * x)
+    share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
+    for i in range(site.q.shape[0]):
+        way = site.q_des[i] - site.q_held[i]
+        site.q_des[i] = site.q_held[i] + share * way
+        site.qd_des[i] = share * site.qd_des[i] + share_rate * way
+
+
+@leaf
+def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> None:
+    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order.
+
+    While shares change, the derivative has their rates in it too.
+    """
+    if site.ramps > 1:
+        apply_ramps(t_ns, site.ramps, ramps, links)
+    put_pair(site.q_followed, pair(site.q_des))
+    for i in range(JOINTS):
+        q_des = qd_des = felt = 0.0
+        for j in range(links.shape[0]):
+            link: Row = links[j]
+            q_des += link.alpha * link.q[i]
+            qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
+            felt -= link.alpha * link.tau_x[i]
+        site.q_des[i], site.qd_des[i], site.felt[i] = q_des, qd_des, felt
+    update_stale_mode(t_ns, site, links)

@@ -1,9 +1,9 @@
-"""Exogenous torque: what operators and environments do to the arm.
+"""Exogenous torque: the effect of operators and environments on the arm.
 
-Law: a function of time and of the arm's state, so that each stage of the integrator can ask for it; where an
-actor is `sampled`, it is asked once a tick and held, as a digital haptic wall does.
+Invariant: the torque is a function of time and of the arm's state, so each stage of the integrator
+evaluates it; a `sampled` source is evaluated once a tick and held, as in a digital haptic wall.
 
-Scenarios speak of the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is its negative.
+Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is its negative.
 """
 
 import math
@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .arm import JOINTS, Array, elbow_and_tip, tip_jacobian
-from .delay import Row
 from .jit import leaf
-from .sines import sincos
-from .vectors import Pair, Vector
+from .sincos import sincos
+from .two_link_arm import JOINTS, end_effector_jacobian, forward_kinematics
+from .vectors import Array, Pair, Row, Vector
 
 
-class Acts(IntEnum):
+class TorqueKind(IntEnum):
     """How an actor pushes.
 
     PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a damper towards a
@@ -36,7 +35,7 @@ class Acts(IntEnum):
     WALL = 5
 
 
-class Actor(NamedTuple):
+class TorqueSource(NamedTuple):
     """One operator or environment; what its vectors mean depends on how it acts.
 
     Attributes:
@@ -53,7 +52,7 @@ class Actor(NamedTuple):
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (n, 1 + JOINTS).
     """
 
-    acts: Acts
+    acts: TorqueKind
     start_s: float = -math.inf
     end_s: float = math.inf
     move_start_s: float = 0.0
@@ -67,7 +66,7 @@ class Actor(NamedTuple):
 
 
 _PAIR = (JOINTS,)
-ACTOR = np.dtype(
+TORQUE_SOURCE_DTYPE = np.dtype(
     (
         np.record,
         [
@@ -86,16 +85,16 @@ ACTOR = np.dtype(
         ],
     )
 )
-Actors = NDArray[np.void]
-Table = Array
+TorqueSourceRows = NDArray[np.void]
+TorqueTable = Array
 
-_PULSE, _HAND, _TASK_HAND = int(Acts.PULSE), int(Acts.HAND), int(Acts.TASK_HAND)
-_RECORDED, _VISCOUS, _WALL = int(Acts.RECORDED), int(Acts.VISCOUS), int(Acts.WALL)
+_PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
+_RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
 
 
-def rows_of(actors: tuple[Actor, ...]) -> tuple[Actors, Table]:
+def torque_source_rows(actors: tuple[TorqueSource, ...]) -> tuple[TorqueSourceRows, TorqueTable]:
     """Returns the actors as the core has them: one row each, dtype ACTOR, and all their tables in one."""
-    rows = np.zeros(len(actors), ACTOR)
+    rows = np.zeros(len(actors), TORQUE_SOURCE_DTYPE)
     tables = [np.zeros((0, 1 + JOINTS))]
     first = 0
     row: Row
@@ -144,7 +143,7 @@ def _spring(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 
 
 @leaf
-def _tabled(actor: Row, t_s: float, table: Table) -> Pair:
+def _tabled(actor: Row, t_s: float, table: TorqueTable) -> Pair:
     """Returns a torque between its rows, linearly; nothing before the first and behind the last."""
     first, count = actor.table_first, actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
@@ -178,15 +177,15 @@ def _wall(actor: Row, at: Pair, speed: Pair) -> Pair:
 @leaf
 def _in_the_plane(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> Pair:
     """Returns J' F of a force at the tip: a hand's, or a wall's."""
-    _, at = elbow_and_tip(lengths, q)
-    x, y = tip_jacobian(lengths, q)
+    _, at = forward_kinematics(lengths, q)
+    x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
     force = _spring(actor, t_s, at, speed) if actor.acts == _TASK_HAND else _wall(actor, at, speed)
     return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1]
 
 
 @leaf
-def torque_of(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: Table) -> Pair:
+def source_torque(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable) -> Pair:
     """Returns what one actor does to the arm at time t, N m, ON it.
 
     A pulse is peak * sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper,
@@ -215,7 +214,13 @@ def torque_of(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, ta
 
 @leaf
 def torque_on_arm(
-    t_s: float, q: Vector, qd: Vector, lengths: Vector, actors: Actors, table: Table, sampled: int
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    lengths: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
 ) -> Pair:
     """Returns what the actors do to the arm at time t, N m; -tau_x of Eq. (8).
 
@@ -232,7 +237,7 @@ def torque_on_arm(
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
         if actor.sampled == sampled:
-            torque = torque_of(t_s, q, qd, lengths, actor, table)
+            torque = source_torque(t_s, q, qd, lengths, actor, table)
             total_0 += torque[0]
             total_1 += torque[1]
     return total_0, total_1

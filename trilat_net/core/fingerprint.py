@@ -1,7 +1,8 @@
 """A fingerprint of the platform's arithmetic, by behaviour.
 
-Law (L5): two platforms with the same fingerprint gave the same bits for many sines and cosines and for a
-short run of two sites with random links; only there is a whole run executed again and bit equality demanded.
+Invariant (L5): two platforms with the same fingerprint gave the same bits for many sines and cosines and
+for a short run of two sites with random links; only between such platforms does verification demand bit
+equality.
 """
 
 import hashlib
@@ -9,17 +10,18 @@ from functools import cache
 
 import numpy as np
 
-from .arm import PARAMETERS, Array, Links, parameters
-from .delay import Delay, Model
-from .exogenous import Actor, Acts
+from .delay import DelayKind, LinkModel
+from .exogenous import TorqueKind, TorqueSource
 from .jit import leaf
-from .setup import Gains, Law, LinkSetup, Scheme, SiteSetup
-from .sines import sincos
-from .site import Site
-from .tick import Arrival, Tick
+from .sincos import sincos
+from .site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup
+from .site_step import Site
+from .ticks import Arrival, TickInput
+from .two_link_arm import PARAMETERS, ArmLinks, theta_from_links
+from .vectors import Array
 
 _TICKS = 200
-_LINK = Model(kind=Delay.GAMMA, extra=2.7, scale=900.0, playout_us=2_000)
+_LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000)
 
 
 @leaf
@@ -29,7 +31,7 @@ def _sines(angles: Array, results: Array) -> None:
 
 
 def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    theta = parameters(Links(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05))
+    theta = theta_from_links(ArmLinks(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05))
     return SiteSetup(
         name=name,
         rate_hz=1000,
@@ -49,22 +51,22 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         qd_limit_rad_s=100.0,
         q0=q0,
         qd0=(0.1, -0.2),
-        actors=(Actor(Acts.PULSE, 0.01, 0.15, a=(3.0, 2.0)),),
+        actors=(TorqueSource(TorqueKind.PULSE, 0.01, 0.15, a=(3.0, 2.0)),),
         links=(LinkSetup(peer, 1.0, 1000, (0.0, 0.0), 7, (_LINK,)),),
     )
 
 
 @cache
-def fingerprint() -> str:
+def compute_fingerprint() -> str:
     """Returns sixteen hexadecimal digits that name this platform's arithmetic."""
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))
     _sines(angles, results)
     digest = hashlib.sha256(results.tobytes())
     sites = [Site(_setup("a", "b", (0.6, -0.4))), Site(_setup("b", "a", (-0.5, 0.8)))]
-    outputs = [site.step(Tick(0)) for site in sites]
+    outputs = [site.step(TickInput(0)) for site in sites]
     for k in range(1, _TICKS):
         arrivals = [[Arrival(0, k - 1, outputs[1 - i].q, outputs[1 - i].qd)] for i in (0, 1)]
-        outputs = [site.step(Tick(k, came)) for site, came in zip(sites, arrivals, strict=True)]
+        outputs = [site.step(TickInput(k, came)) for site, came in zip(sites, arrivals, strict=True)]
         digest.update(np.array([o.q + o.qd + o.tau + o.theta_hat for o in outputs]).tobytes())
     return digest.hexdigest()[:16]

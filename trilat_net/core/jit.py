@@ -1,9 +1,9 @@
 """The one typed wrapper around Numba.
 
-Law: a leaf is compiled for float64 without reordering (no fastmath), so that compiled and plain Python
-runs of it give the same bits. Machine code is cached in the user's cache directory, in a folder named
-after the text of the whole core: Numba alone notices a change of the file that holds a leaf, but not of
-the leaves that it calls.
+Invariant: a leaf is compiled for float64 without reordering (no fastmath), so compiled and plain Python
+runs give the same bits. Machine code is cached in the user's cache directory, in a folder named after a
+hash of all sources of the core: Numba alone notices a change of the file that holds a leaf, not of the
+leaves it calls.
 """
 
 import hashlib
@@ -50,7 +50,7 @@ _config: Any = numba.config  # made at import from the environment; its stubs na
 _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 
 
-def is_cached() -> bool:
+def is_core_cached() -> bool:
     """True where compiled leaves of this very core lie in the cache."""
     return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
 

@@ -1,110 +1,90 @@
-"""One tick of one site, compiled: the state's layout, and the eight stages in order.
+"""One tick of one site, compiled: its eight stages in order, and the integrator of the arm.
 
-Law: one call computes a whole tick, and every stage is a leaf that other drivers of the same numbers (the
-fused virtual-time kernel) call as well. A site's state is one row of a structured array: one argument
-that costs a quarter of a microsecond to pass, and fields with the paper's names.
+Invariant: one call computes a whole tick, and every stage is a leaf that the fused virtual-time run calls
+as well. The arm advances one period by the classical Runge-Kutta method of fourth order: each of its
+stages evaluates operators and environments, and what is held over the period is constant.
 """
 
 import math
 
-import numpy as np
-
 from . import control
-from .arm import JOINTS, PARAMETERS, Array, regressor
-from .delay import Points, Row
-from .exogenous import Actors, Table, torque_on_arm
-from .grid import tick_ns
-from .integrator import advance
+from .dominance import update_reference
+from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .jit import leaf
-from .link import Rows, Ticks, accept, recall
-from .setup import Law, Scheme
-from .shares import follow_ramps
-from .stale import mind_stale_peers
-from .tick import Mode
-from .vectors import Pair, five, pair, put_five, put_pair
+from .link import accept_sample, recall_sample
+from .site_setup import Law, Scheme
+from .ticks import Mode, tick_ns
+from .two_link_arm import forward_dynamics, regressor
+from .vectors import Array, IntArray, Pair, Points, Row, RowArray, Vector, five, pair, put_five, put_pair
 
-_VECTOR = (JOINTS,)
-SITE = np.dtype(
-    (
-        np.record,
-        [
-            ("rate_hz", "i8"),
-            ("scheme", "i8"),
-            ("law", "i8"),
-            ("external", "i8"),
-            ("ramps", "i8"),
-            ("on_stale", "i8"),
-            ("stale_ns", "i8"),
-            ("return_ns", "i8"),
-            ("g", "f8"),
-            ("tau_limit", "f8"),
-            ("qd_limit", "f8"),
-            ("theta", "f8", (PARAMETERS,)),
-            ("Lambda", "f8", _VECTOR),
-            ("Kp", "f8", _VECTOR),
-            ("Kd", "f8", _VECTOR),
-            ("Gamma", "f8", (PARAMETERS,)),
-            ("low", "f8", (PARAMETERS,)),
-            ("high", "f8", (PARAMETERS,)),
-            ("known", "f8", (PARAMETERS,)),
-            ("K", "f8", _VECTOR),
-            ("d", "f8", _VECTOR),
-            ("k_f", "f8", _VECTOR),
-            ("lengths", "f8", (2,)),
-            # the state
-            ("mode", "i8"),
-            ("q", "f8", _VECTOR),
-            ("qd", "f8", _VECTOR),
-            ("theta_hat", "f8", (PARAMETERS,)),
-            ("tau", "f8", _VECTOR),
-            ("tau_before", "f8", _VECTOR),
-            ("Yr", "f8", (PARAMETERS,)),
-            ("Yr_before", "f8", (PARAMETERS,)),
-            ("q_held", "f8", _VECTOR),
-            ("return_from_ns", "i8"),
-            # what a tick computes on its way
-            ("q_des", "f8", _VECTOR),
-            ("qd_des", "f8", _VECTOR),
-            ("q_followed", "f8", _VECTOR),
-            ("felt", "f8", _VECTOR),
-            ("on_arm", "f8", _VECTOR),
-            ("held", "f8", _VECTOR),
-            ("e", "f8", _VECTOR),
-            ("ed", "f8", _VECTOR),
-            ("r", "f8", _VECTOR),
-            ("Y", "f8", (JOINTS, PARAMETERS)),
-        ],
-    )
-)
-ARRIVAL = np.dtype((np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", _VECTOR), ("qd", "f8", _VECTOR)]))
 
-# Where each vector of a record lies in the row of floats that a tick emits.
-EMITTED = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-ROW_FLOATS = 6 * JOINTS + PARAMETERS
+@leaf
+def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
+    """Returns x + step * rate."""
+    return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
+
+
+@leaf
+def _acceleration(
+    t_s: float,
+    q: Pair,
+    qd: Pair,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    acts: TorqueSourceRows,
+    table: TorqueTable,
+) -> Pair:
+    """Returns qdd at one stage, under the held u and what acts at that stage's time and state."""
+    on_arm = torque_on_arm(t_s, q, qd, lengths, acts, table, 0)
+    return forward_dynamics(theta, g, q, qd, (on_arm[0] + u[0], on_arm[1] + u[1]))
+
+
+@leaf
+def rk4_step(
+    t_s: float,
+    h_s: float,
+    q: Vector,
+    qd: Vector,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    acts: TorqueSourceRows,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Returns q and qd one period later, Eq. (8).
+
+    Args:
+        t_s: time at the start of the period, s since the epoch.
+        h_s: the period, s.
+        q: joint angles, shape (2,), rad.
+        qd: joint velocities, shape (2,), rad/s.
+        u: torque held over the period, control and sampled actors, shape (2,), N m.
+        theta: the arm's parameters, shape (5,).
+        g: gravitational acceleration, m/s^2.
+        lengths: of the two links, m.
+        acts: operators and environments, see `exogenous`.
+        table: their recorded torques.
+    """
+    half, sixth = 0.5 * h_s, h_s / 6.0
+    q1, v1 = (q[0], q[1]), (qd[0], qd[1])
+    a1 = _acceleration(t_s, q1, v1, u, theta, g, lengths, acts, table)
+    q2, v2 = add_scaled(q1, half, v1), add_scaled(v1, half, a1)
+    a2 = _acceleration(t_s + half, q2, v2, u, theta, g, lengths, acts, table)
+    q3, v3 = add_scaled(q1, half, v2), add_scaled(v1, half, a2)
+    a3 = _acceleration(t_s + half, q3, v3, u, theta, g, lengths, acts, table)
+    q4, v4 = add_scaled(q1, h_s, v3), add_scaled(v1, h_s, a3)
+    a4 = _acceleration(t_s + h_s, q4, v4, u, theta, g, lengths, acts, table)
+    v_sum = (v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0], v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1])
+    a_sum = (a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0], a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1])
+    return add_scaled(q1, sixth, v_sum), add_scaled(v1, sixth, a_sum)
+
 
 _DIVERGED = int(Mode.DIVERGED)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
-
-
-@leaf
-def _reference(t_ns: int, site: Row, links: Rows, ramps: Array) -> None:
-    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order.
-
-    While shares change, the derivative has their rates in it too.
-    """
-    if site.ramps > 1:
-        follow_ramps(t_ns, site.ramps, ramps, links)
-    put_pair(site.q_followed, pair(site.q_des))
-    for i in range(JOINTS):
-        q_des = qd_des = felt = 0.0
-        for j in range(links.shape[0]):
-            link: Row = links[j]
-            q_des += link.alpha * link.q[i]
-            qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
-            felt -= link.alpha * link.tau_x[i]
-        site.q_des[i], site.qd_des[i], site.felt[i] = q_des, qd_des, felt
-    mind_stale_peers(t_ns, site, links)
 
 
 @leaf
@@ -114,17 +94,17 @@ def _estimate(k: int, site: Row) -> None:
         return
     a, b = site.Yr_before, site.Yr
     both = (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4])
-    estimate = control.estimate(site.theta_hat, 0.5 / site.rate_hz, site.Gamma, both)
-    put_five(site.theta_hat, control.project(estimate, site.low, site.high))
+    estimate = control.update_estimate(site.theta_hat, 0.5 / site.rate_hz, site.Gamma, both)
+    put_five(site.theta_hat, control.project_estimate(estimate, site.low, site.high))
 
 
 @leaf
-def site_torque(site: Rows) -> None:
+def torque_stage(site: RowArray) -> None:
     """Stage 6 of a tick: the torque of the site's law, unless that is somebody's own."""
     s: Row = site[0]
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
-        put_pair(s.tau, control.torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, s.tau_limit))
+        put_pair(s.tau, control.adaptive_torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, s.tau_limit))
     elif s.law != _OWN:
         put_pair(
             s.tau,
@@ -138,7 +118,7 @@ def site_torque(site: Rows) -> None:
 def _errors_and_regressor(site: Row) -> None:
     """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
     q, qd, Lambda = pair(site.q), pair(site.qd), pair(site.Lambda)
-    e, ed, r = control.errors(q, qd, site.q_des, site.qd_des, Lambda)
+    e, ed, r = control.control_errors(q, qd, site.q_des, site.qd_des, Lambda)
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
     Y = regressor(site.g, q, qd, v, a)
@@ -186,7 +166,7 @@ def _emit(site: Row, row: Array) -> None:
 
 
 @leaf
-def _feel(t_ns: int, site: Row, actors: Actors, table: Table) -> None:
+def _feel(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
     """Writes what acts on the arm now, and what of it is held over the tick."""
     t_s, q, qd, lengths = t_ns * 1e-9, pair(site.q), pair(site.qd), pair(site.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
@@ -200,19 +180,19 @@ def _held_torque(k: int, site: Row, i: int) -> float:
     """Returns what pushes a joint through the period: the torque at its middle, and what is held."""
     torque: float = site.tau[i]
     if site.scheme != _DIGITAL and k > 0:
-        torque = control.limited(1.5 * site.tau[i] - 0.5 * site.tau_before[i], site.tau_limit)
+        torque = control.limit_torque(1.5 * site.tau[i] - 0.5 * site.tau_before[i], site.tau_limit)
     held: float = site.held[i]
     return torque + held
 
 
 @leaf
-def _advance(k: int, t_ns: int, site: Row, actors: Actors, table: Table) -> None:
+def _advance(k: int, t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
     """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
     s = site
     h_s = 1.0 / s.rate_hz
     if s.external == 0:
         u = (_held_torque(k, s, 0), _held_torque(k, s, 1))
-        q, qd = advance(
+        q, qd = rk4_step(
             t_ns * 1e-9, h_s, pair(s.q), pair(s.qd), u, five(s.theta), s.g, pair(s.lengths), actors, table
         )
         if _finite(q, qd):
@@ -221,23 +201,23 @@ def _advance(k: int, t_ns: int, site: Row, actors: Actors, table: Table) -> None
         else:
             s.mode = _DIVERGED
     if s.scheme == _DIGITAL and s.law == _ADAPTIVE:
-        estimate = control.estimate(s.theta_hat, h_s, s.Gamma, s.Yr)
-        put_five(s.theta_hat, control.project(estimate, s.low, s.high))
+        estimate = control.update_estimate(s.theta_hat, h_s, s.Gamma, s.Yr)
+        put_five(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
     put_pair(s.tau_before, pair(s.tau))
     put_five(s.Yr_before, five(s.Yr))
 
 
 @leaf
-def site_accept(
+def accept_stage(
     k: int,
     count: int,
-    site: Rows,
-    links: Rows,
-    models: Rows,
-    samples: Rows,
-    calendars: Ticks,
+    site: RowArray,
+    links: RowArray,
+    models: RowArray,
+    samples: RowArray,
+    calendars: IntArray,
     points: Points,
-    arrivals: Rows,
+    arrivals: RowArray,
     forces: Array,
 ) -> None:
     """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
@@ -246,52 +226,56 @@ def site_accept(
         arrival: Row = arrivals[n]
         j = arrival.peer
         tick, q, qd = arrival.tick, arrival.q, arrival.qd
-        accept(k, rate_hz, tick, q, qd, forces[n], links[j], models[j], samples[j], calendars[j], points)
+        accept_sample(
+            k, rate_hz, tick, q, qd, forces[n], links[j], models[j], samples[j], calendars[j], points
+        )
 
 
 @leaf
-def site_follow(
+def follow_stages(
     k: int,
     t_ns: int,
-    site: Rows,
-    links: Rows,
-    models: Rows,
-    samples: Rows,
-    calendars: Ticks,
+    site: RowArray,
+    links: RowArray,
+    models: RowArray,
+    samples: RowArray,
+    calendars: IntArray,
     points: Points,
     ramps: Array,
 ) -> None:
     """Stages 2 to 5 of a tick, with its arrivals in their links; arguments as in `site_tick`."""
     s: Row = site[0]
     for j in range(links.shape[0]):  # 2 recall
-        recall(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
-    _reference(t_ns, s, links, ramps)  # 3 reference
+        recall_sample(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
+    update_reference(t_ns, s, links, ramps)  # 3 reference
     _errors_and_regressor(s)  # 4 errors
     _estimate(k, s)  # 5 estimate
 
 
 @leaf
-def site_look(
+def sense_stages(
     k: int,
     t_ns: int,
     count: int,
-    site: Rows,
-    links: Rows,
-    models: Rows,
-    samples: Rows,
-    calendars: Ticks,
+    site: RowArray,
+    links: RowArray,
+    models: RowArray,
+    samples: RowArray,
+    calendars: IntArray,
     points: Points,
     ramps: Array,
-    arrivals: Rows,
+    arrivals: RowArray,
     forces: Array,
 ) -> None:
     """Stages 1 to 5 of a tick: what came in, the reference, the errors, the estimate; see `site_tick`."""
-    site_accept(k, count, site, links, models, samples, calendars, points, arrivals, forces)
-    site_follow(k, t_ns, site, links, models, samples, calendars, points, ramps)
+    accept_stage(k, count, site, links, models, samples, calendars, points, arrivals, forces)
+    follow_stages(k, t_ns, site, links, models, samples, calendars, points, ramps)
 
 
 @leaf
-def site_act(k: int, t_ns: int, site: Rows, actors: Actors, table: Table, row: Array) -> None:
+def act_stages(
+    k: int, t_ns: int, site: RowArray, actors: TorqueSourceRows, table: TorqueTable, row: Array
+) -> None:
     """Stages 7 and 8 of a tick, with the torque in place: the record, and the way to the next tick."""
     s: Row = site[0]
     _feel(t_ns, s, actors, table)
@@ -307,17 +291,17 @@ def site_tick(
     k: int,
     t_ns: int,
     count: int,
-    site: Rows,
-    links: Rows,
-    models: Rows,
-    samples: Rows,
-    calendars: Ticks,
+    site: RowArray,
+    links: RowArray,
+    models: RowArray,
+    samples: RowArray,
+    calendars: IntArray,
     points: Points,
     ramps: Array,
-    arrivals: Rows,
+    arrivals: RowArray,
     forces: Array,
-    actors: Actors,
-    table: Table,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
     row: Array,
 ) -> None:
     """Computes one tick of one site; what `Site.step` and the virtual-time kernel both call.
@@ -339,13 +323,13 @@ def site_tick(
         table: their recorded torques.
         row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
     """
-    site_look(k, t_ns, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
-    site_torque(site)  # 6 torque
-    site_act(k, t_ns, site, actors, table, row)
+    sense_stages(k, t_ns, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
+    torque_stage(site)  # 6 torque
+    act_stages(k, t_ns, site, actors, table, row)
 
 
 @leaf
-def site_resume(k: int, site: Rows, actors: Actors, table: Table) -> None:
+def resume_stages(k: int, site: RowArray, actors: TorqueSourceRows, table: TorqueTable) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
     s: Row = site[0]
     t_ns = tick_ns(k, s.rate_hz)

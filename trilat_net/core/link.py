@@ -1,28 +1,27 @@
-"""The receiving end of one directed link j -> i: where delay is applied.
+"""The receiving end of one directed link j -> i, which applies the delay.
 
-Law (L2): a sample of tick m is due when its channel says so, counted from its nominal stamp in integer
-nanoseconds; it is in use from the first tick of the receiver at or after that, never at its own stamp.
-When it really arrived has no influence as long as it arrived before it was due. (On a measured link a
-sample is due at once, so there its arrival is all that counts.)
+Invariant (L2): a sample of tick m is due when its channel says so, counted from its nominal stamp in
+integer nanoseconds; it is in use from the receiver's first tick at or after that, never at its own stamp.
+Its real arrival has no influence if it precedes the due time. (On a measured link a sample is due at
+once, so there the arrival alone counts.)
 
-A link is a calendar. `accept` files a sample under its own tick and writes into the page of the tick
-that releases it which sample is the newest there; `recall` turns to the page of the present tick. Both
-cost the same whatever the delay. Newest wins: an older sample never replaces a newer one.
+A link is a calendar. `accept_sample` files a sample under its own tick and writes into the page of the
+tick that releases it which sample is newest there; `recall_sample` reads the page of the present tick.
+Both cost the same at any delay. Newest wins: an older sample never replaces a newer one.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .arm import JOINTS, Array
-from .channel import LOST, foresee
-from .delay import LIMIT_US, Delay, Points, Row
-from .grid import NS_PER_S, first_tick_at, tick_ns
+from .channel import LOST, schedule_deliveries
+from .delay import MAX_DELAY_US, DelayKind
 from .jit import leaf
-from .vectors import pair, put_pair
+from .ticks import NS_PER_S, first_tick_at, tick_ns
+from .two_link_arm import JOINTS
+from .vectors import Array, IntArray, Points, Row, RowArray, pair, put_pair
 
 # One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and
 # qd are the peer's start pose, at rest (L7).
-LINK = np.dtype(
+LINK_DTYPE = np.dtype(
     (
         np.record,
         [
@@ -56,7 +55,7 @@ LINK = np.dtype(
 )
 # One page per sample, a power of two of them: when the sample of that index is due, and the sample that waits
 # there with its own tick (-1: none) and the peer's joint state.
-SAMPLE = np.dtype(
+SAMPLE_DTYPE = np.dtype(
     (
         np.record,
         [
@@ -73,25 +72,24 @@ AHEAD_LIMIT_S = 10
 AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
 """A stamp further ahead of the receiver than this is refused."""
 
-Rows = NDArray[np.void]
-Ticks = NDArray[np.int64]
-
-_MEASURED = int(Delay.MEASURED)
+_MEASURED = int(DelayKind.MEASURED)
 
 
 def calendar_pages(rate_hz: int) -> int:
     """Returns how many ticks a calendar must span: the longest delay and what may run ahead of it."""
-    ticks = first_tick_at(LIMIT_US * 1000 + AHEAD_LIMIT_NS, rate_hz) + 2
+    ticks = first_tick_at(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, rate_hz) + 2
     return 1 << int(ticks).bit_length()
 
 
 @leaf
-def release_tick(tick: int, link: Row, models: Rows, samples: Rows, points: Points, rate_hz: int) -> int:
+def release_tick(
+    tick: int, link: Row, models: RowArray, samples: RowArray, points: Points, rate_hz: int
+) -> int:
     """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by then.
 
     LOST where it never does, or where it is so old that its page has been turned.
     """
-    foresee(tick, link, models, samples, points)
+    schedule_deliveries(tick, link, models, samples, points)
     pages = samples.shape[0]
     page: Row = samples[tick & (pages - 1)]
     if page.due_ns == LOST or tick <= link.foreseen - pages:
@@ -108,7 +106,7 @@ def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 
 @leaf
-def accept(
+def accept_sample(
     k: int,
     rate_hz: int,
     tick: int,
@@ -116,9 +114,9 @@ def accept(
     qd: Array,
     tau_x: Array,
     link: Row,
-    models: Rows,
-    samples: Rows,
-    calendar: Ticks,
+    models: RowArray,
+    samples: RowArray,
+    calendar: IntArray,
     points: Points,
 ) -> None:
     """Takes one arrival into a link; what it cannot use it counts.
@@ -170,8 +168,8 @@ def accept(
 
 
 @leaf
-def recall(
-    k: int, rate_hz: int, link: Row, models: Rows, samples: Rows, calendar: Ticks, points: Points
+def recall_sample(
+    k: int, rate_hz: int, link: Row, models: RowArray, samples: RowArray, calendar: IntArray, points: Points
 ) -> None:
     """Brings into use the newest sample that tick k releases, if there is one; else the last one stays.
 
@@ -187,7 +185,7 @@ def recall(
         points: the site's traces and outages.
     """
     same = link.rate_hz == rate_hz
-    foresee(k if same else k * link.rate_hz // rate_hz, link, models, samples, points)
+    schedule_deliveries(k if same else k * link.rate_hz // rate_hz, link, models, samples, points)
     page = k & (calendar.shape[0] - 1)
     newest = calendar[page]
     if newest < 0:

@@ -1,10 +1,14 @@
-"""Vectors of fixed length as tuples: in registers while a tick is computed, in tables between ticks.
+"""Types of the core's numbers: arrays, rows of structured arrays, and vectors of fixed length as tuples.
 
-Law: a leaf takes vectors (tuples or rows of arrays, by index) and returns tuples; it writes nothing.
+Invariant: a leaf takes vectors (tuples or rows of arrays, read by index) and returns tuples, which stay in
+registers while a tick is computed; only the `put_` functions write.
 """
 
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .jit import leaf
 
@@ -38,3 +42,16 @@ def put_pair(a: Any, values: Pair) -> None:
 def put_five(a: Any, values: Five) -> None:
     """Writes five numbers into a row."""
     a[0], a[1], a[2], a[3], a[4] = values
+
+
+Array = NDArray[np.float64]
+
+Row = Any
+"""A row of a structured array; NumPy's types cannot name its fields."""
+
+Points = NDArray[np.int64]
+"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay of -1 is a
+sample lost) and outages (first and last stamp, ns), one after the other."""
+
+RowArray = NDArray[np.void]
+IntArray = NDArray[np.int64]

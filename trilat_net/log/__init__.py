@@ -1,1 +1,1 @@
-"""The MCAP layout: what a log holds, how it is written, how it is read. The only importer of `mcap`."""
+"""The MCAP log: write, read, check and recover it. The only importer of `mcap`."""

@@ -1,27 +1,151 @@
-"""One site's part of a log: its records as arrays with time, or one by one.
+"""One site's part of a log: its records as arrays over time, or one by one.
 
-Law: what is asked for is decoded, and nothing else; what is no record is an error that names the site,
-whenever it is found.
+Invariant: only what is requested is decoded; an invalid record is an error that names the site. Memory
+stays bounded for a log of any length: long sequences of records are decoded in blocks on access.
 """
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.arm import Array
-from ..core.grid import NS_PER_S
+from .. import process
+from ..core.ticks import NS_PER_S
+from ..core.vectors import Array
 from ..errors import LogError, WireError
 from ..net.messages import READABLE, State
 from ..net.wire import decode
-from . import columns
-from .columns import Ints, Words
-from .records import ByTick, Records, records
+from . import record_columns
+from .record_columns import Ints, Strings
+
+MAX_DECODED_RECORDS = 1 << 16
+"""Records of a site that are held decoded, at most: a minute at 1 kHz, some 150 MB."""
+BLOCK_RECORDS = 1 << 11
+"""Records that are decoded together."""
 
 
-class Times(NamedTuple):
+HEAVY_BYTES = 12 << 20
+HEAVY_RATIO = 10
+"""Records whose decoded form takes more than this, and than so many times their payloads, are held few at a
+time: they were made to take much."""
+HEAVY_BLOCK, HEAVY_BLOCKS = 128, 8
+"""Heavy records that are decoded together, and how many times that many are held."""
+
+
+class LazyRecords(Sequence[State]):
+    """Records decoded a block at a time; the blocks looked at last are held.
+
+    Args:
+        payloads: the records as published.
+        decoded: decodes some of them.
+        heavy: whether they take much each.
+    """
+
+    def __init__(
+        self,
+        payloads: Sequence[bytes],
+        decoded: Callable[[Sequence[bytes]], list[State]],
+        *,
+        heavy: bool = False,
+    ) -> None:
+        self._size, self._held = (
+            (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS // BLOCK_RECORDS)
+        )
+        self._payloads = payloads
+        self._decoded = decoded
+        self._blocks: OrderedDict[int, list[State]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def __iter__(self) -> Iterator[State]:
+        for number in range(-(-len(self._payloads) // self._size)):
+            yield from self._block(number)
+
+    @overload
+    def __getitem__(self, place: int) -> State: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[State]: ...
+    def __getitem__(self, place: int | slice) -> State | list[State]:
+        if isinstance(place, slice):
+            return [self[n] for n in range(*place.indices(len(self)))]
+        index = place + len(self) if place < 0 else place
+        if not 0 <= index < len(self):
+            raise IndexError(f"record {place} of {len(self)}")
+        return self._block(index // self._size)[index % self._size]
+
+    def _block(self, number: int) -> list[State]:
+        block = self._blocks.get(number)
+        if block is None:
+            block = self._decoded(self._payloads[number * self._size : (number + 1) * self._size])
+            self._blocks[number] = block
+            if len(self._blocks) > self._held:
+                self._blocks.popitem(last=False)
+        else:
+            self._blocks.move_to_end(number)
+        return block
+
+
+def decode_records(
+    payloads: Sequence[bytes], decoded: Callable[[Sequence[bytes]], list[State]]
+) -> Sequence[State]:
+    """Returns the records of a site, in the order of their payloads.
+
+    Args:
+        payloads: the records as published.
+        decoded: decodes some of them, or raises what is to be raised where one is none.
+    """
+    if len(payloads) > MAX_DECODED_RECORDS:
+        return LazyRecords(payloads, decoded)
+    room = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
+    held: list[State] = []
+    with process.pause_gc():
+        for first in range(0, len(payloads), BLOCK_RECORDS):
+            block = decoded(payloads[first : first + BLOCK_RECORDS])
+            room -= sum(map(_weight, block))
+            if room < 0:
+                return LazyRecords(payloads, decoded, heavy=True)
+            held += block
+    return held
+
+
+def _weight(state: State) -> int:
+    """Returns how many bytes a record takes, about."""
+    lists = len(state.rx) + len(state.echo) + len(state.cmd)
+    return 2_000 + 130 * lists + 100 * len(state.used) + 32 * len(state.mem)
+
+
+class RecordsByTick(Mapping[int, State]):
+    """Records by their tick; of several with one tick, the last.
+
+    Args:
+        states: the records in order of their ticks.
+        ticks: those, shape (K,).
+    """
+
+    def __init__(self, states: Sequence[State], ticks: NDArray[np.int64]) -> None:
+        self._states = states
+        self._ticks = ticks.tolist()
+
+    def __getitem__(self, tick: int) -> State:
+        place = bisect_right(self._ticks, tick) - 1
+        if place < 0 or self._ticks[place] != tick:
+            raise KeyError(tick)
+        return self._states[place]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(dict.fromkeys(self._ticks))
+
+    def __len__(self) -> int:
+        return len(set(self._ticks))
+
+
+class MessageTimes(NamedTuple):
     """When messages came and when they were sent, Unix ns, shape (K,) each."""
 
     log_ns: Ints
@@ -57,7 +181,7 @@ class SiteLog:
         rate_hz: int,
         payloads: Sequence[bytes],
         source: str,
-        times: Times | None = None,
+        times: MessageTimes | None = None,
     ) -> None:
         self.name = name
         self.peers = peers
@@ -65,12 +189,12 @@ class SiteLog:
         self._source = source
         self.payloads = payloads
         with self._told():
-            self.tick: Ints = columns.ticks(payloads)
+            self.tick: Ints = record_columns.decode_ticks(payloads)
         if (self.tick[1:] < self.tick[:-1]).any():
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = [payloads[n] for n in order.tolist()]
-            times = None if times is None else Times(*(column[order] for column in times))
+            times = None if times is None else MessageTimes(*(column[order] for column in times))
         self._times = times
 
     def __len__(self) -> int:
@@ -95,7 +219,7 @@ class SiteLog:
 
     def _vectors(self, field: str) -> Array:
         with self._told():
-            return columns.vectors(self.payloads, field)
+            return record_columns.decode_vectors(self.payloads, field)
 
     def prepare(self, *fields: str) -> None:
         """Decodes several vectors in one pass, for who will ask for all of them: three times as fast.
@@ -106,12 +230,12 @@ class SiteLog:
         absent = [field for field in fields if field not in self.__dict__]
         if absent:
             with self._told():
-                self.__dict__.update(columns.many_vectors(self.payloads, absent))
+                self.__dict__.update(record_columns.decode_many_vectors(self.payloads, absent))
 
     def numbers(self, field: str) -> Ints:
         """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
         with self._told():
-            return columns.numbers(self.payloads, field)
+            return record_columns.decode_ints(self.payloads, field)
 
     def record(self, n: int) -> State:
         """Returns one record, decoded and checked alone.
@@ -124,13 +248,13 @@ class SiteLog:
     @cached_property
     def states(self) -> Sequence[State]:
         """The records, decoded and checked as a whole."""
-        return records(self.payloads, self._decoded)
+        return decode_records(self.payloads, self._decoded)
 
     @cached_property
-    def by_tick(self) -> "dict[int, State] | ByTick":
+    def by_tick(self) -> "dict[int, State] | RecordsByTick":
         """The same, by their ticks; of several with one tick the last."""
-        if isinstance(self.states, Records):
-            return ByTick(self.states, self.tick)
+        if isinstance(self.states, LazyRecords):
+            return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
     def _decoded(self, payloads: Sequence[bytes]) -> list[State]:
@@ -162,15 +286,15 @@ class SiteLog:
         """When each record was sent, by its own stamp, shape (K,), Unix ns."""
         return self._when().publish_ns
 
-    def _when(self) -> Times:
+    def _when(self) -> MessageTimes:
         zeros = np.zeros(len(self), dtype=np.int64)
-        return self._times if self._times is not None else Times(zeros, zeros)
+        return self._times if self._times is not None else MessageTimes(zeros, zeros)
 
     @cached_property
-    def mode(self) -> Words:
+    def mode(self) -> Strings:
         """What the site was doing, shape (K,): "run", "hold", "brake", "return" or "diverged"."""
         with self._told():
-            return columns.words(self.payloads, "mode")
+            return record_columns.decode_strings(self.payloads, "mode")
 
     @cached_property
     def q(self) -> Array:
@@ -231,13 +355,13 @@ class SiteLog:
     def used(self) -> dict[str, Ints]:
         """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
         with self._told():
-            return columns.per_peer(self.payloads, "used", self.peers, absent=-1)
+            return record_columns.decode_per_peer(self.payloads, "used", self.peers, absent=-1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
         """How many samples each record took in, shape (K,), and all of them as in `rx`, shape (N, 3)."""
         with self._told():
-            return columns.arrivals(self.payloads)
+            return record_columns.decode_arrivals(self.payloads)
 
     def changes(self) -> dict[int, list[str]]:
         """Returns the changes that the site took in, by tick, as `cmd` names them."""
@@ -246,7 +370,7 @@ class SiteLog:
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
         with self._told():
-            lists = columns.words(self.payloads, "cmd")
+            lists = record_columns.decode_strings(self.payloads, "cmd")
         return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:

@@ -1,1 +1,1 @@
-"""The world outside a site: clocks, messages, the bus, and how members of a session find together."""
+"""Clocks, messages, the bus, and how the members of a session find each other and agree on an epoch."""

@@ -1,8 +1,8 @@
-"""The other end of `plant = "external"`: what the program of an arm outside says to its site, and hears.
+"""Connection of an external arm's program to its site (`plant = "external"`).
 
-Law: the arm says where it is, as often as it likes; the torque that it is to apply stands in the record that
-the site publishes at every tick, so that what drives the arm is what the log holds. Where there is no torque
-that counts, there is None, and the arm is to brake.
+Invariant: the arm sends its position as often as it likes; the torque to apply stands in the record that the
+site publishes at every tick, so the arm receives exactly what the log holds. Without a valid torque,
+`torque` returns None and the arm must brake.
 
     with ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:
         while not port.over:
@@ -19,9 +19,9 @@ from ..errors import WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock, SystemClock
-from .measurement import Measurement
+from .membership import new_boot, read_events
 from .messages import State
-from .voice import new_boot, said
+from .requests import ArmMeasurement
 from .wire import decode, encode
 from .zenoh_bus import ZenohBus
 
@@ -83,7 +83,7 @@ class ArmPort:
             q: joint angles, rad.
             qd: joint velocities, rad/s.
         """
-        message = Measurement(
+        message = ArmMeasurement(
             site=self._site,
             boot=self._boot,
             n=self._n,
@@ -122,7 +122,7 @@ class ArmPort:
                 continue  # a stranger's
             if self.record is None or record.boot == self.record.boot:
                 self.record, self._came_ns = record, message[1]
-        for event in said(self._events):
+        for event in read_events(self._events):
             if event.kind == "end" and self.record is not None and event.boot == self.record.boot:
                 self._gone = True
         while (change := self._presence.poll()) is not None:

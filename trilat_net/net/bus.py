@@ -1,10 +1,11 @@
-"""The bus: what a member needs of a network, behind a small Protocol, and a fake that keeps it.
+"""The bus: the Protocol of a member's network connection, and an in-process implementation for tests.
 
-Law: what arrives runs nothing in a site but a stamp, an append, or a short answer. Messages wait in bounded
-rings until the loop asks; what overflows is lost oldest first, and is counted where messages are stamped;
-elsewhere the receiver sees it by the ticks. Only the recorder takes callbacks of its own.
+Invariant: an arriving message triggers no more in a site than a stamp, an append or a short reply. Messages
+wait in bounded rings until the loop polls them; on overflow the oldest is dropped. Stamped rings count the
+loss; elsewhere the receiver sees it in the tick numbers. Only the recorder takes callbacks.
 
-`zenoh_bus` is the real one; `LocalBus` joins members of one process. Both pass the same contract tests.
+`zenoh_bus` is the real implementation; `LocalBus` joins members of one process. Both pass the same contract
+tests.
 """
 
 from collections import deque
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
 
-RING = 16_384
+RING_CAPACITY = 16_384
 """Messages that a ring holds: sixteen seconds of one peer at 1 kHz."""
 
 
@@ -37,14 +38,14 @@ class StampedInbox(Protocol):
         """Returns the oldest message (payload, instant of its arrival in ns), or None; never waits."""
 
 
-class Presence(Protocol):
+class PresenceInbox(Protocol):
     """A bounded ring of liveliness changes."""
 
     def poll(self) -> tuple[str, bool] | None:
         """Returns the oldest change (key, whether it is alive now), or None; never waits."""
 
 
-class Question(Protocol):
+class Query(Protocol):
     """A question that waits for an answer."""
 
     @property
@@ -55,10 +56,10 @@ class Question(Protocol):
         """Answers it."""
 
 
-class Questions(Protocol):
+class QueryInbox(Protocol):
     """A bounded ring of questions."""
 
-    def poll(self) -> Question | None:
+    def poll(self) -> Query | None:
         """Returns the oldest question, or None; never waits."""
 
 
@@ -74,16 +75,16 @@ class Bus(Protocol):
                 not lose what it publishes, as a replay.
         """
 
-    def inbox(self, key: str, capacity: int = RING) -> Inbox:
+    def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """Returns a ring that fills with what others publish under a key expression."""
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """Returns a ring whose messages are stamped by `now_ns` as they come, in a thread of the bus."""
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Calls back with (key, payload) as messages come, in a thread of the bus."""
 
-    def questions(self, key: str) -> Questions:
+    def questions(self, key: str) -> QueryInbox:
         """Returns a ring of the questions that others ask under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
@@ -101,14 +102,14 @@ class Bus(Protocol):
     def announce(self, key: str) -> None:
         """Declares a liveliness token, which disappears with the member."""
 
-    def presence(self, key: str) -> Presence:
+    def presence(self, key: str) -> PresenceInbox:
         """Returns a ring of the tokens that appear and disappear, those that stand already first."""
 
     def close(self) -> None:
         """Leaves; safe to call again."""
 
 
-def matches(expression: str, key: str) -> bool:
+def matches_key(expression: str, key: str) -> bool:
     """True where a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of one."""
     return _match(expression.split("/"), key.split("/"))
 
@@ -138,7 +139,7 @@ def _match_chunk(pattern: str, chunk: str) -> bool:
 class _Ring(Generic[T]):
     """A bounded ring of anything; what overflows is lost oldest first."""
 
-    def __init__(self, capacity: int = RING) -> None:
+    def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
@@ -183,7 +184,7 @@ class StampingRing:
             return None
 
 
-class _LocalQuestion:
+class _LocalQuery:
     """A question inside one process."""
 
     def __init__(self, key: str, payload: bytes, replies: _Ring[tuple[str, bytes]]) -> None:
@@ -215,7 +216,7 @@ class LocalBus:
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
-        self._answering: list[tuple[str, Callable[[_LocalQuestion], None]]] = []
+        self._answering: list[tuple[str, Callable[[_LocalQuery], None]]] = []
         self._watching: list[tuple[str, _Ring[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
@@ -225,18 +226,18 @@ class LocalBus:
         def publish(payload: bytes) -> None:
             for member in self._network.members:
                 for expression, sink in member._sinks:
-                    if member is not self and matches(expression, key):
+                    if member is not self and matches_key(expression, key):
                         sink(key, payload)
 
         return publish
 
-    def inbox(self, key: str, capacity: int = RING) -> Inbox:
+    def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """See `Bus`."""
         ring = _Ring[tuple[str, bytes]](capacity)
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """See `Bus`."""
         ring = StampingRing(now_ns, capacity)
         self._sinks.append((key, lambda _, payload: ring.take(payload)))
@@ -246,16 +247,16 @@ class LocalBus:
         """See `Bus`."""
         self._sinks.append((key, callback))
 
-    def questions(self, key: str) -> Questions:
+    def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
-        ring = _Ring[Question]()
+        ring = _Ring[Query]()
         self._answering.append((key, ring.put))
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
 
-        def at_once(question: _LocalQuestion) -> None:
+        def at_once(question: _LocalQuery) -> None:
             answered = answer(question.payload)
             if answered is not None:
                 question.answer(answered)
@@ -267,8 +268,8 @@ class LocalBus:
         replies = _Ring[tuple[str, bytes]]()
         for member in self._network.members:
             for answered, take in member._answering:
-                if member is not self and matches(key, answered):
-                    take(_LocalQuestion(answered, payload, replies))
+                if member is not self and matches_key(key, answered):
+                    take(_LocalQuery(answered, payload, replies))
         return replies
 
     def announce(self, key: str) -> None:
@@ -276,12 +277,12 @@ class LocalBus:
         self._tokens.append(key)
         self._tell(key, True)
 
-    def presence(self, key: str) -> Presence:
+    def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
         ring = _Ring[tuple[str, bool]]()
         for member in self._network.members:
             for token in member._tokens:
-                if member is not self and matches(key, token):
+                if member is not self and matches_key(key, token):
                     ring.put((token, True))
         self._watching.append((key, ring))
         return ring
@@ -296,5 +297,5 @@ class LocalBus:
     def _tell(self, token: str, alive: bool) -> None:
         for member in self._network.members:
             for expression, ring in member._watching:
-                if member is not self and matches(expression, token):
+                if member is not self and matches_key(expression, token):
                     ring.put((token, alive))

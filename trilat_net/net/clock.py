@@ -1,6 +1,7 @@
-"""Clocks: the only reader of time.
+"""Clocks: the only module that reads the time.
 
-Law (L1): whoever needs the time gets a clock as an argument; integer nanoseconds, never a float.
+Invariant (L1): code that needs the time takes a clock as an argument; times are integer nanoseconds,
+never floats.
 """
 
 import platform
@@ -92,7 +93,7 @@ class SkewedClock:
         )
 
 
-def system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
+def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
     """Returns the machine's clock, or one that runs beside it where an offset (s) or a drift is injected."""
     if not offset_s and not drift_ppm:
         return SystemClock()

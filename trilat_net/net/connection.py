@@ -1,21 +1,70 @@
-"""How a member takes part in the network: where it listens, what it connects to, and as what.
+"""A member's connection to the network: endpoints, mode, the opened bus; and the router process.
 
-Law: a place that is named replaces the places on this machine, whoever names it. What the command line and
-a file both say is united or refused, never chosen between.
+Invariant: default endpoints are explicit loopback addresses, a function of session and site, so that
+separate terminals meet and two sessions on one host do not. A named endpoint replaces the defaults; values
+given both on the command line and in a file are united or refused, never chosen between. A router carries
+Zenoh traffic and prints who joins and leaves; it adds no routing of its own.
 """
 
+import math
 import re
+import socket
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..errors import SessionError, UsageError
+from . import topics
+from .bus import Bus
 from .clock import Clock
 from .zenoh_bus import RouterSilent, ZenohBus
-from .zenoh_config import Endpoint, Mode
-from .zenoh_file import ZenohFile
+from .zenoh_config import Endpoint, ZenohFile, ZenohMode
 
-AGAIN_NS = 200_000_000
+_FIRST_PORT, _BLOCKS, _BLOCK = 10_240, 340, 64
+
+
+def default_endpoint(session: str, index: int) -> str:
+    """Returns where the site of that index in the scenario listens by default."""
+    port = _FIRST_PORT + zlib.crc32(session.encode()) % _BLOCKS * _BLOCK + index % _BLOCK
+    return f"tcp/127.0.0.1:{port}"
+
+
+def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
+    """Returns where every site of a session listens by default."""
+    return {site: default_endpoint(session, index) for index, site in enumerate(sites)}
+
+
+def choose_session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
+    """Returns where the sites of a session may listen: by default, or elsewhere where a port is taken."""
+    default = [default_endpoint(session, index) for index in range(len(sites))]
+    return default if all(map(_is_free, default)) else find_free_endpoints(len(sites))
+
+
+def _is_free(endpoint: str) -> bool:
+    """True where nobody has the port of a loopback endpoint at this moment."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
+        except OSError:
+            return False
+    return True
+
+
+def find_free_endpoints(count: int) -> list[str]:
+    """Returns loopback endpoints whose ports nobody has at this moment."""
+    sockets = [socket.socket() for _ in range(count)]
+    try:
+        for probe in sockets:
+            probe.bind(("127.0.0.1", 0))
+        return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
+    finally:
+        for probe in sockets:
+            probe.close()
+
+
+RETRY_NS = 200_000_000
 """How long to wait between two tries to reach a router."""
 
 
@@ -32,7 +81,7 @@ class Connection:
 
     listen: Sequence[Endpoint] = ()
     connect: Sequence[Endpoint] | None = ()
-    mode: Mode = "peer"
+    mode: ZenohMode = "peer"
     own: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -41,7 +90,7 @@ class Connection:
         return self.listen or self.connect or ()
 
 
-def member_connection(
+def resolve_member_connection(
     listen: Sequence[str] | None,
     connect: Sequence[str] | None,
     routers: Sequence[str] | None,
@@ -71,7 +120,7 @@ def member_connection(
     if not routers and file.mode != "client":
         return Connection(
             _listen(listen, file, "peer", listen_else),
-            _united(connect, file, "peer", connect_else),
+            _merge_endpoints(connect, file, "peer", connect_else),
             "peer",
             file.settings,
         )
@@ -87,13 +136,13 @@ def member_connection(
     for endpoint in routers or ():
         if not re.fullmatch(r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint):
             raise UsageError(f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}")
-    chosen = _united(routers or connect, file, "client", ())
+    chosen = _merge_endpoints(routers or connect, file, "client", ())
     if not chosen:
         raise UsageError(f"{where}: there is no router to connect to; name it with --router")
     return Connection((), chosen, "client", file.settings)
 
 
-def router_connection(
+def resolve_router_connection(
     listen: Sequence[str] | None,
     connect: Sequence[str] | None,
     file: ZenohFile | None,
@@ -109,14 +158,14 @@ def router_connection(
         raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
     return Connection(
         _listen(listen, file, "router", listen_else),
-        _united(connect, file, "router", ()),
+        _merge_endpoints(connect, file, "router", ()),
         "router",
         file.settings,
     )
 
 
 def _listen(
-    named: Sequence[str] | None, file: ZenohFile, mode: Mode, otherwise: Sequence[str]
+    named: Sequence[str] | None, file: ZenohFile, mode: ZenohMode, otherwise: Sequence[str]
 ) -> Sequence[Endpoint]:
     stated = file.endpoints("listen", mode)
     if named is not None and stated is not None:
@@ -126,8 +175,8 @@ def _listen(
     return otherwise if stated is None else stated
 
 
-def _united(
-    named: Sequence[str] | None, file: ZenohFile, mode: Mode, otherwise: Sequence[str] | None
+def _merge_endpoints(
+    named: Sequence[str] | None, file: ZenohFile, mode: ZenohMode, otherwise: Sequence[str] | None
 ) -> Sequence[Endpoint] | None:
     stated = file.endpoints("connect", mode)
     if named is None and stated is None:
@@ -166,5 +215,44 @@ def open_bus(
             if not told:
                 say(f"{silent} yet; trying again")
             told = True
-        clock.sleep_until(clock.monotonic_ns() + AGAIN_NS)
+        clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
     return None
+
+
+ROUTER_POLL_NS = 50_000_000
+
+
+def run_router(
+    bus: Bus,
+    clock: Clock,
+    stopped: Callable[[], bool],
+    say: Callable[[str], None],
+    until_idle_s: float | None = None,
+) -> None:
+    """Stands until it is stopped, or until all members have left.
+
+    Args:
+        bus: a router's connection.
+        clock: the time.
+        stopped: whether to end now.
+        say: tells a person what happens.
+        until_idle_s: end so many seconds after the last member has left, or None.
+    """
+    presence = bus.presence(topics.key("*", "*", topics.ALIVE) + "/*")
+    there: set[str] = set()
+    idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
+    empty_since_ns: int | None = None  # nobody has come yet: no end
+    while not stopped():
+        while (change := presence.poll()) is not None:
+            key, alive = change
+            where = topics.parse_key(key)
+            if where is None or alive == (key in there):
+                continue
+            (there.add if alive else there.remove)(key)
+            say(f"session {where.session}: {where.member} {'is here' if alive else 'has left'}")
+            empty_since_ns = None if there else clock.monotonic_ns()
+        now_ns = clock.monotonic_ns()
+        if empty_since_ns is not None and now_ns - empty_since_ns >= idle_ns:
+            say(f"nobody has been here for {until_idle_s:g} s")
+            return
+        clock.sleep_until(now_ns + ROUTER_POLL_NS)

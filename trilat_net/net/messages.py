@@ -1,7 +1,7 @@
-"""The messages of a session: the types are the schema.
+"""The logged and published messages of a session; the types are the schema.
 
-Law: one definition validates, makes the JSON Schema that a log stores, and is the documentation. Units
-stand in the names or in the schema (`x-unit`); SI and radians throughout.
+Invariant: one definition validates a message, yields the JSON Schema that a log stores, and documents the
+format. Units stand in the field names or in the schema (`x-unit`); SI and radians throughout.
 """
 
 from typing import Annotated, Any
@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.arm import JOINTS, PARAMETERS
-from ..core.own import MAX_MEMORY
+from ..core.two_link_arm import JOINTS, PARAMETERS
+from ..core.user_law import MAX_LAW_MEMORY
 
 VERSION = 3
 """What is sent, and all that is accepted from others."""
@@ -82,14 +82,14 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rx: list[Stamp]
     rx_crc: U64
     cmd: list[str]
-    mem: Annotated[list[float], Meta(max_length=JOINTS + 1 + MAX_MEMORY)]
+    mem: Annotated[list[float], Meta(max_length=JOINTS + 1 + MAX_LAW_MEMORY)]
     late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
     sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
     echo: list[Stamp] = []
 
 
-class Sample(msgspec.Struct, frozen=True, kw_only=True):
+class PeerSample(msgspec.Struct, frozen=True, kw_only=True):
     """What a peer needs of a `State`: the fields that it reads, by the same names."""
 
     v: int

@@ -1,17 +1,22 @@
-"""Where another clock stands: its offset and drift, from stamps that crossed a network.
+"""Offset and drift of another clock.
 
-Law: every bound is proved by stamps, whatever the delays were and however unequal the two ways. A message is
-never received before it was sent, so that with offset = other clock - own clock
+Estimated from stamps that crossed a network, and the slewed offset in use.
+
+Invariant: stamps prove every bound, for any delays, however unequal the two directions. A message is
+never received before it was sent, so with offset = other clock - own clock
 
     offset <= (their reading on receiving) - (own reading on sending): a ceiling, when the own clock sent;
     offset >= (their reading on sending) - (own reading on receiving): a floor, when the own clock received.
 
-A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their middle is its
-offset, their distance its round trip, half of that its bound. Of each window the lowest ceiling and the
-highest floor are kept; they need not be of one exchange, so the bound is half the smallest way there plus
-half the smallest way back. Over the windows the offset is a line; lines through all ceilings and floors are
-the ones that may be, and what they span now is the bound. Assumed of the clocks: they drift apart by less
-than DRIFT_LIMIT, and over the windows kept along a line up to WANDER.
+A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their mean is the
+offset, their distance the round trip, half of that the bound. Each window keeps its lowest ceiling and
+its highest floor; these may come from different exchanges, so the bound is half the shortest way out plus
+half the shortest way back. Over the windows the offset is a line; the lines through all ceilings and
+floors are admissible, and their spread now is the bound. Assumed: clocks drift apart by less than
+DRIFT_LIMIT, and over the kept windows along a line to within WANDER.
+
+The offset in use never steps: it is continuous and piecewise linear, reaches each new estimate within
+SLEW_NS and then follows the estimate's drift. Its bound covers the estimate's interval also on the way.
 """
 
 import math
@@ -21,9 +26,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.grid import NS_PER_S
+from ..core.ticks import NS_PER_S
 
-WINDOWS = 60
+WINDOWS_KEPT = 60
 """Windows that are kept."""
 DRIFT_LIMIT = 500_000.0
 """Largest drift of one clock against another, ns/s."""
@@ -36,7 +41,7 @@ _ROUNDS = 3
 Array = NDArray[np.float64]
 
 
-class Limit(NamedTuple):
+class OffsetLimit(NamedTuple):
     """What an offset is at most (a ceiling) or at least (a floor).
 
     Attributes:
@@ -48,7 +53,7 @@ class Limit(NamedTuple):
     offset_ns: int
 
 
-class Estimate(NamedTuple):
+class OffsetEstimate(NamedTuple):
     """What is known of an offset at an instant.
 
     Attributes:
@@ -73,7 +78,7 @@ class Estimate(NamedTuple):
         """Returns the offset at another instant, ns."""
         return self.offset_ns + round((at_ns - self.at_ns) * self.drift / NS_PER_S)
 
-    def including(self, *limits: Limit | None) -> "Estimate":
+    def including(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
         """Returns the same with limits that contradict it inside what is possible."""
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         return self._replace(low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets]))
@@ -89,12 +94,12 @@ class Estimate(NamedTuple):
         return max(0, math.ceil(max(above, below)))
 
 
-def known(offset_ns: int) -> Estimate:
+def exact_offset(offset_ns: int) -> OffsetEstimate:
     """Returns the estimate where both clocks are one: exact, and for ever."""
-    return Estimate(0, offset_ns, 0.0, offset_ns, offset_ns, 0.0, 0.0)
+    return OffsetEstimate(0, offset_ns, 0.0, offset_ns, offset_ns, 0.0, 0.0)
 
 
-def offset_text(offset_ns: int, bound_ns: int) -> str:
+def format_offset(offset_ns: int, bound_ns: int) -> str:
     """Returns an offset and its bound for people."""
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
@@ -109,17 +114,17 @@ class OffsetEstimator:
 
     def __init__(self) -> None:
         self.broken = 0
-        self._ceilings: deque[Limit] = deque(maxlen=WINDOWS)
-        self._floors: deque[Limit] = deque(maxlen=WINDOWS)
+        self._ceilings: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
+        self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
-    def add(self, ceiling: Limit | None, floor: Limit | None) -> None:
+    def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
         """Takes what one window says; None where nothing came on that way."""
         if ceiling is not None:
             self._ceilings.append(ceiling)
         if floor is not None:
             self._floors.append(floor)
 
-    def estimate(self, now_ns: int) -> Estimate | None:
+    def estimate(self, now_ns: int) -> OffsetEstimate | None:
         """Returns what is known now, or None where one of the ways has said nothing yet.
 
         Args:
@@ -144,7 +149,7 @@ class OffsetEstimator:
 class _Lines:
     """All lines under every ceiling and over every floor; times are s from now, values ns from a base."""
 
-    def __init__(self, ceilings: deque[Limit], floors: deque[Limit], now_ns: int) -> None:
+    def __init__(self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int) -> None:
         self._now_ns, self._base_ns = now_ns, ceilings[-1].offset_ns
         self._above_s, self._above = self._columns(ceilings)
         self._below_s, self._below = self._columns(floors)
@@ -158,12 +163,12 @@ class _Lines:
         touching = np.min(room, where=apart_s == 0.0, initial=0.0)
         self.possible = bool(touching >= 0.0 and self.flattest <= self.steepest)
 
-    def _columns(self, limits: deque[Limit]) -> tuple[Array, Array]:
+    def _columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
         times = np.array([min(0, limit.at_ns - self._now_ns) for limit in limits], dtype=np.float64)
         values = np.array([limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64)
         return times / NS_PER_S, values
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> OffsetEstimate:
         """Returns the line in the middle, and what all lines span now."""
         slope = min(max(self._slope(), self.flattest), self.steepest)
         middle = 0.5 * (
@@ -172,7 +177,7 @@ class _Lines:
         # now lies behind every limit: the highest value is the steepest line's, the lowest the flattest's
         high = np.min(self._widest - self.steepest * self._above_s)
         low = np.max(self._lowest - self.flattest * self._below_s)
-        return Estimate(
+        return OffsetEstimate(
             self._now_ns,
             self._base_ns + round(middle),
             slope,
@@ -204,3 +209,66 @@ class _Lines:
                 denominator += float((weights * from_mean**2).sum())
             slope = numerator / denominator
         return slope
+
+
+SLEW_NS = 1_000_000_000
+"""How long it takes to reach a new estimate."""
+
+
+class _SlewSegment:
+    """The way towards one estimate and on along it, from an instant and a value on."""
+
+    def __init__(self, from_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
+        self.from_ns, self.estimate = from_ns, estimate
+        self._joined_ns = from_ns + SLEW_NS
+        self._joined_offset_ns = estimate.offset_at(self._joined_ns)
+        self._approach = (self._joined_offset_ns - offset_ns) / SLEW_NS
+        self._drift = estimate.drift / NS_PER_S
+        self.bound_ns = max(
+            estimate.bound_at(from_ns, offset_ns),
+            estimate.bound_at(self._joined_ns, self._joined_offset_ns),
+        )
+
+    def at(self, at_ns: int) -> int:
+        passed_ns = at_ns - self._joined_ns
+        return self._joined_offset_ns + int(passed_ns * (self._approach if passed_ns < 0 else self._drift))
+
+    def bound_at(self, at_ns: int) -> int:
+        if self.from_ns <= at_ns <= self._joined_ns:
+            return self.bound_ns
+        return self.estimate.bound_at(at_ns, self.at(at_ns))
+
+
+class SlewedOffset:
+    """An offset over time, the other clock minus the own one.
+
+    Args:
+        estimate: what it begins with.
+    """
+
+    def __init__(self, estimate: OffsetEstimate) -> None:
+        self._leg = self._before = _SlewSegment(estimate.at_ns, estimate.offset_ns, estimate)
+
+    @property
+    def estimate(self) -> OffsetEstimate:
+        """What it goes by."""
+        return self._leg.estimate
+
+    @property
+    def bound_ns(self) -> int:
+        """How far it is from the true offset at most, from its last bend on for BEND_NS; then it grows."""
+        return self._leg.bound_ns
+
+    def bend(self, at_ns: int, estimate: OffsetEstimate) -> None:
+        """Goes by a new estimate from an instant of the own clock on."""
+        self._leg, self._before = _SlewSegment(at_ns, self.at(at_ns), estimate), self._leg
+
+    def at(self, at_ns: int) -> int:
+        """Returns the offset in force at an instant, not before the last bend but one, ns."""
+        leg = self._leg
+        return leg.at(at_ns) if at_ns >= leg.from_ns else self._before.at(at_ns)
+
+    def bound_at(self, at_ns: int) -> int:
+        """Returns how far the offset in force can be from the true one at such an instant, ns."""
+        leg = self._leg
+        return leg.bound_at(at_ns) if at_ns >= leg.from_ns else self._before.bound_at(at_ns)

@@ -1,30 +1,69 @@
-"""Round trips to the members of a session, and what they say of the members' clocks.
+"""Repeated queries over a slow network, and pings: round trips to members and the offsets of their clocks.
 
-Law: who is asked answers at once, in a thread of its bus, with what its clock read; who asks learns where
-that clock stands, to half the round trip, however much the two clocks differ.
+Invariant: a reply counts however many queries later it arrives, as long as its query is one of the last
+QUERIES_KEPT. A member answers a ping at once, in a thread of its bus, with its clock's reading; the asker
+then knows that clock to half the round trip, however far the clocks differ.
 """
 
 from collections import deque
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
-from ..core.grid import NS_PER_S
+from ..core.ticks import NS_PER_S
 from ..errors import WireError
 from . import topics
-from .answers import Pong
-from .asking import Asking
-from .bus import Bus
+from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Info
-from .offset import Estimate, Limit, OffsetEstimator, known, offset_text
+from .offset import OffsetEstimate, OffsetEstimator, OffsetLimit, exact_offset, format_offset
+from .requests import Pong
 from .wire import decode, encode
+
+QUERIES_KEPT = 128
+
+
+class QueryReply(NamedTuple):
+    """An answer: when it was asked for, ns of the asker's clock; its key; its payload."""
+
+    asked_ns: int
+    key: str
+    payload: bytes
+
+
+class RepeatedQuery:
+    """All that is asked under one key expression.
+
+    Args:
+        bus: the asker's connection.
+        clock: its time.
+        key: the key expression.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, key: str) -> None:
+        self._bus, self._clock, self._key = bus, clock, key
+        self._open: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
+
+    def ask(self) -> int:
+        """Asks once more, and returns when, ns."""
+        asked_ns = self._clock.monotonic_ns()
+        self._open.append((asked_ns, self._bus.ask(self._key)))
+        return asked_ns
+
+    def poll(self) -> QueryReply | None:
+        """Returns an answer that has come, or None; never waits."""
+        for asked_ns, inbox in self._open:
+            if (reply := inbox.poll()) is not None:
+                return QueryReply(asked_ns, *reply)
+        return None
+
 
 PINGS = 20
 """Answers from a member until its clock counts as known."""
-WINDOW = 5
+PINGS_PER_WINDOW = 5
 """Of so many the tightest are kept."""
-PACE_NS = 10_000_000
+PING_PACE_NS = 10_000_000
 """Between two pings until then."""
-REST_NS = 250_000_000
+PING_REST_NS = 250_000_000
 """Between two pings afterwards, so that what is known does not grow old."""
 GLANCE_NS = 100_000
 """How often to poll while an answer is under way: it is stamped when it is found."""
@@ -49,7 +88,7 @@ def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
     bus.respond(topics.key(session, info.member, topics.PING), answer)
 
 
-class Trips:
+class RoundTrips:
     """The round trips to one start of a member.
 
     Args:
@@ -71,8 +110,8 @@ class Trips:
         self.rtts_ns: deque[int] = deque(maxlen=_KEPT)
         self.shortest_ns = 0
         self.estimator = OffsetEstimator()
-        self.latest: Estimate | None = None
-        self._window: list[tuple[Limit, Limit]] = []
+        self.latest: OffsetEstimate | None = None
+        self._window: list[tuple[OffsetLimit, OffsetLimit]] = []
         self._agreeing = 0
 
     @property
@@ -87,22 +126,24 @@ class Trips:
             return
         self.shortest_ns = min(self.shortest_ns, rtt_ns) if self.rtts_ns else rtt_ns
         self.rtts_ns.append(rtt_ns)
-        self._window.append((Limit(asked_ns, pong.came_ns - asked_ns), Limit(now_ns, pong.left_ns - now_ns)))
-        if len(self._window) == WINDOW:
+        self._window.append(
+            (OffsetLimit(asked_ns, pong.came_ns - asked_ns), OffsetLimit(now_ns, pong.left_ns - now_ns))
+        )
+        if len(self._window) == PINGS_PER_WINDOW:
             self._close(now_ns)
 
     def _close(self, now_ns: int) -> None:
         """Keeps the tightest of some, and draws the line."""
         drift = self.latest.drift / NS_PER_S if self.latest else 0.0
 
-        def level(limit: Limit) -> float:
+        def level(limit: OffsetLimit) -> float:
             return limit.offset_ns - drift * (limit.at_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
         self._window = []
         self.estimator.add(min(ceilings, key=level), max(floors, key=level))
         estimate = self.estimator.estimate(now_ns)
-        self._agreeing = self._agreeing + WINDOW if estimate else 0
+        self._agreeing = self._agreeing + PINGS_PER_WINDOW if estimate else 0
         self.latest = estimate or self.latest
 
 
@@ -120,10 +161,10 @@ class Pinger:
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, enough: int = PINGS) -> None:
-        self.trips: dict[int, Trips] = {}
+        self.trips: dict[int, RoundTrips] = {}
         self._clock, self._enough = clock, enough
-        self._asking = Asking(bus, clock, topics.key(session, "*", topics.PING))
-        self._asked_ns = -REST_NS
+        self._asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
+        self._asked_ns = -PING_REST_NS
         self._glance_until_ns = 0
 
     def poll(self, wanted: Collection[int]) -> None:
@@ -133,19 +174,19 @@ class Pinger:
             wanted: boots of the members to learn the clocks of; nobody is asked where there are none.
         """
         if wanted:
-            pace_ns = REST_NS if self.know(wanted) else PACE_NS
+            pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
             if self._clock.monotonic_ns() - self._asked_ns >= pace_ns:
                 self._asked_ns = self._asking.ask()
                 self._glance_until_ns = self._asked_ns + 2 * self.slowest_ns() + _STRAGGLE_NS
         while (answer := self._asking.poll()) is not None:
             now_ns = self._clock.monotonic_ns()
-            where = topics.address(answer.key)
+            where = topics.parse_key(answer.key)
             try:
                 pong = decode(answer.payload, Pong)
             except WireError:
                 continue  # a stranger's
             if where is not None and where.member == pong.member and pong.boot in wanted:
-                self.trips.setdefault(pong.boot, Trips(pong, self._enough)).take(
+                self.trips.setdefault(pong.boot, RoundTrips(pong, self._enough)).take(
                     answer.asked_ns, pong, now_ns
                 )
 
@@ -153,10 +194,10 @@ class Pinger:
         """True where enough answers have come from all of these."""
         return all(boot in self.trips and self.trips[boot].known for boot in boots)
 
-    def estimate(self, boot: int) -> Estimate:
+    def estimate(self, boot: int) -> OffsetEstimate:
         """Returns where a member's clock stands, as last known: exactly here where nobody had to ask."""
         trips = self.trips.get(boot)
-        return known(0) if trips is None or trips.latest is None else trips.latest
+        return exact_offset(0) if trips is None or trips.latest is None else trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
         """Returns all that is known of a member's clock, or None where it is the own one."""
@@ -173,13 +214,13 @@ class Pinger:
         return min(GLANCE_NS, otherwise_ns) if under_way else otherwise_ns
 
 
-def clock_texts(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> list[str]:
+def describe_clocks(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> list[str]:
     """Returns a sentence for every member whose clock is another one, as of an instant of the own clock."""
     texts = []
     for name, boot in boots.items():
         if boot in pinger.trips:
             estimate = pinger.estimate(boot)
             offset_ns = estimate.offset_at(at_ns)
-            known_text = offset_text(offset_ns, estimate.bound_at(at_ns, offset_ns))
+            known_text = format_offset(offset_ns, estimate.bound_at(at_ns, offset_ns))
             texts.append(f"clock of {name}: another one, {known_text}")
     return texts

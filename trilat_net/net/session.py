@@ -1,15 +1,13 @@
-"""How the members of a session find together and agree on one epoch.
+"""The start of a session: members meet and agree on one epoch.
 
-Law: one epoch whatever the start order. The first site of the scenario leads: with every member's answer
-in and equal where it must be, it announces an epoch and the boots that it is for; when all have answered
-`ready` in time it says `start`, and otherwise announces another one. Nobody starts without `start`; a
-recorder that comes later learns from those who run when that was.
+Invariant: one epoch for any start order. The first site of the scenario leads: once every member has replied
+consistently, it announces an epoch with the boots it is for; once all have replied `ready` in time it sends
+`start`, and otherwise announces another epoch. No member starts without `start`; a late recorder learns the
+epoch from the running members.
 
-The epoch is an instant of the leader's monotonic clock. A member on another clock puts it onto its own by
-pings, to half a round trip, and is ready only when it knows all clocks that it will need; wall clocks
-decide nothing.
-
-Everything here is polled, on a `Bus` and a `Clock` that it is given; nothing waits.
+The epoch is an instant of the leader's monotonic clock. A member on another clock converts it by pings, to
+half a round trip, and is ready only when it knows all clocks it needs; wall clocks decide nothing.
+Everything is polled, on a given `Bus` and `Clock`; nothing waits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +17,11 @@ from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .latecomer import Latecomer
-from .meeting import Meeting
+from .membership import EventPublisher, LateJoin, Membership, liveliness_token, read_events
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
-from .voice import Voice, said, token
 
-AHEAD_NS = 500_000_000
+EPOCH_AHEAD_NS = 500_000_000
 """How far ahead an epoch is announced, and two round trips more."""
 DECIDE_NS = 150_000_000
 """How long before the epoch every answer must be in, and a round trip more."""
@@ -47,7 +43,7 @@ class Epoch(NamedTuple):
     epochs: Mapping[str, int] = {}
 
 
-class Joining:
+class SessionJoin:
     """One member's way into a session; call `poll` until it returns the epoch.
 
     Args:
@@ -62,20 +58,22 @@ class Joining:
         pinger: where their clocks stand.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, voice: Voice, sites: Sequence[str]) -> None:
+    def __init__(
+        self, bus: Bus, clock: Clock, session: str, voice: EventPublisher, sites: Sequence[str]
+    ) -> None:
         self._clock, self._session, self._voice = clock, session, voice
         self._sites = tuple(sites)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        self.meeting = Meeting(bus, clock, session, voice, sites)
+        self.meeting = Membership(bus, clock, session, voice, sites)
         self.pinger = Pinger(bus, clock, session)
-        self._latecomer = Latecomer(self.meeting, self.pinger)
+        self._latecomer = LateJoin(self.meeting, self.pinger)
         answer_pings(bus, clock, session, voice.info)
         self._offered: Event | None = None
         self._epoch_ns = 0
         self._announced: Event | None = None
         self._attempt = 0
         self._ready: dict[str, int] = {}
-        bus.announce(token(session, voice.info.member, voice.info.boot))
+        bus.announce(liveliness_token(session, voice.info.member, voice.info.boot))
 
     @property
     def _own(self) -> Info:
@@ -118,7 +116,7 @@ class Joining:
 
     def _listen(self) -> Epoch | None:
         """Takes events; returns the epoch of the announcement that has been started."""
-        for event in said(self._events):
+        for event in read_events(self._events):
             if event.boots.get(event.member) != event.boot:
                 continue  # from nobody whom the announcement is for
             if event.kind == "epoch":
@@ -218,7 +216,7 @@ class Joining:
         boots = self.meeting.boots()
         self._ready = {}
         self._attempt += 1
-        ahead_ns = AHEAD_NS + 2 * self.pinger.slowest_ns()
+        ahead_ns = EPOCH_AHEAD_NS + 2 * self.pinger.slowest_ns()
         self._epoch_ns = now_ns + ahead_ns
         self._announced = self._voice.say(
             "epoch",

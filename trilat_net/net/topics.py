@@ -1,4 +1,4 @@
-"""Keys: where a session's messages are."""
+"""Bus keys: `trilat/<session>/<member>/<channel>`, and a boot number after `alive`."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ PAST, STATS = "past", "stats"
 MEASURED = "measured"
 
 
-class Address(NamedTuple):
+class KeyParts(NamedTuple):
     """What a key says: `trilat/<session>/<member>/<channel>`, and a boot behind `alive`."""
 
     session: str
@@ -23,8 +23,8 @@ def key(session: str, member: str, channel: str) -> str:
     return f"{ROOT}/{session}/{member}/{channel}"
 
 
-def address(key: str) -> Address | None:
+def parse_key(key: str) -> KeyParts | None:
     """Returns what a key says, or None where it is none of ours."""
     root, _, rest = key.partition("/")
     parts = rest.split("/")
-    return Address(*parts) if root == ROOT and len(parts) in (3, 4) else None
+    return KeyParts(*parts) if root == ROOT and len(parts) in (3, 4) else None

@@ -1,10 +1,10 @@
-"""Messages to bytes and back.
+"""Encoding and decoding of messages.
 
-Law: decoding never trusts. What arrives is a message of this version with finite numbers in range, or a
-`WireError` whose reason is counted; encoding refuses what decoding would.
+Invariant: decoding never trusts its input. A payload yields a message of this schema version with finite
+numbers in range, or a `WireError` whose reason is counted; encoding refuses what decoding would.
 
 Payloads are MessagePack maps with string keys and plain lists, encoded by `msgpack` and decoded by
-`msgspec` straight into the types of `messages`.
+`msgspec` straight into the types of `messages` and `requests`.
 """
 
 import math
@@ -15,10 +15,8 @@ from typing import Any, TypeVar
 import msgpack
 import msgspec
 
-from ..core.tick import Arrival, Output
+from ..core.ticks import Arrival, TickRecord
 from ..errors import WireError
-from .answers import Order, Past, Pong, Reply, Wanted
-from .measurement import MEASUREMENT_VECTORS, Measurement
 from .messages import (
     SAMPLE_VECTORS,
     STATE_VECTORS,
@@ -26,9 +24,18 @@ from .messages import (
     Event,
     Info,
     LinkStats,
+    PeerSample,
     RecorderStats,
-    Sample,
     State,
+)
+from .requests import (
+    MEASUREMENT_VECTORS,
+    ArmMeasurement,
+    Backfill,
+    BackfillRequest,
+    ChangeReply,
+    ChangeRequest,
+    Pong,
 )
 
 MAX_BYTES = 65_536
@@ -41,11 +48,11 @@ _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind)
     for kind in (
-        *(State, Sample, LinkStats, Event, Info, RecorderStats),
-        *(Pong, Order, Reply, Wanted, Past, Measurement),
+        *(State, PeerSample, LinkStats, Event, Info, RecorderStats),
+        *(Pong, ChangeRequest, ChangeReply, BackfillRequest, Backfill, ArmMeasurement),
     )
 }
-_LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Past: MAX_PAST_BYTES}
+_LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 
 _SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
@@ -61,7 +68,7 @@ def encode_state(
     site: str,
     boot: int,
     peers: Sequence[str],
-    output: Output,
+    output: TickRecord,
     arrivals: Sequence[Arrival],
     late_us: int,
     busy_us: int,
@@ -119,7 +126,16 @@ def encode_state(
 
 
 def encode(
-    message: LinkStats | Event | Info | RecorderStats | Pong | Order | Reply | Wanted | Past | Measurement,
+    message: LinkStats
+    | Event
+    | Info
+    | RecorderStats
+    | Pong
+    | ChangeRequest
+    | ChangeReply
+    | BackfillRequest
+    | Backfill
+    | ArmMeasurement,
 ) -> bytes:
     """Returns the payload of any message but a `State`."""
     packed: bytes = _pack(msgspec.structs.asdict(message))
@@ -127,7 +143,19 @@ def encode(
 
 
 M = TypeVar(
-    "M", State, Sample, LinkStats, Event, Info, RecorderStats, Pong, Order, Reply, Wanted, Past, Measurement
+    "M",
+    State,
+    PeerSample,
+    LinkStats,
+    Event,
+    Info,
+    RecorderStats,
+    Pong,
+    ChangeRequest,
+    ChangeReply,
+    BackfillRequest,
+    Backfill,
+    ArmMeasurement,
 )
 
 
@@ -151,14 +179,14 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
         raise WireError("malformed", str(error)) from None
     if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    if isinstance(message, Sample | State | Measurement):
+    if isinstance(message, PeerSample | State | ArmMeasurement):
         _check_numbers(message)
     return message
 
 
-def _check_numbers(message: Sample | State | Measurement) -> None:
+def _check_numbers(message: PeerSample | State | ArmMeasurement) -> None:
     """Refuses vectors of the wrong length and numbers that are not finite."""
-    if isinstance(message, Measurement):
+    if isinstance(message, ArmMeasurement):
         fields, vectors_of, lengths = _MEASUREMENT_CHECK
         number = message.n
     else:

@@ -1,7 +1,7 @@
 """The bus over Eclipse Zenoh; the only importer of `zenoh`.
 
-Law: nothing here waits for the network. What is published is dropped rather than kept waiting (but by a
-patient publisher), what is asked is answered into a ring, and a session that cannot open yet says so.
+Invariant: nothing here waits for the network. A publisher drops a message rather than delay its caller
+(except a patient one), queries go into a ring, and a session that cannot open yet raises an error.
 """
 
 import json
@@ -15,9 +15,8 @@ import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
 from ..errors import SessionError, UsageError
-from .bus import RING, Inbox, Presence, Questions, StampedInbox, StampingRing
-from .zenoh_config import Endpoint, Mode, configuration
-from .zenoh_file import ZenohFile, understood
+from .bus import RING_CAPACITY, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
+from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 ASK_TIMEOUT_S = 3.0
 MAX_DEPTH = 100
@@ -28,7 +27,7 @@ class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
     """A router that does not answer, or not yet."""
 
 
-class _Ring:
+class _ZenohRing:
     def __init__(self, subscriber: Any) -> None:
         self._try_recv = subscriber.try_recv
         self._subscriber = subscriber
@@ -38,7 +37,7 @@ class _Ring:
         return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
 
 
-class _Replies:
+class _ZenohReplies:
     def __init__(self, replies: Any) -> None:
         self._replies = replies
 
@@ -52,7 +51,7 @@ class _Replies:
         return str(reply.ok.key_expr), reply.ok.payload.to_bytes()
 
 
-class _PresenceRing:
+class _ZenohPresenceRing:
     def __init__(self, subscriber: Any, own: set[str]) -> None:
         self._subscriber = subscriber
         self._own = own
@@ -65,31 +64,31 @@ class _PresenceRing:
         return None
 
 
-class _Question:
+class _ZenohQuery:
     def __init__(self, query: zenoh.Query, key: str) -> None:
         self._query = query
         self._key = key
 
     @property
     def payload(self) -> bytes:
-        return _sent(self._query)
+        return _query_payload(self._query)
 
     def answer(self, payload: bytes) -> None:
         with self._query as query:  # a query ends for the asker only when it is dropped
             query.reply(self._key, payload)
 
 
-class _QuestionRing:
+class _ZenohQueryRing:
     def __init__(self, queryable: Any, key: str) -> None:
         self._queryable = queryable
         self._key = key
 
-    def poll(self) -> _Question | None:
+    def poll(self) -> _ZenohQuery | None:
         query = self._queryable.try_recv()
-        return None if query is None else _Question(query, self._key)
+        return None if query is None else _ZenohQuery(query, self._key)
 
 
-def _sent(query: zenoh.Query) -> bytes:
+def _query_payload(query: zenoh.Query) -> bytes:
     """Returns what came with a question."""
     return b"" if query.payload is None else query.payload.to_bytes()
 
@@ -114,17 +113,17 @@ class ZenohBus:
         self,
         listen: Sequence[Endpoint] = (),
         connect: Sequence[Endpoint] = (),
-        mode: Mode = "peer",
+        mode: ZenohMode = "peer",
         own: Mapping[str, Any] | None = None,
     ) -> None:
         zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # says nothing without RUST_LOG
         try:
-            config = zenoh.Config.from_json5(json.dumps(configuration(listen, connect, mode, own)))
+            config = zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own)))
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
             if mode == "client" and "Unable to connect" in str(error):
                 refused = ", or none lets this member in" if own else ""
-                raise RouterSilent(f"no router answers at {_places(connect)}{refused}") from None
+                raise RouterSilent(f"no router answers at {_endpoint_texts(connect)}{refused}") from None
             raise UsageError(_open_problem(error, listen, connect)) from None
         self._kept: list[Any] = []
         self._tokens: set[str] = set()
@@ -141,15 +140,15 @@ class ZenohBus:
         put: Callable[[bytes], None] = publisher.put
         return put
 
-    def inbox(self, key: str, capacity: int = RING) -> Inbox:
+    def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """See `Bus`."""
-        return _Ring(
+        return _ZenohRing(
             self._session.declare_subscriber(
                 key, handlers.RingChannel(capacity), allowed_origin=Locality.REMOTE
             )
         )
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING) -> StampedInbox:
+    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """See `Bus`."""
         ring = StampingRing(now_ns, capacity)
         self._call(key, lambda sample: ring.take(sample.payload.to_bytes()))
@@ -167,9 +166,9 @@ class ZenohBus:
             )
         )
 
-    def questions(self, key: str) -> Questions:
+    def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
-        return _QuestionRing(
+        return _ZenohQueryRing(
             self._session.declare_queryable(key, handlers.RingChannel(64), allowed_origin=Locality.REMOTE),
             key,
         )
@@ -179,7 +178,7 @@ class ZenohBus:
 
         def at_once(query: zenoh.Query) -> None:
             with query:  # a query ends for the asker only when it is dropped
-                payload = answer(_sent(query))
+                payload = answer(_query_payload(query))
                 if payload is not None:
                     query.reply(key, payload)
 
@@ -191,7 +190,7 @@ class ZenohBus:
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
-        return _Replies(
+        return _ZenohReplies(
             self._session.get(
                 key,
                 handlers.FifoChannel(256),  # a ring forgets its answers when the last one has come
@@ -211,9 +210,9 @@ class ZenohBus:
         self._tokens.add(key)
         self._kept.append(self._session.liveliness().declare_token(key))
 
-    def presence(self, key: str) -> Presence:
+    def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
-        return _PresenceRing(
+        return _ZenohPresenceRing(
             self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True),
             self._tokens,
         )
@@ -240,7 +239,7 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise UsageError(f"{path}: is no text in UTF-8") from None
-    return understood(str(path), _parsed(str(path), text), _refusal)
+    return check_zenoh_file(str(path), _parsed(str(path), text), _refusal)
 
 
 def _parsed(source: str, text: str) -> object:
@@ -276,7 +275,7 @@ def _reason(error: zenoh.ZError) -> str:
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
-def _places(endpoints: Sequence[Endpoint]) -> str:
+def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
     return ", ".join(map(str, endpoints))
 
 
@@ -284,7 +283,7 @@ def _open_problem(error: zenoh.ZError, listen: Sequence[Endpoint], connect: Sequ
     """Puts Zenoh's refusal to open a session into one sentence."""
     if "in use" in str(error) or "AddrInUse" in str(error):
         return (
-            f"cannot listen at {_places(listen)}: the port is in use; "
+            f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
             "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
         )
-    return f"cannot open a Zenoh session with {_places([*listen, *connect])}: {_reason(error)}"
+    return f"cannot open a Zenoh session with {_endpoint_texts([*listen, *connect])}: {_reason(error)}"

@@ -1,16 +1,24 @@
-"""What a session needs of Zenoh.
+"""The Zenoh configuration of a session member, and checks of a user's own configuration file.
 
-Law: explicit endpoints and nothing else. No multicast, no gossip, no shared memory: two sessions on one
-host, or on a crowded network, never meet by accident.
+Invariant: explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never
+meet by accident. No setting of a user's file is overruled silently: it is taken, or refused with its key,
+its value and the value required.
 
-Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here: a burst of
-catch-up ticks must fit), a publisher that waits 1 ms for room (0: a loop never waits; the receiver counts
-what was dropped), and `express`, which sends each message by itself and is left off: batching is what
-makes bursts of thousands of small messages fit.
+Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here, for bursts of
+catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never waits and the receiver counts
+drops), and `express`, which sends each message by itself; it stays off because batching makes bursts of
+thousands of small messages fit.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+import difflib
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from ..errors import UsageError
 
 LEASE_MS = 5_000
 """A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
@@ -18,7 +26,7 @@ closed connection; a silent one by the age of its samples."""
 
 BATCHES, BATCH_BYTES = 16, 65_535
 
-Mode = Literal["peer", "client", "router"]
+ZenohMode = Literal["peer", "client", "router"]
 Endpoint = str | Mapping[str, Any]
 """As in "tcp/127.0.0.1:7447", or one of Zenoh's groups of locators."""
 
@@ -35,10 +43,10 @@ QUEUES = (
 """Zenoh's queues of a link, by priority."""
 
 
-def configuration(
+def make_zenoh_config(
     listen: Sequence[Endpoint],
     connect: Sequence[Endpoint],
-    mode: Mode = "peer",
+    mode: ZenohMode = "peer",
     own: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Returns the Zenoh configuration of a member of a session.
@@ -87,3 +95,171 @@ def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
         under = both.get(key)
         both[key] = _merged(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
     return both
+
+
+class _Requirement(NamedTuple):
+    """What a key must be, where a file states it."""
+
+    holds: Callable[[Any], bool]
+    must: str
+
+
+def _exactly(value: object, must: str) -> _Requirement:
+    return _Requirement(lambda stated: stated == value and isinstance(stated, type(value)), must)
+
+
+def _at_least(least: int, must: str) -> _Requirement:
+    return _Requirement(lambda stated: isinstance(stated, int) and stated >= least, must)
+
+
+_OURS = _Requirement(lambda _: False, "left out: a session sets it itself")
+_NAMED = _exactly(False, "false: members meet at named endpoints and nowhere else")
+_UNTOUCHED = _exactly([], "empty: it would change or thin out a session's messages")
+_TX = "transport/link/tx"
+
+REQUIREMENTS: Mapping[str, _Requirement] = {
+    "connect/timeout_ms": _OURS,
+    "connect/exit_on_failure": _OURS,
+    "listen/timeout_ms": _OURS,
+    "listen/exit_on_failure": _OURS,
+    "scouting/multicast/enabled": _NAMED,
+    "scouting/gossip/enabled": _NAMED,
+    **{
+        f"{_TX}/queue/size/{queue}": _at_least(
+            BATCHES, f"{BATCHES}: a burst of catch-up ticks must fit into the queue"
+        )
+        for queue in QUEUES
+    },
+    f"{_TX}/queue/congestion_control/drop/wait_before_drop": _exactly(0, "0: a loop never waits for room"),
+    f"{_TX}/queue/batching/enabled": _exactly(
+        True, "true: without batches a burst of catch-up ticks does not fit into the queue"
+    ),
+    f"{_TX}/batch_size": _at_least(BATCH_BYTES, f"{BATCH_BYTES}: a burst of catch-up ticks must fit"),
+    f"{_TX}/lease": _at_least(LEASE_MS, f"{LEASE_MS} or more: a stall shorter than that loses no message"),
+    "transport/unicast/lowlatency": _exactly(False, "false: it sends in the loop, without a queue"),
+    "transport/shared_memory/enabled": _exactly(False, "false: a receiver that stalls would lose messages"),
+    "qos/publication": _UNTOUCHED,
+    "qos/network": _UNTOUCHED,
+    "downsampling": _UNTOUCHED,
+    "low_pass_filter": _UNTOUCHED,
+}
+"""What a session needs, by the path of the key in Zenoh's configuration."""
+
+_FILES = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
+"""Keys that name files. Zenoh opens those of a connecting side late, and then tries again for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohFile:
+    """A person's own Zenoh configuration, as far as it goes with a session; made by `understood`.
+
+    Attributes:
+        source: the file.
+        mode: the mode that it states, or "".
+        settings: what it states besides mode and endpoints.
+    """
+
+    source: str
+    mode: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    _endpoints: Mapping[str, Any] = field(default_factory=dict)
+
+    def endpoints(self, side: Literal["listen", "connect"], mode: ZenohMode) -> list[Endpoint] | None:
+        """Returns the endpoints that it states for a mode, or None where it states none."""
+        stated = self._endpoints.get(side)
+        if isinstance(stated, dict) and "locators" not in stated:
+            stated = stated.get(mode)
+        if stated is None:
+            return None
+        return list(stated) if isinstance(stated, list) else [stated]
+
+
+def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]) -> ZenohFile:
+    """Returns what a file says, checked.
+
+    Args:
+        source: the file.
+        stated: what is in it.
+        refusal: why Zenoh refuses a configuration, or "".
+
+    Raises:
+        UsageError: it is no configuration of Zenoh's, or contradicts what a session needs.
+    """
+    if not isinstance(stated, dict):
+        raise UsageError(f"{source}: a Zenoh configuration is one object in braces, not {_shown(stated)}")
+    settings = _without_nulls(stated)
+    if refusal(settings):
+        path, reason = _culprit(settings, refusal, ()) or ((), refusal(settings))
+        raise UsageError(f"{source}: {'/'.join(path)}: {_nearest(path, reason)}")
+    for key, value in _leaves(settings, ()):
+        need = REQUIREMENTS.get(key)
+        if need is not None and not need.holds(value):
+            raise UsageError(f"{source}: {key}: {_shown(value)} must be {need.must}")
+        if re.fullmatch(_FILES, key):
+            _readable(source, key, value)
+    mode = settings.pop("mode", "")
+    endpoints = {
+        side: settings[side].pop("endpoints")
+        for side in ("listen", "connect")
+        if _has_endpoints(settings, side)
+    }
+    return ZenohFile(source, mode, settings, endpoints)
+
+
+def _has_endpoints(settings: Mapping[str, Any], side: str) -> bool:
+    return "endpoints" in settings.get(side, {})
+
+
+def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """A null in Zenoh's files says that nothing is said."""
+    return {
+        key: _without_nulls(value) if isinstance(value, dict) else value
+        for key, value in stated.items()
+        if value is not None
+    }
+
+
+def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        here = (*path, key)
+        if isinstance(value, dict) and "/".join(here) not in REQUIREMENTS:
+            yield from _leaves(value, here)
+        else:
+            yield "/".join(here), value
+
+
+def _culprit(
+    settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
+) -> tuple[tuple[str, ...], str] | None:
+    """Returns the path of the key that Zenoh refuses, and why; each key is tried alone."""
+    for key, value in settings.items():
+        here = (*path, key)
+        alone: Any = value
+        for part in reversed(here):
+            alone = {part: alone}
+        if reason := refusal(alone):
+            deeper = _culprit(value, refusal, here) if isinstance(value, dict) else None
+            return deeper or (here, reason)
+    return None
+
+
+def _nearest(path: Sequence[str], reason: str) -> str:
+    """Says an unknown key with the one that it resembles most, and any other refusal as it is."""
+    unknown = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
+    if unknown is None or not path or unknown[1] != path[-1]:
+        return reason
+    near = difflib.get_close_matches(unknown[1], re.findall(r"`([^`]*)`", unknown[2]), 1)
+    choice = f"did you mean {near[0]}?" if near else f"there are {unknown[2].replace('`', '')}"
+    return f"no key of Zenoh's; {choice}"
+
+
+def _readable(source: str, path: str, name: object) -> None:
+    try:
+        Path(str(name)).read_bytes()
+    except OSError as error:
+        raise UsageError(f"{source}: {path}: {name} cannot be read: {error.strerror}") from None
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,17 +1,33 @@
-"""Scenarios: what an experiment is, typed, frozen and validated.
+"""Scenarios: experiments, typed, frozen and validated.
 
-Law: a scenario that loads is one that runs; everything that a person can get wrong is refused here, with
-the path of the key and the nearest valid name.
+Invariant: a scenario that loads also runs; every mistake that a person can make is refused here, with the
+path of the key and the nearest valid name.
 """
 
-from .actors import Pulse
-from .commands import command, command_from, later_tables, owner, present_links, resolve_change
-from .expectation import Expect
+from ..deprecated import lookup_of
+from .delay_models import Link
+from .expect import Expect
 from .laws import Adaptive, ProportionalDamped
-from .links import Link
-from .model import Scenario
-from .reader import embedded, load, override, parse, shipped, shipped_text, site_named, template_text
-from .site import Arm, Limits, OnStale, SiteSpec
+from .operators import Pulse
+from .override import apply_overrides
+from .run_changes import (
+    find_owner,
+    initial_link_tables,
+    parse_core_change,
+    resolve_change,
+    scheduled_link_tables,
+    to_core_change,
+)
+from .scenario_reader import (
+    find_site,
+    list_shipped,
+    load_scenario,
+    parse_embedded,
+    parse_scenario,
+    read_shipped,
+    read_template,
+)
+from .scenario_types import Arm, Limits, OnStale, Scenario, SiteSpec
 
 __all__ = [
     "Adaptive",
@@ -24,18 +40,20 @@ __all__ = [
     "Pulse",
     "Scenario",
     "SiteSpec",
-    "command",
-    "command_from",
-    "embedded",
-    "later_tables",
-    "load",
-    "override",
-    "owner",
-    "parse",
-    "present_links",
+    "apply_overrides",
+    "find_owner",
+    "find_site",
+    "initial_link_tables",
+    "list_shipped",
+    "load_scenario",
+    "parse_core_change",
+    "parse_embedded",
+    "parse_scenario",
+    "read_shipped",
+    "read_template",
     "resolve_change",
-    "shipped",
-    "shipped_text",
-    "site_named",
-    "template_text",
+    "scheduled_link_tables",
+    "to_core_change",
 ]
+
+__getattr__ = lookup_of("scenario")

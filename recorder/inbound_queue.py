@@ -1,0 +1,60 @@
+"""Bounded queue of inbound messages, stamped on arrival, for the one thread that writes.
+
+Invariant (L6): the queue is bounded; overflow is counted and reported.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from trilat_net.net.clock import Clock
+
+CAPACITY = 200_000
+"""Messages that wait at most: a minute of three sites at 1 kHz."""
+KEYS = 1_000
+"""Keys whose losses are counted apart."""
+
+
+class InboundMessage(NamedTuple):
+    """One message as it came in: its key, its bytes, and when, on the monotonic clock."""
+
+    key: str
+    payload: bytes
+    mono_ns: int
+
+
+class InboundQueue:
+    """A queue between the bus's thread, which takes, and the writer's, which drains.
+
+    Args:
+        clock: what stamps.
+
+    Attributes:
+        overflowed: messages lost because the queue was full, by key.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._queue: deque[InboundMessage] = deque()
+        self.overflowed: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        """Returns how many wait."""
+        return len(self._queue)
+
+    def take(self, key: str, payload: bytes) -> None:
+        """Takes one message; called by the bus."""
+        if len(self._queue) >= CAPACITY:
+            self.overflowed[key if len(self.overflowed) < KEYS else "others"] += 1
+            return
+        self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
+
+    def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
+        """Yields what waits, oldest first.
+
+        Args:
+            until_ns: what came after this instant waits on; None for all.
+        """
+        queue = self._queue
+        while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
+            yield queue.popleft()

@@ -1,0 +1,314 @@
+"""The recorder as one process: find and join a session, write its messages, end with it.
+
+Invariant: no message is lost that arrived, or that a site still buffers. Messages are stamped on arrival and
+wait in one bounded queue; one thread writes. The file is flushed every 100 ms and completed on every orderly
+end of the process.
+"""
+
+import platform
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from trilat_net import process
+from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.errors import LogRefused, RunFailed, ScenarioError, SessionError, WireError
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
+from trilat_net.log.mcap_writer import Sink
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection, default_endpoint, default_endpoints, open_bus
+from trilat_net.net.membership import ASK_EVERY_NS, EventPublisher, liveliness_token, new_boot
+from trilat_net.net.messages import Info
+from trilat_net.net.pinging import describe_clocks
+from trilat_net.net.session import Epoch, SessionJoin
+from trilat_net.net.wire import decode
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.process import Interrupt
+from trilat_net.scenario import Scenario, parse_embedded
+
+from .inbound_queue import InboundQueue
+from .session_recording import RecorderReport, Recording
+
+
+class FirstSiteQuery:
+    """Asks the first site of a session, on this machine, where the others are.
+
+    It announces the recorder meanwhile, so that the session does not begin without it.
+
+    Args:
+        session: the session's name.
+        boot: the recorder's boot.
+        own: settings of a person's own for Zenoh.
+    """
+
+    def __init__(self, session: str, boot: int, own: Mapping[str, Any] | None = None) -> None:
+        self._session = session
+        self._first = default_endpoint(session, 0)
+        self._bus = ZenohBus([], [self._first], own=own)
+        self._bus.announce(liveliness_token(session, topics.RECORDER, boot))
+
+    def endpoints(self, clock: Clock, stopped: Callable[[], bool], timeout_s: float | None) -> list[str]:
+        """Returns the default endpoints of the session's sites, once the first has said who they are.
+
+        Raises:
+            SessionError: it did not answer in time.
+        """
+        begun_ns = clock.monotonic_ns()
+        while not stopped():
+            replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
+            clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
+            while (reply := replies.poll()) is not None:
+                try:
+                    names = parse_embedded(decode(reply[1], Info).scenario, self._session).names
+                except (WireError, ScenarioError):
+                    continue  # no site of ours
+                return list(default_endpoints(self._session, names).values())
+            if timeout_s is not None and clock.monotonic_ns() - begun_ns > timeout_s * 1e9:
+                raise SessionError(
+                    f"the recorder waited {timeout_s:g} s for the first site of session {self._session!r} "
+                    f"at {self._first}; name other endpoints with --connect"
+                )
+        return [self._first]
+
+    def close(self) -> None:
+        """Leaves; by then the recorder has announced itself to all sites."""
+        self._bus.close()
+
+
+POLL_NS = 10_000_000
+FLUSH_NS = 80_000_000
+"""How often the log is handed to the operating system: a crash loses this, and at most two polls."""
+
+
+class Recorder:
+    """One recording, from the first poll to the end mark of the file.
+
+    Args:
+        bus: the connection.
+        clock: the time.
+        session: the session's name.
+        boot: this process's boot.
+        storage: where the log goes.
+        stopped: True once the recorder was asked to end.
+        say: tells a person what happens.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        boot: int,
+        storage: LogStorage,
+        stopped: Callable[[], bool],
+        say: Callable[[str], None],
+    ) -> None:
+        self._bus, self._clock, self._session, self._storage = bus, clock, session, storage
+        self._stopped, self._say = stopped, say
+        self._tap = InboundQueue(clock)
+        for channel in (topics.STATE, topics.LINK, topics.EVENT):
+            bus.tap(topics.key(session, "*", channel), self._tap.take)
+        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._voice = EventPublisher(
+            bus,
+            session,
+            Info(
+                member=topics.RECORDER,
+                boot=boot,
+                scenario_sha256="",
+                scenario="",
+                host=platform.node(),
+                clock=clock.identity(),
+                fingerprint=compute_fingerprint(),
+            ),
+            partial(self._tap.take, topics.key(session, topics.RECORDER, topics.EVENT)),
+        )
+        self._joining = SessionJoin(bus, clock, session, self._voice, ())
+
+    def join(self, timeout_s: float | None) -> Epoch | None:
+        """Waits for a session to begin.
+
+        Args:
+            timeout_s: how long, s; None for as long as it takes.
+
+        Returns:
+            The epoch, or None where the recorder was asked to end before.
+
+        Raises:
+            SessionError: none began in time.
+        """
+        begun_ns = self._clock.monotonic_ns()
+        while not self._stopped():
+            epoch = self._joining.poll()
+            if epoch is not None:
+                return epoch
+            now_ns = self._clock.monotonic_ns()
+            if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
+                met = ", ".join(self._joining.meeting.met) or "nobody"
+                raise SessionError(
+                    f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
+                    f"it met {met}"
+                )
+            self._clock.sleep_until(now_ns + self._joining.pinger.pause_ns(POLL_NS))
+        return None
+
+    def record(self, epoch: Epoch) -> Recording:
+        """Writes the session from its epoch to its end, and returns the finished recording.
+
+        Raises:
+            UsageError: the file cannot be made.
+            LogRefused: the disk refused; says what is kept.
+        """
+        scenario = self._scenario(epoch)
+
+        def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+            return LogWriter(
+                *(stream, scenario, self._session, "live", epoch.unix_ns),
+                part=part,
+                choice=self._storage.choice,
+                views_hz=self._storage.views_hz,
+            )
+
+        with LogParts(self._storage, begin) as log:
+            recording = Recording(log, scenario, self._session, epoch, self._bus, self._voice)
+            log.so_far = partial(recording.account_texts, self._tap)
+            boot = self._voice.info.boot
+            report = RecorderReport(
+                *(self._bus, self._clock, self._session, boot, epoch, recording, self._tap),
+                lambda: log.written_bytes,
+            )
+            self._begin(recording, epoch, log.path)
+            left = self._tap
+            try:
+                self._run(recording, report)
+            except LogRefused:
+                left = self._nothing()
+                raise
+            finally:
+                report.say()
+                self._finish(recording, left)
+        return recording
+
+    def _finish(self, recording: Recording, left: InboundQueue) -> None:
+        """Writes what is left and the end of the log; where the disk refuses what is left, the end."""
+        try:
+            recording.finish(left)
+        except LogRefused:
+            recording.finish(self._nothing())
+            raise
+
+    def _nothing(self) -> InboundQueue:
+        """Returns a queue in which nothing waits: on a full disk there is no room for it."""
+        tap = InboundQueue(self._clock)
+        tap.overflowed = self._tap.overflowed
+        return tap
+
+    def _scenario(self, epoch: Epoch) -> Scenario:
+        """Returns the scenario, as a member of the session has it."""
+        return next(
+            parse_embedded(info.scenario, info.member)
+            for info in self._joining.meeting.met.values()
+            if info.scenario and epoch.boots.get(info.member) == info.boot
+        )
+
+    def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
+        """Says that it is one of the session's members, or that it comes late."""
+        own, now_ns = self._voice.info, self._clock.monotonic_ns()
+        self._voice.info = msgspec.structs.replace(own, running=True)
+        how = "the session begins"
+        if epoch.boots.get(own.member) != own.boot:
+            how = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
+            recording.away()
+            self._attend(recording)
+            recording.late(now_ns)
+        self._say(f"recorder: {how}, writing {path}")
+        for text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
+            self._say(f"recorder: {text}")
+
+    def _attend(self, recording: Recording) -> None:
+        """Notes who has come and who has gone."""
+        while (change := self._presence.poll()) is not None:
+            recording.presence(*change)
+
+    def _run(self, recording: Recording, report: RecorderReport) -> None:
+        """Takes and writes until the session is over."""
+        flushed_ns = self._clock.monotonic_ns()
+        while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
+            self._voice.answer()
+            recording.write(self._tap, self._clock.monotonic_ns())
+            self._attend(recording)
+            report.poll()
+            now_ns = self._clock.monotonic_ns()
+            if now_ns - flushed_ns >= FLUSH_NS:
+                recording.flush()
+                flushed_ns = now_ns
+                report.flushed(self._clock.monotonic_ns() - now_ns)
+            self._clock.sleep_until(now_ns + POLL_NS)
+
+
+def record_session(
+    session: str,
+    storage: LogStorage,
+    connection: Connection,
+    join_timeout_s: float | None,
+    clock: Clock,
+    say: Callable[[str], None],
+    afterwards: Callable[[], None] = lambda: None,
+) -> int:
+    """Records one session, as a process of its own.
+
+    Args:
+        session: the session's name.
+        storage: where the log goes.
+        connection: how it takes part in the network; without endpoints to connect to it asks the session's
+            first site, on this machine.
+        join_timeout_s: how long to wait for the session to begin, s, or None.
+        clock: the time.
+        say: tells a person what happens.
+        afterwards: what to do with the finished log of a session that nobody interrupted. The recorder is a
+            member of the session until that is done: sites that shall stay wait for it.
+
+    Returns:
+        The exit code: 0, or 128 and the number of the signal that ended it.
+
+    Raises:
+        TrilatError: the session did not begin, the file cannot be written, or records are missing.
+    """
+    boot = new_boot()
+    say(f"recorder: waiting for session {session!r} to begin")
+    with ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt())
+        if connection.connect is None:
+            discovery = FirstSiteQuery(session, boot, connection.own)
+            stack.callback(discovery.close)
+            found = discovery.endpoints(clock, interrupt.requested, join_timeout_s)
+            connection = replace(connection, connect=found)
+        bus = open_bus(
+            connection, clock, interrupt.requested, join_timeout_s, lambda text: say(f"recorder: {text}")
+        )
+        if bus is None:
+            return interrupt.exit_code
+        stack.callback(bus.close)
+        recorder = Recorder(bus, clock, session, boot, storage, interrupt.requested, say)
+        process.freeze_gc()  # in a session its pauses would be time that a crash can lose
+        epoch = recorder.join(join_timeout_s)
+        if epoch is None:
+            say("recorder: ended before the session began; nothing was written")
+            return interrupt.exit_code
+        recording = recorder.record(epoch)
+        say("\n".join(recording.summary()))
+        if not interrupt.requested():
+            with suppress(KeyboardInterrupt), interrupt.raising():
+                afterwards()
+    if interrupt.requested():
+        return interrupt.exit_code
+    if problem := recording.problem():
+        raise RunFailed(problem)
+    return 0

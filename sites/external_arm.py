@@ -1,0 +1,139 @@
+"""Measurements of an external arm (`plant = "external"`), as its site receives them.
+
+Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The newest
+measurement counts; a site does not begin without one, and stops when none arrive any more.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from trilat_net.core.ticks import PlantState
+from trilat_net.errors import RunFailed, SessionError, WireError
+from trilat_net.net.bus import StampedInbox
+from trilat_net.net.clock import Clock
+from trilat_net.net.requests import ArmMeasurement
+from trilat_net.net.wire import decode
+
+MEASUREMENTS_KEPT = 64
+"""Measurements that wait, at most: older ones are of no use."""
+SILENCE_LIMIT_NS = 500_000_000
+"""An arm that says nothing for longer than this is gone."""
+START_POSE_TOLERANCE_RAD = 0.01
+"""An arm that begins farther from its `q0_rad` than this is told of."""
+POLL_NS = 5_000_000
+_MOST_NS = 20_000_000
+"""How much of its silence a single look can show: a site that slept cannot know what it would have heard."""
+
+
+class ExternalArm:
+    """The measurements of one arm.
+
+    Args:
+        site: whose arm it is.
+        ring: where they arrive.
+        clock: the time.
+        dropped: where what is dropped is counted, by reason.
+        where: what to call the place where they arrive.
+
+    Attributes:
+        newest: the newest measurement, None before the first.
+        taken: how many were taken in.
+    """
+
+    def __init__(
+        self, site: str, ring: StampedInbox, clock: Clock, dropped: Counter[str], where: str
+    ) -> None:
+        self.newest: PlantState | None = None
+        self.taken = 0
+        self._site, self._ring, self._dropped = site, ring, dropped
+        self._clock, self._where = clock, where
+        self._boot = self._n = -1
+        self._bound = self._counting = False
+        self._silent_ns = 0
+        self._looked_ns: int | None = None
+
+    def speaks(self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]) -> bool:
+        """Waits for the first measurement; False where the site was asked to end before.
+
+        Args:
+            stopped: True once the site was asked to end.
+            give_up_ns: when to give up.
+            say: tells a person what happens.
+
+        Raises:
+            SessionError: none came in time.
+        """
+        say(f"{self._site}: waiting for its arm on {self._where}")
+        while not stopped():
+            self.look()
+            if self.newest is not None:
+                return True
+            now_ns = self._clock.monotonic_ns()
+            if now_ns > give_up_ns:
+                dropped = ", ".join(f"{count} {reason}" for reason, count in self._dropped.items())
+                raise SessionError(
+                    f"{self._site} waited in vain for its arm: no measurement came on {self._where}"
+                    + (f"; dropped: {dropped}" if dropped else "")
+                    + "; see docs/external-arm.md"
+                )
+            self._clock.sleep_until(now_ns + POLL_NS)
+        return False
+
+    def bind(self, q0_rad: Sequence[float]) -> str:
+        """From now on only the program counts that speaks now; one that is started anew is a stranger.
+
+        Args:
+            q0_rad: where the peers take the arm to start.
+
+        Returns:
+            What to say of where it stands; "" where it stands there.
+        """
+        self.look()
+        self._bound = True
+        self._silent_ns = 0
+        off = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
+        off_rad = max(abs(a - b) for a, b in off)
+        if off_rad <= START_POSE_TOLERANCE_RAD:
+            return ""
+        return (
+            f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start: their "
+            "references will jump"
+        )
+
+    def look(self) -> None:
+        """Takes in what has come."""
+        now_ns = self._clock.monotonic_ns()
+        before = self.taken
+        while (message := self._ring.poll()) is not None:
+            self._take(message[0])
+        passed_ns = 0 if self._looked_ns is None else min(now_ns - self._looked_ns, _MOST_NS)
+        self._silent_ns = 0 if self.taken > before else self._silent_ns + passed_ns
+        self._looked_ns = now_ns
+
+    @property
+    def failure(self) -> RunFailed | None:
+        """Why the run cannot go on: it has said nothing for too long; else None."""
+        if self._silent_ns <= SILENCE_LIMIT_NS:
+            return None
+        return RunFailed(f"the arm of {self._site} was silent for {SILENCE_LIMIT_NS * 1e-9:g} s")
+
+    def _take(self, payload: bytes) -> None:
+        try:
+            message = decode(payload, ArmMeasurement)
+        except WireError as error:
+            self._dropped[error.reason] += 1
+            return
+        if message.site != self._site or (self._bound and message.boot != self._boot):
+            self._dropped["stranger"] += 1
+            return
+        if message.boot != self._boot:
+            self._boot, self._n = message.boot, message.n - 1
+        if message.n <= self._n:
+            self._dropped["old measurement"] += 1
+            return
+        if self._counting and message.n > self._n + 1:
+            self._dropped["missing measurement"] += message.n - self._n - 1
+        self._counting = self._bound
+        self._n = message.n
+        self.newest = PlantState(message.q, message.qd)
+        self.taken += 1

@@ -1,0 +1,142 @@
+"""Deadline budget and watchdog of a user's control law.
+
+Invariant: the watchdog judges the law's own computing time, never the machine's lateness, and enters no
+number of the run. A single hiccup is only counted; a law that is too slow, or does not return, ends the run
+in order.
+
+A law may use `SHARE` of a tick period. Time beyond that adds to its overtime, which faster ticks pay back; a
+law that owes `MOST_NS` is too slow. One tick counts for at most `HICCUP_NS`, so no single tick can end a
+run. If the machine preempted the thread, the thread's computing time counts instead of the elapsed time.
+"""
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Any
+
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import NS_PER_S, TickInput, TickRecord
+from trilat_net.errors import LawFailed
+from trilat_net.net.clock import Clock
+
+try:
+    import resource
+
+    _WHO: int | None = getattr(resource, "RUSAGE_THREAD", None)
+except ImportError:  # not on this platform: there the time that passed counts
+    _WHO = None
+
+SHARE = 0.75
+MOST_NS = 500_000_000
+HICCUP_NS = 50_000_000
+LOOK_S = 1.0
+LOOKS = 3
+"""A law that is in the same tick at so many looks in a row, one every `LOOK_S`, does not come back."""
+
+
+def read_thread_usage() -> tuple[int, int]:
+    """Returns what this thread has computed, ns, and how often it lost its processor; (0, -1) if unknown."""
+    if _WHO is None:
+        return 0, -1
+    usage = resource.getrusage(_WHO)
+    return round((usage.ru_utime + usage.ru_stime) * NS_PER_S), usage.ru_nivcsw
+
+
+class LawWatchdog:
+    """Steps a site with a law from outside; a context, within which one that hangs is stopped.
+
+    Args:
+        site: the site.
+        law: the law, as in "package.module:Law".
+        clock: the time.
+        use: what the thread has computed, see `thread_use`.
+
+    Attributes:
+        hiccups: ticks in which the law took longer than there is from one tick to the next.
+        longest_ns: the longest of all.
+        longest_tick: which tick that was.
+    """
+
+    def __init__(
+        self, site: Site, law: str, clock: Clock, use: Callable[[], tuple[int, int]] = read_thread_usage
+    ) -> None:
+        self.hiccups = self.longest_ns = 0
+        self.longest_tick = -1
+        self._site, self._law, self._clock, self._use = site, law, clock, use
+        self._period_ns = NS_PER_S // site.rate_hz
+        self._owed_ns = self._sum_ns = self._count = 0
+        self._within = -1  # the tick that is being stepped
+        self._seen, self._looks = -1, 0
+        self._before: Any = None
+
+    def step(self, tick: TickInput) -> TickRecord:
+        """Steps the site.
+
+        Raises:
+            LawFailed: the law did, or is too slow.
+        """
+        computed_ns, lost = self._use()
+        began_ns = self._clock.monotonic_ns()
+        self._within = tick.k
+        try:
+            output = self._site.step(tick)
+        finally:
+            self._within = -1
+        took_ns = self._clock.monotonic_ns() - began_ns
+        if took_ns > SHARE * self._period_ns:  # else nothing is to be told apart
+            computed_after_ns, lost_after = self._use()
+            if lost_after != lost:
+                took_ns = min(took_ns, computed_after_ns - computed_ns)
+        self._book(tick.k, took_ns)
+        return output
+
+    def _book(self, k: int, took_ns: int) -> None:
+        self.hiccups += took_ns > self._period_ns
+        self._sum_ns += took_ns
+        self._count += 1
+        if took_ns > self.longest_ns:
+            self.longest_ns, self.longest_tick = took_ns, k
+        self._owed_ns += min(took_ns, HICCUP_NS) - int(SHARE * self._period_ns)
+        self._owed_ns = max(self._owed_ns, 0)
+        if self._owed_ns > MOST_NS:
+            mean_ms, period_ms = self._sum_ns / self._count * 1e-6, self._period_ns * 1e-6
+            raise self._failed(
+                k,
+                f"it is too slow: {mean_ms:.3g} ms a tick, of {period_ms:.3g} ms between two of them it may "
+                f"take {SHARE:.0%}; make it faster, or lower rate_hz",
+            )
+
+    def told(self) -> str:
+        """Says how often the law was late for the next tick; "" where it never was."""
+        if not self.hiccups:
+            return ""
+        return (
+            f"the law {self._law} took longer than from one tick to the next at {self.hiccups} ticks, "
+            f"at most {self.longest_ns * 1e-6:.3g} ms, at tick {self.longest_tick}"
+        )
+
+    def __enter__(self) -> "LawWatchdog":
+        if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGALRM, self._look)
+            signal.setitimer(signal.ITIMER_REAL, LOOK_S, LOOK_S)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)
+            self._before = None
+
+    def _look(self, _number: int, _frame: FrameType | None) -> None:
+        """Stops a law that is in the same tick as at the looks before; a process that slept had none."""
+        within = self._within
+        self._looks = self._looks + 1 if within >= 0 and within == self._seen else 0
+        self._seen = within
+        if self._looks >= LOOKS - 1:
+            raise self._failed(within, f"it did not come back within {(LOOKS - 1) * LOOK_S:g} s")
+
+    def _failed(self, k: int, problem: str) -> LawFailed:
+        return LawFailed(problem, site=self._site.name, law=self._law, tick=k)

@@ -1,0 +1,189 @@
+"""Ping client: round trips to every member of a session, and the link statistics that its sites publish.
+
+Invariant: read-only. It announces no token; a session neither waits for it nor sees it.
+"""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+
+from trilat_net.errors import RunFailed, ScenarioError, SessionError, WireError
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection, default_endpoint, default_endpoints, open_bus
+from trilat_net.net.membership import ASK_EVERY_NS
+from trilat_net.net.messages import Info, LinkStats
+from trilat_net.net.offset import OffsetEstimate, exact_offset
+from trilat_net.net.pinging import PING_PACE_NS, Pinger, RepeatedQuery
+from trilat_net.net.wire import decode
+from trilat_net.scenario import parse_embedded
+
+POLL_NS = 1_000_000
+GATHER_NS = 600_000_000
+"""How long to look for members after the first one."""
+PATIENCE_NS = 3_000_000_000
+"""How much longer than they should take to wait for the last answers."""
+
+
+@dataclass(frozen=True, slots=True)
+class PingResult:
+    """One member, as far as it could be reached.
+
+    Attributes:
+        info: what it says of itself.
+        rtts_ns: round trips, without the time that it held them.
+        shared: whether its clock is the visitor's own.
+        estimate: where its clock stands against the visitor's; None where too few round trips agree.
+    """
+
+    info: Info
+    rtts_ns: tuple[int, ...]
+    shared: bool
+    estimate: OffsetEstimate | None
+
+
+class SessionPing:
+    """One look at a session; call `poll` until `over`.
+
+    Args:
+        bus: a connection to its members.
+        clock: the visitor's time.
+        session: the session's name.
+        count: how many round trips to make to each member.
+
+    Attributes:
+        infos: who answered, by name.
+        links: of every site that runs, its latest statistics.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
+        self.infos: dict[str, Info] = {}
+        self.links: dict[str, LinkStats] = {}
+        self._clock, self._count = clock, count
+        self._asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
+        self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
+        self.pinger = Pinger(bus, clock, session, count)
+        self._asked_ns = clock.monotonic_ns() - ASK_EVERY_NS
+        self._first_ns: int | None = None
+
+    def poll(self) -> None:
+        """Takes what has come, and asks on."""
+        if self._clock.monotonic_ns() - self._asked_ns >= ASK_EVERY_NS:
+            self._asked_ns = self._asking.ask()
+        while (answer := self._asking.poll()) is not None:
+            try:
+                info = decode(answer.payload, Info)
+            except WireError:
+                continue  # a stranger's, or of another version of us
+            where = topics.parse_key(answer.key)
+            if where is None or where.member != info.member:
+                continue
+            self.infos[info.member] = info
+            self._first_ns = self._first_ns or self._clock.monotonic_ns()
+        while (message := self._stats.poll()) is not None:
+            try:
+                stats = decode(message[1], LinkStats)
+            except WireError:
+                continue
+            self.links[stats.site] = stats
+        self.pinger.poll(self._boots())
+
+    def _boots(self) -> set[int]:
+        return {info.boot for info in self.infos.values()}
+
+    def over(self, timeout_ns: int, begun_ns: int) -> bool:
+        """True once everybody has answered, or had the time to."""
+        now_ns = self._clock.monotonic_ns()
+        if self._first_ns is None:
+            return now_ns - begun_ns > timeout_ns
+        passed_ns = now_ns - self._first_ns
+        enough_ns = GATHER_NS + self._count * PING_PACE_NS + PATIENCE_NS
+        return passed_ns > GATHER_NS and (self.pinger.know(self._boots()) or passed_ns > enough_ns)
+
+    def reached(self) -> list[PingResult]:
+        """Returns what was measured, by name of the member."""
+        own = self._clock.identity()
+        reached = []
+        for _, info in sorted(self.infos.items()):
+            trips = self.pinger.trips.get(info.boot)
+            rtts = tuple(trips.rtts_ns) if trips else ()
+            shared = info.clock == own
+            estimate = exact_offset(0) if shared else trips.latest if trips else None
+            reached.append(PingResult(info, rtts, shared, estimate))
+        return reached
+
+
+def ping_session(
+    connection: Connection,
+    clock: Clock,
+    session: str,
+    count: int,
+    timeout_s: float,
+    stopped: Callable[[], bool],
+) -> SessionPing | None:
+    """Looks at a session once; None where a signal came first.
+
+    Args:
+        connection: how to reach it; without endpoints to connect to, on this machine.
+        clock: the visitor's time.
+        session: its name.
+        count: how many round trips to make to each member.
+        timeout_s: how long to wait for the first answer, s.
+        stopped: True once it was asked to end.
+
+    Raises:
+        RunFailed: nobody answered.
+    """
+    timeout_ns = int(timeout_s * 1e9)
+    if connection.connect is None:
+        first = replace(connection, connect=[default_endpoint(session, 0)])
+        infos = _poll_session(first, clock, session, 1, timeout_ns, stopped, gather=False)
+        if infos is None:
+            return None
+        connection = replace(connection, connect=_site_endpoints(infos, session))
+    return _poll_session(connection, clock, session, count, timeout_ns, stopped, gather=True)
+
+
+def _poll_session(
+    connection: Connection,
+    clock: Clock,
+    session: str,
+    count: int,
+    timeout_ns: int,
+    stopped: Callable[[], bool],
+    *,
+    gather: bool,
+) -> SessionPing | None:
+    """Looks until all have answered, or without `gather` until one has said who the sites are."""
+    begun_ns = clock.monotonic_ns()
+    try:
+        bus = open_bus(connection, clock, stopped, timeout_ns / 1e9, lambda _: None)
+    except SessionError as error:
+        raise RunFailed(str(error)) from None
+    if bus is None:
+        return None
+    with closing(bus):
+        probe = SessionPing(bus, clock, session, count)
+        while not (probe.over(timeout_ns, begun_ns) or (probe.infos and not gather)):
+            if stopped():
+                return None
+            probe.poll()
+            clock.sleep_until(clock.monotonic_ns() + probe.pinger.pause_ns(POLL_NS))
+    if not probe.infos:
+        places = ", ".join(map(str, connection.connect or ()))
+        raise RunFailed(
+            f"nobody of session {session!r} answered at {places} within {timeout_ns / 1e9:g} s; is that its "
+            "name, and has it not ended? name other endpoints with --connect"
+        )
+    return probe
+
+
+def _site_endpoints(probe: SessionPing, session: str) -> list[str]:
+    """Returns the default endpoints of the sites that a member's scenario names."""
+    for info in probe.infos.values():
+        try:
+            return list(default_endpoints(session, parse_embedded(info.scenario, session).names).values())
+        except ScenarioError:
+            continue  # the recorder's, which has none
+    return [default_endpoint(session, 0)]

@@ -1,0 +1,170 @@
+"""Virtual runs with their books, each made once per test session."""
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import trilat_net
+from trilat_net.analysis.certificate.energy_balance import (
+    EnergyBalance,
+    SiteEnergy,
+    compute_energy_balance,
+    compute_site_energies,
+)
+from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario, parse_scenario
+
+ROWS = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
+LYAPUNOV = {
+    **{f"dominance.{i}.{j}": share for i, row in ROWS.items() for j, share in row.items()},
+    "sites.m1.control.Kd": 10.0,
+    "sites.m2.control.Kd": 3.0,
+    "sites.s.control.Kd": 0.3,
+    "control.Kp": 0.1,
+    "duration_s": 10.0,
+    "rate_hz": 500,
+}
+"""Unequal shares and Kd, upon `free`."""
+
+JITTER = {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0, "duration_s": 3.0}
+
+RICH = """
+name = "rich"
+rate_hz = 500
+duration_s = 6.0
+[control]
+law = "adaptive_box"
+theta_hat0 = [0.0, 0.0, 0.0, 1.9, 0.95]
+theta_low = [-9.0, -9.0, -9.0, 1.8, 0.9]
+theta_high = [9.0, 9.0, 9.0, 2.1, 1.05]
+[link]
+delay_ms = 100.0
+[sites.m1]
+role = "master"
+q0_rad = [-0.6, 1.8]
+[[sites.m1.hands]]
+kind = "spring"
+to_rad = [-0.2, 1.2]
+move_start_s = 0.5
+move_end_s = 2.0
+stiffness_nm_rad = 60.0
+damping_nm_s_rad = 5.0
+sampled = true
+[sites.m2]
+role = "master"
+q0_rad = [-0.9, 1.9]
+hands = [{ kind = "pulse", start_s = 2.5, end_s = 4.0, peak_nm = [6.0, -3.0] }]
+on_stale = { action = "hold", age_ms = 300.0, return_s = 0.5 }
+[sites.s]
+role = "slave"
+q0_rad = [-0.4, 1.6]
+limits = { tau_limit_nm = 18.0 }
+environment = [
+    { kind = "wall", point_m = [1.2, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 300.0 },
+    { kind = "viscous", damping_nm_s_rad = 0.5, sampled = true },
+]
+[dominance]
+m1 = { m2 = 0.4, s = 0.6 }
+m2 = { m1 = 0.5, s = 0.5 }
+s = { m1 = 0.7, m2 = 0.3 }
+[links."m1->s"]
+model = "uniform"
+delay_ms = 100.0
+half_width_ms = 60.0
+[links."s->m1"]
+model = "uniform"
+delay_ms = 60.0
+half_width_ms = 40.0
+loss = 0.3
+[links."s->m2"]
+delay_ms = 100.0
+outages_s = [[1.0, 1.8]]
+[[timeline]]
+at_s = 1.0
+dominance = "s"
+to = { m1 = 0.2, m2 = 0.8 }
+ramp_s = 1.5
+[[timeline]]
+at_s = 3.0
+dominance = "m1"
+to = { m2 = 0.9, s = 0.1 }
+"""
+"""Everything at once that can give energy to V."""
+
+WALL = """
+name = "wall"
+duration_s = 6.0
+[control]
+theta_hat0 = [3.0, 1.0, 1.0, 2.0, 1.0]
+[link]
+delay_ms = 200.0
+[sites.m1]
+q0_rad = [-0.6, 1.8]
+[[sites.m1.hands]]
+kind = "tip_spring"
+to_m = [1.5, 0.37]
+move_start_s = 1.0
+move_end_s = 3.0
+stiffness_n_m = 100.0
+damping_n_s_m = 20.0
+[sites.m2]
+q0_rad = [-0.6, 1.8]
+[sites.s]
+role = "slave"
+q0_rad = [-0.6, 1.8]
+environment = [{ kind = "wall", point_m = [1.24, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 10000.0 }]
+[dominance]
+m1 = { m2 = 0.5, s = 0.5 }
+m2 = { m1 = 0.5, s = 0.5 }
+s = { m1 = 0.5, m2 = 0.5 }
+"""
+
+TEXTS = {"rich": RICH, "wall": WALL}
+
+
+def _frozen(overrides: Mapping[str, Any] | None) -> tuple[tuple[str, Any], ...]:
+    pairs = sorted((overrides or {}).items())
+    return tuple((key, tuple(value) if isinstance(value, list) else value) for key, value in pairs)
+
+
+@cache
+def _log(name: str, overrides: tuple[tuple[str, Any], ...]) -> Log:
+    values = {key: list(value) if isinstance(value, tuple) else value for key, value in overrides}
+    scenario = parse_scenario(TEXTS[name], name, values) if name in TEXTS else load_scenario(name, values)
+    return trilat_net.simulate(scenario)
+
+
+def log(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
+    """The log of a shipped scenario or of one above."""
+    return _log(name, _frozen(overrides))
+
+
+@cache
+def _books(name: str, overrides: tuple[tuple[str, Any], ...]) -> dict[str, SiteEnergy]:
+    return compute_site_energies(_log(name, overrides))
+
+
+def booked(name: str, overrides: Mapping[str, Any] | None = None) -> dict[str, SiteEnergy]:
+    """Its books."""
+    return _books(name, _frozen(overrides))
+
+
+@cache
+def _balanced(name: str, overrides: tuple[tuple[str, Any], ...]) -> EnergyBalance:
+    return compute_energy_balance(_books(name, overrides))
+
+
+def balanced(name: str, overrides: Mapping[str, Any] | None = None) -> EnergyBalance:
+    """Its balance."""
+    return _balanced(name, _frozen(overrides))
+
+
+@cache
+def _certified(name: str, overrides: tuple[tuple[str, Any], ...]) -> Certificate:
+    return certify(_log(name, overrides))
+
+
+def certified(name: str, overrides: Mapping[str, Any] | None = None) -> Certificate:
+    """Its certificate."""
+    return _certified(name, _frozen(overrides))

@@ -1,0 +1,182 @@
+"""Certificates of logs of every kind: other laws, gaps, old versions, torn and empty files."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.analysis import logs
+from trilat_net.analysis.certificate.premises import find_unjudged_spans
+from trilat_net.analysis.certificate.stability_certificate import (
+    NO_COMMON_TIME,
+    NO_PERIOD,
+    StabilityFinding,
+    certify,
+)
+from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.errors import LogError
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
+
+from . import runs
+
+GOLDEN = sorted((Path(__file__).parent.parent / "golden").glob("v*.mcap"))
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+def test_every_released_version_is_certified(path: Path) -> None:
+    found = certify(trilat_net.open_log(path))
+    assert found.balance is not None
+    assert found.verdict.finding in (StabilityFinding.COVERED, StabilityFinding.ROSE)
+    assert np.abs(found.balance.unexplained).max() <= 1e-3 * found.balance.scale
+
+
+@pytest.mark.parametrize(
+    ("d", "motion", "passed"), [(0.2, EndBehaviour.DIVERGED, False), (2.5, EndBehaviour.DECAYS, True)]
+)
+def test_a_law_without_a_functional_is_judged_by_growth_alone(
+    d: float, motion: EndBehaviour, passed: bool
+) -> None:
+    law = {"control.law": "p_d", "control.K": 10.0, "control.d": d, "duration_s": 12.0, "rate_hz": 200}
+    found = certify(trilat_net.simulate(load_scenario("free", law)))
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
+    assert found.growth.motion is motion
+    assert found.passed is passed
+
+
+def outside(log: Log, *, known: bool) -> Log:
+    """The same records, of a slave that is outside of the program."""
+    spec = log.scenario.sites["s"]
+    arm = msgspec.structs.replace(spec.arm, known=known)
+    sites = {**log.scenario.sites, "s": msgspec.structs.replace(spec, plant="external", arm=arm)}
+    log.scenario = msgspec.structs.replace(log.scenario, sites=sites)
+    return log
+
+
+def still_free() -> Log:
+    return logs.rewritten(runs.log("free", {"duration_s": 2.0, "rate_hz": 200}), lambda _: True)
+
+
+def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
+    found = certify(outside(still_free(), known=False))
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert found.verdict.text == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
+
+
+def test_an_arm_outside_is_judged_while_it_moves_as_its_theta_says_and_is_not_accused_where_it_does_not() -> (
+    None
+):
+    as_told = certify(outside(still_free(), known=True))
+    assert as_told.verdict.finding is StabilityFinding.COVERED
+    assert "no record says who pushes the arm of s" in as_told.verdict.text
+    other = outside(
+        logs.rewritten(
+            still_free(),
+            change=lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s,
+        ),
+        known=True,
+    )
+    found = certify(other)
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert "the arm of s, outside of the program, does not move as its theta says" in found.verdict.text
+
+
+def test_records_with_none_beside_them_are_no_period() -> None:
+    found = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
+    assert found.verdict.text == f"V cannot be judged: {NO_PERIOD}"
+
+
+def test_a_period_too_long_for_the_gains_is_not_judged_and_accuses_nobody() -> None:
+    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
+    light = {"arm.m2_kg": 0.001, "rate_hz": 333, "duration_s": 2.0}
+    found = certify(trilat_net.simulate(load_scenario("two_sites", light)))
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert "the period is too long for these gains" in found.verdict.text
+
+
+def test_gaps_are_left_out_and_told_of() -> None:
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0})
+    log = logs.rewritten(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
+    found = certify(log)
+    assert found.balance is not None
+    assert found.verdict.finding is StabilityFinding.COVERED
+    assert found.verdict.text.startswith("covered by the theorem, as far as the log tells: V did not rise: ")
+    assert "not judged: 0.995 to 1.35 s" in found.verdict.text
+    given = sum(np.abs(x).max() for x in found.balance.given.values())
+    assert given <= 1e-6  # nobody is said to have given what changed in the gap
+    assert found.balance.relative <= 1e-3
+    assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]  # s looks back by 150 ms
+
+
+def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
+    """Whatever was lost, nobody is accused for what lies in the gap."""
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    for site in whole.sites:
+        found = certify(
+            logs.rewritten(whole, lambda s, site=site: not (s.site == site and 50 <= s.tick < 450))
+        )
+        assert found.verdict.finding is not StabilityFinding.BROKEN
+
+
+def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes() -> None:
+    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
+    assert found.balance is not None
+    assert found.verdict.finding is StabilityFinding.COVERED
+    assert found.balance.t_s[0] == pytest.approx(
+        1.205
+    )  # what is under way then was sent since the first record
+    assert found.balance.relative <= 1e-3
+
+
+@pytest.mark.parametrize("ticks", [0, 1])
+def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
+    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
+    assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
+    assert found.growth.motion is EndBehaviour.UNDECIDED
+    assert not found.passed
+
+
+def test_two_records_are_a_period() -> None:
+    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < 2))
+    assert found.balance is not None
+    assert len(found.balance.t_s) == 2
+
+
+def test_nobody_moves_and_there_is_no_energy() -> None:
+    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by it."""
+    rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
+    found = runs.certified("paper", rest)
+    assert found.balance is not None
+    assert found.balance.V[0] == 0.0
+    assert found.balance.relative <= 1e-3
+    assert found.verdict.finding is StabilityFinding.COVERED
+
+
+def test_sites_of_different_rates_are_booked_together() -> None:
+    rates = {"sites.m2.rate_hz": 250, "sites.s.rate_hz": 350, "rate_hz": 500, "duration_s": 4.0}
+    found = runs.certified("asymmetric", rates)
+    assert found.balance is not None
+    assert len(found.balance.t_s) == pytest.approx(2000, abs=5)
+    assert found.balance.relative <= 2e-4
+    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE)
+
+
+def test_a_command_is_a_change_like_a_scripted_one() -> None:
+    found = certify(logs.busy().log)
+    assert found.balance is not None
+    assert found.balance.relative <= 5e-3
+    assert found.verdict.finding is not StabilityFinding.BROKEN
+
+
+def test_a_change_that_is_none_is_the_files_fault() -> None:
+    with pytest.raises(LogError, match="a command that is none"):
+        certify(
+            logs.rewritten(
+                logs.simulated("paper"),
+                change=lambda s: msgspec.structs.replace(s, cmd=["{}"] if s.tick == 5 else []),
+            )
+        )

@@ -1,0 +1,124 @@
+"""What a run does at its end, of signals whose answer is known."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.analysis import logs
+from trilat_net.analysis.run_end import EndBehaviour, classify_log_end
+from trilat_net.log.log_reader import Log
+
+
+@cache
+def still() -> Log:
+    return trilat_net.simulate("two_sites", {"duration_s": 12, "rate_hz": 50})
+
+
+def moving(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
+    """A log whose sites move like that."""
+
+    def changed(state):
+        t_s = state.t_ns * 1e-9
+        return logs.replaced(state, q=[e(t_s), 0.0], q_des=[0.0, 0.0], qd=[qd(t_s), 0.0])
+
+    return logs.rewritten(still(), change=changed)
+
+
+def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]:
+    return lambda t_s: amplitude * np.exp(rate_per_s * t_s) * np.sin(2 * np.pi * 1.5 * t_s)
+
+
+@pytest.mark.parametrize(
+    ("e", "qd", "motion", "says"),
+    [
+        (swing(-0.8), swing(-0.7), EndBehaviour.CONVERGED, "converged: |e| "),
+        (swing(-0.7), swing(-0.1), EndBehaviour.DECAYS, "decaying (|e| -0.7"),
+        (swing(-0.1), swing(-0.1), EndBehaviour.DECAYS, "|qd| -0.1"),
+        (swing(0.0), swing(0.0), EndBehaviour.BOUNDED, "bounded oscillation at 1.5"),
+        (swing(-0.8), swing(0.0), EndBehaviour.BOUNDED, "bounded oscillation at 1.5"),
+        (swing(0.0), swing(-0.02), EndBehaviour.BOUNDED, "Hz (|qd| -0.02"),
+        (swing(0.0), swing(-0.15), EndBehaviour.DECAYS, "decaying (|e| steady, |qd| -0.15"),
+        (swing(0.2), swing(0.2), EndBehaviour.GROWS, "growing (|e| +0.2"),
+        (swing(-0.3), swing(0.3), EndBehaviour.GROWS, "|qd| +0.3"),
+        (swing(0.2), swing(0.0), EndBehaviour.UNDECIDED, "|e| grows, |qd| steady"),
+        (lambda _: 0.2, swing(-0.8), EndBehaviour.CONVERGED, "at rest, and the sites do not agree"),
+        (lambda _: 0.1, lambda _: 0.4, EndBehaviour.BOUNDED, "bounded motion"),
+    ],
+)
+def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
+    found = classify_log_end(moving(e, qd))
+    assert found.motion is motion
+    assert says in found.text
+
+
+@pytest.mark.parametrize(
+    ("d", "motion"),
+    [(0.9, EndBehaviour.GROWS), (1.1, EndBehaviour.DECAYS)],
+    ids=["below the margin", "above it"],
+)
+def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> None:
+    """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
+    assert (
+        classify_log_end(trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 100})).motion is motion
+    )
+
+
+def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
+    """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
+    held = {"scheme": "digital", "link.delay_ms": 0.0}
+    slow = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
+    fast = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0}))
+    assert slow.motion is EndBehaviour.BOUNDED
+    assert slow.end.end_speed_rad_s > 0.5
+    assert fast.motion is EndBehaviour.DECAYS
+    assert fast.end.end_speed_rad_s < 0.1
+
+
+def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:
+    short, long = (
+        classify_log_end(trilat_net.simulate("contact", {"rate_hz": 200, "duration_s": s}))
+        for s in (15.0, 30.0)
+    )
+    assert short.motion is EndBehaviour.UNDECIDED
+    assert long.motion is EndBehaviour.BOUNDED
+    assert "bounded oscillation at 0.5 Hz" in long.text
+    near = classify_log_end(
+        trilat_net.simulate("contact", {"rate_hz": 200, "link.delay_ms": 20.0, "duration_s": 12.0})
+    )
+    assert near.text.startswith("at rest, and the sites do not agree")
+
+
+def test_a_site_without_records_leaves_it_undecided() -> None:
+    found = classify_log_end(
+        logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
+    )
+    assert found.motion is EndBehaviour.UNDECIDED
+    assert found.text == "undecided: no record of s"
+
+
+def test_only_times_of_which_all_sites_have_records_count() -> None:
+    torn = logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300))
+    assert classify_log_end(torn).motion is EndBehaviour.UNDECIDED
+
+
+def test_what_came_late_is_undecided() -> None:
+    found = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
+    assert found.motion is EndBehaviour.UNDECIDED
+    assert found.grows is None
+    assert "record longer" in found.text
+
+
+def test_a_short_run_is_undecided_and_a_stopped_one_diverged() -> None:
+    short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
+    assert classify_log_end(short).motion is EndBehaviour.UNDECIDED
+    stopped = classify_log_end(logs.diverged())
+    assert stopped.motion is EndBehaviour.DIVERGED
+    assert "passed its qd_limit_rad_s" in stopped.text
+
+
+def test_a_log_without_records_is_undecided() -> None:
+    empty = logs.rewritten(still(), lambda _: False)
+    assert classify_log_end(empty).motion is EndBehaviour.UNDECIDED

@@ -1,0 +1,130 @@
+"""What the report, a terminal and a program are told of a certificate."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.analysis import logs
+from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
+from trilat_net.log.log_reader import Log
+from trilat_net.reporting.certificate_section import build_certificate_section
+from trilat_net.reporting.certificate_text import CertificateMark, describe_certificate, list_energies
+from trilat_net.reporting.figures.certificate_energy import draw_functional
+from trilat_net.reporting.page import render_sections, write_section_figures
+
+from . import runs
+
+
+def jittered() -> Log:
+    return runs.log("free", {**runs.JITTER, "rate_hz": 100})
+
+
+LOGS = {
+    "free": lambda: runs.log("free", {"duration_s": 4.0, "rate_hz": 200}),
+    "jitter": jittered,
+    "rich": lambda: runs.log("rich"),
+    "four": lambda: logs.simulated("four"),
+    "p_d": lambda: runs.log("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}),
+    "empty": lambda: logs.rewritten(logs.simulated("paper"), lambda _: False),
+    "diverged": logs.diverged,
+    "busy": lambda: logs.busy().log,
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_facts_are_json_without_nan_and_say_what_the_verdict_says(name: str) -> None:
+    found = certify(LOGS[name]())
+    read = json.loads(json.dumps(certificate_to_json(found), allow_nan=False))
+    assert read["text"] == found.verdict.text
+    assert read["passed"] is found.passed
+    assert (read["functional"] is None) == (found.balance is None)
+    assert (read["rise"] is None) == (found.verdict.rise is None)
+    assert all(set(premise) == {"name", "holds", "text"} for premise in read["premises"])
+
+
+def test_the_numbers_add_up() -> None:
+    """V at the end is V at the start, less what was taken, plus what was given, to the residual."""
+    f = certificate_to_json(certify(LOGS["jitter"]()))["functional"]
+    end = f["v_first_j"] - sum(f["taken_j"].values()) + sum(f["given_j"].values())
+    assert end == pytest.approx(f["v_last_j"], abs=f["residual_max_j"])
+    assert sum(f["parts_last_j"].values()) == pytest.approx(f["v_last_j"])
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_figure_is_a_function_of_the_log(name: str) -> None:
+    log = LOGS[name]()
+    found = certify(log)
+    figure = draw_functional(log, found)
+    if found.balance is None:
+        assert [text.get_text() for text in figure.texts] == [found.verdict.text]
+        return
+    assert [axes.get_ylabel()[-3:] for axes in figure.axes] == ["(J)"] * 4
+    assert figure.axes[-1].get_xlabel() == "time (s)"
+    assert figure.axes[-1].get_yscale() == "log"
+    total = figure.axes[0].lines[0]
+    assert np.max(total.get_ydata()) == pytest.approx(found.balance.V.max())
+    marked = [p for p in figure.axes[0].patches if p.get_zorder() == 0.4]
+    assert len(marked) == (found.verdict.rise is not None)
+
+
+def test_the_page_shows_it_in_one_file_and_a_figure_beside_it(tmp_path: Path) -> None:
+    made = build_certificate_section(jittered())
+    html = render_sections([made])
+    assert "Was it stable, and why" in html
+    assert "<strong>outside the theorem (delays): V rose by" in html
+    assert "<td>V at 0 s</td>" in html
+    assert 'src="data:image/png;base64,' in html
+    assert write_section_figures([made], tmp_path) == [tmp_path / "certificate.png"]
+    assert made.facts["verdict"] == "rose"
+
+
+@pytest.mark.parametrize(
+    ("name", "marks"),
+    [
+        ("free", [CertificateMark.OK, CertificateMark.OK, CertificateMark.OK]),
+        ("jitter", [CertificateMark.OPEN, CertificateMark.OK, CertificateMark.OK]),
+        ("rich", [CertificateMark.OPEN, CertificateMark.OK, CertificateMark.OK, CertificateMark.NOTE]),
+        ("p_d", [CertificateMark.OPEN, CertificateMark.OPEN]),
+        ("diverged", [CertificateMark.OK, CertificateMark.FAIL, CertificateMark.OK]),
+    ],
+)
+def test_lines_give_verdict_growth_and_balance_and_pass_where_one_vouches_and_none_fails(
+    name: str, marks: list[CertificateMark]
+) -> None:
+    found = certify(LOGS[name]())
+    said = describe_certificate(found)
+    assert [line.mark for line in said] == marks
+    assert said[0].text == found.verdict.text
+    assert found.passed is (CertificateMark.OK in marks[:2] and CertificateMark.FAIL not in marks)
+
+
+def test_the_papers_weights_are_told_of_where_they_are_wrong_and_v_rises_with_them() -> None:
+    told = describe_certificate(runs.certified("free", runs.LYAPUNOV))[-1]
+    assert told.mark is CertificateMark.NOTE
+    assert told.text.startswith("with the paper's weights, ones, V would have risen by 12.3 J of 32.8")
+    assert runs.certified("free", {"duration_s": 4.0, "rate_hz": 200}).ones is None
+
+
+@pytest.mark.parametrize("name", ["jitter", "rich", "busy"])
+def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
+    found = certify(LOGS[name]())
+    assert found.balance is not None
+    (_, first), *between, (_, last) = list_energies(found.balance)
+    assert first + sum(amount for _, amount in between) == pytest.approx(last, abs=1e-5 * found.balance.scale)
+
+
+def test_many_links_are_one_entry() -> None:
+    found = certify(LOGS["four"]())
+    assert found.balance is not None
+    some = {f"a->{n}": np.ones_like(found.balance.V) for n in range(7)}
+    listed = list_energies(found.balance._replace(given={**found.balance.given, **some}))
+    assert [name for name, _ in listed if "->" in name] == []
+    assert any("links" in name for name, _ in listed)
+
+
+def test_no_energy_is_said() -> None:
+    rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
+    found = certify(runs.log("paper", rest))
+    assert describe_certificate(found)[-1].text == "energy balance: there is no energy in this run"

@@ -1,0 +1,177 @@
+"""The verdict: covered, outside and yet not risen, risen and by whom, and logs that do not add up."""
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+import trilat_net
+from tests.analysis import logs
+from trilat_net.analysis.certificate.stability_certificate import Certificate, StabilityFinding, certify
+from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.log.log_reader import Log
+from trilat_net.net.messages import State
+from trilat_net.scenario import load_scenario, parse_scenario
+
+from . import runs
+
+SHORT = {"duration_s": 4.0, "rate_hz": 200}
+
+
+def made(name: str = "free", **overrides: object) -> Log:
+    return runs.log(name, {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}})
+
+
+def test_free_motion_is_covered() -> None:
+    found = certify(made())
+    assert found.verdict.finding is StabilityFinding.COVERED
+    assert found.verdict.text.startswith("covered by the theorem: V did not rise: 29.78 J at 0 s, 12")
+    assert found.passed
+
+
+def test_hands_are_told_of_and_excused() -> None:
+    found = runs.certified("paper", {"duration_s": 11.5, "rate_hz": 100})
+    assert found.verdict.finding is StabilityFinding.COVERED
+    assert (
+        "covered by the theorem: V rose by no more than the hands gave: 24 J at 0 s, " in found.verdict.text
+    )
+
+
+def test_outside_and_yet_not_risen() -> None:
+    found = runs.certified("wall")
+    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert found.verdict.text.startswith(
+        "outside the theorem (hands), yet V rose by no more than the hands and walls gave: "
+    )
+    assert found.passed
+
+
+def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
+    found = runs.certified("free", runs.JITTER)
+    rise = found.verdict.rise
+    assert found.verdict.finding is StabilityFinding.ROSE
+    assert rise is not None
+    assert rise.amount > 10 * found.verdict.tolerance
+    assert sum(rise.causes.values()) >= rise.amount
+    assert all("->" in cause for cause in rise.causes)
+    share = 100.0 * rise.amount / found.balance.V.max()
+    assert f"V rose by {rise.amount:.3g} J ({share:.2g} % of its largest value) " in found.verdict.text
+    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
+
+
+def test_kd_of_different_shape_lets_v_rise_by_what_beta_does_not_cancel() -> None:
+    found = certify(made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1]))
+    assert found.verdict.finding is StabilityFinding.ROSE
+    assert found.verdict.rise is not None
+    assert list(found.verdict.rise.causes) == ["what beta does not cancel"]
+
+
+def test_a_slow_digital_loop_is_fed_by_sampling() -> None:
+    """T = 0 at 80 Hz: `digital` keeps swinging, and it is the hold that keeps it up."""
+    found = certify(made(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0))
+    assert found.verdict.finding is StabilityFinding.ROSE
+    assert found.verdict.rise is not None
+    assert next(iter(found.verdict.rise.causes)) == "sampling"
+    assert found.growth.motion is not EndBehaviour.CONVERGED
+
+
+def tampered(change: Callable[[State], State]) -> Certificate:
+    return certify(logs.rewritten(made(rate_hz=500, duration_s=2.0), change=change))
+
+
+@pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
+def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) -> None:
+    def change(state: State) -> State:
+        late = state.site == "m2" and state.tick >= 375
+        values = [1.05 * x for x in getattr(state, field)]
+        return msgspec.structs.replace(state, **{field: values}) if late else state
+
+    found = tampered(change)
+    assert found.verdict.finding is StabilityFinding.BROKEN
+    assert not found.passed
+    assert "were not made by the equations that the log claims" in found.verdict.text
+
+
+def test_a_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
+    log = runs.log("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500})
+    late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
+    found = certify(
+        logs.rewritten(log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s)
+    )
+    assert found.verdict.finding is StabilityFinding.BROKEN
+
+
+def test_hands_that_were_erased_break_the_balance() -> None:
+    log = runs.log("paper", {"duration_s": 11.5, "rate_hz": 100})
+    found = certify(logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0])))
+    assert found.verdict.finding is StabilityFinding.BROKEN
+    assert "the energy of m1 does not add up" in found.verdict.text
+
+
+FOUR = """
+name = "pairs"
+rate_hz = 100
+duration_s = 2.0
+[link]
+delay_ms = 50.0
+[sites.a]
+role = "master"
+q0_rad = [0.3, 0.0]
+[sites.b]
+role = "slave"
+[sites.c]
+role = "master"
+[sites.d]
+role = "slave"
+q0_rad = [0.1, 0.2]
+[dominance]
+a = { b = 1.0 }
+b = { a = 1.0 }
+c = { d = 1.0 }
+d = { c = 1.0 }
+"""
+
+
+def test_two_closed_groups_are_refused_and_named() -> None:
+    found = certify(trilat_net.simulate(parse_scenario(FOUR)))
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert "{a, b} and {c, d} follow nobody outside: beta is not unique" in found.verdict.text
+    assert found.groups == (("a", "b"), ("c", "d"))
+    assert found.balance is None
+
+
+def test_groups_that_only_a_change_makes_are_refused_too() -> None:
+    joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
+    step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
+    assert certify(trilat_net.simulate(parse_scenario(joined))).balance is not None
+    found = certify(trilat_net.simulate(parse_scenario(joined + step)))
+    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+
+
+EXPERT = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
+"""m1 and s follow each other, and m2 follows both."""
+
+
+def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
+    """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
+    found = certify(trilat_net.simulate(load_scenario("free", {**SHORT, **EXPERT, "duration_s": 1.0})))
+    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert found.growth.grows is None
+    assert found.passed
+
+
+def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
+    hand = {"sites.m2.hands": [{"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}]}
+    found = certify(
+        trilat_net.simulate(load_scenario("free", {**SHORT, **EXPERT, **hand, "duration_s": 1.0}))
+    )
+    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert not found.bounded_by_v
+    assert not found.passed
+
+
+def test_growth_fails_a_run_whatever_v_did() -> None:
+    found = runs.certified("wall")
+    grown = found.growth._replace(end=found.growth.end._replace(motion=EndBehaviour.GROWS))
+    assert found.passed
+    assert not found._replace(growth=grown).passed

@@ -1,0 +1,170 @@
+"""Jumps are exact: what is booked is the difference of V before and after, found by computing V twice."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
+from trilat_net.analysis.certificate import energy_terms
+from trilat_net.analysis.certificate.energy_terms import SiteConstants, evaluate_functional, split_periods
+from trilat_net.analysis.dominance_history import DominanceHistory
+from trilat_net.analysis.torque_split import split_torque
+
+from . import runs
+
+ROWS = 40
+NOW = 30
+RATE_HZ = 100
+EQ = SiteConstants(
+    theta=np.array([3.0, 1.0, 1.0, 2.0, 1.0]),
+    g=9.81,
+    Lambda=np.array([1.0, 2.5]),
+    Kp=np.array([0.5, 2.0]),
+    Kd=np.array([3.0, 0.7]),
+    Gamma=np.ones(5),
+    low=np.full(5, -np.inf),
+    high=np.full(5, np.inf),
+    tau_limit=50.0,
+)
+
+
+def moving(
+    random: np.random.Generator, site: str, used: dict[str, np.ndarray], rows: int, first: int
+) -> AlignedRecords:
+    vectors = [random.normal(size=(rows, 2)) for _ in range(6)]
+    yes = np.ones(rows, dtype=np.bool_)
+    return AlignedRecords(site, RATE_HZ, first, yes, yes, *vectors, random.normal(size=(rows, 5)), used)
+
+
+class Situation:
+    """A site at two ticks, and its peers all the time before; which samples are in use is chosen."""
+
+    def __init__(self, seed: int, before: tuple[int, int], after: tuple[int, int]) -> None:
+        random = np.random.default_rng(seed)
+        self.peers = [moving(random, name, {}, ROWS, 0) for name in ("a", "b")]
+        self.alpha = random.dirichlet([1.0, 1.0])
+        used = {
+            name: np.array(pair)
+            for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
+        }
+        self.track = moving(random, "s", used, 2, NOW)
+        self.views = [view_delayed_peer(self.track, peer, PeerTrajectory(peer)) for peer in self.peers]
+        self.track.q_des[:] = sum(a * v.seen.q for a, v in zip(self.alpha, self.views, strict=True))
+        alpha = np.tile(self.alpha, (2, 1))
+        self.shares = DominanceHistory(alpha, np.zeros((2, 2)), alpha[:1])
+
+    def v(self, row: int) -> float:
+        return float(evaluate_functional(self.track, EQ, self.shares, self.views).total[row])
+
+    def booked(self) -> list[float]:
+        ends = split_periods(self.track, EQ, self.shares, self.views)
+        links = enumerate(self.views)
+        return [
+            float(energy_terms.link_work(self.track, EQ, self.shares, ends, j, one).total[0])
+            for j, one in links
+        ]
+
+
+ticks = st.integers(1, NOW - 2)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
+def test_the_work_of_links_is_what_their_jumps_change_in_v(
+    seed: int, before: tuple[int, int], after: tuple[int, int]
+) -> None:
+    """Against the same instant with samples in use that are as old as those before: m + 1 in place of m'."""
+    jumped = Situation(seed, before, after)
+    kept = Situation(seed, before, (before[0] + 1, before[1] + 1))
+    change = jumped.v(1) - kept.v(1)
+    assert sum(jumped.booked()) == pytest.approx(change, rel=1e-9, abs=1e-9)
+    assert kept.booked() == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
+def test_the_right_end_of_a_period_is_where_the_ages_stayed_as_they_were(
+    seed: int, before: tuple[int, int], after: tuple[int, int]
+) -> None:
+    site = Situation(seed, before, after)
+    ends = split_periods(site.track, EQ, site.shares, site.views)
+    kept = sum(a * p.q[m + 1] for a, p, m in zip(site.alpha, site.peers, before, strict=True))
+    q, qd = site.track.q[1], site.track.qd[1]
+    right, jumped = qd + EQ.Lambda * (q - kept), qd + EQ.Lambda * (q - site.track.q_des[1])
+    assert ends.r_right[0] == pytest.approx(right)
+    assert ends.r_middle[0] == pytest.approx(0.5 * (right + jumped))
+    assert ends.qd_des_right[0] == pytest.approx(
+        sum(a * p.qd[m + 1] for a, p, m in zip(site.alpha, site.peers, before, strict=True))
+    )
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_held_torque_works_with_its_value_at_the_beginning(seed: int) -> None:
+    site = Situation(seed, (5, 9), (6, 10))
+    ends = split_periods(site.track, EQ, site.shares, site.views)
+    now, held = np.random.default_rng(seed).normal(size=(2, 2, 2))
+    booked = energy_terms.torque_work(site.track, ends, now, held)
+    left, right = ends.r_left[0] @ (now[0] + held[0]), ends.r_right[0] @ (now[1] + held[0])
+    assert float(booked.total[0]) == pytest.approx(0.5 / RATE_HZ * (left + right))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
+def test_the_work_of_a_step_of_shares_is_what_it_changes_in_v(seed: int, share: float) -> None:
+    stepped, kept = (Situation(seed, (5, 9), (6, 10)) for _ in range(2))
+    after = np.array([share, 1.0 - share])
+    stepped.shares.alpha[1] = after
+    stepped.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(after, stepped.views, strict=True))
+    ends = split_periods(stepped.track, EQ, stepped.shares, stepped.views)
+    amount = energy_terms.dominance_change_work(stepped.track, EQ, stepped.shares, ends, stepped.views).total[
+        0
+    ]
+    assert float(amount) == pytest.approx(stepped.v(1) - kept.v(1), rel=1e-9, abs=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: int) -> None:
+    """a_ij T' [ 1/2 |qd_jd|^2_Kd + (Lambda Kd e_i + Lambda M r_i)' qd_jd ], of an age that grows slowly."""
+    site = Situation(seed, (5, 9), (6, 10))
+    peer = site.peers[0]
+    t_s, speed = np.arange(ROWS) / RATE_HZ, np.array([0.3, -0.2])
+    peer.qd[:], peer.q[:] = speed, speed * t_s[:, np.newaxis]
+    peer = peer._replace(rate_hz=RATE_HZ)
+    grown_s = 1e-6
+    one = view_delayed_peer(site.track, peer, PeerTrajectory(peer))
+    later = PeerTrajectory(peer).at(one.stamp_s - np.array([0.0, grown_s]))
+    views = [one._replace(seen=later), site.views[1]]
+    site.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(site.alpha, views, strict=True))
+    ends = split_periods(site.track, EQ, site.shares, views)
+    booked = float(energy_terms.link_work(site.track, EQ, site.shares, ends, 0, views[0]).total[0])
+    e, qd, q = site.track.e[1], site.track.qd[1], site.track.q[1]
+    r = qd + EQ.Lambda * e
+    c2 = np.cos(q[1])
+    M = np.array([[3 + 2 * c2, 1 + c2], [1 + c2, 1.0]])
+    missing = 0.5 * EQ.Kd @ speed**2 + (EQ.Lambda * EQ.Kd * e + EQ.Lambda * (M @ r)) @ speed
+    assert booked == pytest.approx(float(site.alpha[0] * grown_s * missing), rel=1e-4, abs=1e-11)
+
+
+def test_hands_and_walls_are_told_apart_and_are_all_that_pushes() -> None:
+    log = runs.log("rich")
+    for name, book in runs.booked("rich").items():
+        torque = split_torque(book.track, log.scenario.sites[name])
+        total = torque.hands + torque.hands_held + torque.walls + torque.walls_held
+        assert total == pytest.approx(-book.track.tau_x, abs=1e-12)
+        assert (name == "s") == bool(torque.walls.any())
+        assert (name == "m1") == bool(np.abs(torque.hands_held).max() > 1e-9)
+        assert (name == "m2") == bool(np.abs(torque.hands).max() > 1e-9)
+
+
+def test_a_box_that_holds_the_truth_only_takes() -> None:
+    given_by_box = runs.balanced("rich").given["estimates"]
+    assert given_by_box[-1] < -0.1
+    assert np.diff(given_by_box).max() <= 1e-12
+
+
+def test_the_torque_limit_counts_where_it_cuts() -> None:
+    book = runs.booked("rich")["s"]
+    cut = (np.abs(book.track.tau) >= book.eq.tau_limit).any(axis=1)
+    booked = book.given["torque limit"]
+    assert cut.any()
+    assert np.array_equal(booked.left != 0.0, cut[:-1])
+    assert np.array_equal(booked.right != 0.0, cut[1:])

@@ -1,0 +1,95 @@
+"""Walls: what they are met with, in closed form and as a scenario's figures say."""
+
+import math
+
+import pytest
+
+from tests.analysis.logs import rewritten
+from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.wall_contact import find_wall_contact, list_walls
+from trilat_net.core.two_link_arm import JOINTS
+
+from .written import pair, simulated
+
+WALL = """
+[[sites.s.environment]]
+kind = "wall"
+point_m = [1.9, 0.0]
+normal = [-1.0, 0.0]
+stiffness_n_m = 1000.0
+damping_n_s_m = 20.0
+"""
+
+
+def swinging(_: str, t_s: float) -> dict[str, list[float]]:
+    """The stretched arm turns through the horizontal: its tip is at 2 cos q."""
+    angle = 0.5 * math.cos(2.0 * math.pi * t_s)
+    return {"q": [angle, 0.0], "qd": [-math.pi * math.sin(2.0 * math.pi * t_s), 0.0]}
+
+
+def test_force_depth_and_hits_of_a_swing() -> None:
+    """2 cos q > 1.9 m twice a period; K depth - B outward speed, never pulling."""
+    log = pair(swinging, more=WALL)
+    found = compute_log_metrics(log).walls["s/1"]
+    force = []
+    for t_s in log["s"].t_s.tolist():
+        pose = swinging("s", t_s)
+        depth, inward = 2.0 * math.cos(pose["q"][0]) - 1.9, -2.0 * math.sin(pose["q"][0]) * pose["qd"][0]
+        force.append(max(0.0, 1000.0 * depth + 20.0 * inward) if depth > 0.0 else 0.0)
+    mean = sum(force) / len(force)
+    assert found["force_mean_n"].value == pytest.approx(mean, rel=1e-9)
+    deviation = math.sqrt(sum((one - mean) ** 2 for one in force) / len(force))
+    assert found["force_deviation_n"].value == pytest.approx(deviation, rel=1e-9)
+    assert found["force_peak_n"].value == pytest.approx(max(force), rel=1e-9)
+    assert found["depth_max_m"].value == pytest.approx(0.1, rel=1e-4)
+    assert found["hits"].value == 8.0
+    assert found["contact_share"].value == pytest.approx(sum(one > 0.0 for one in force) / len(force))
+
+
+def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
+    found = compute_log_metrics(
+        pair(lambda _, __: {"q": [0.0] * JOINTS, "qd": [0.0] * JOINTS}, more=WALL)
+    ).walls["s/1"]
+    assert found["hits"].value == 0.0
+    assert found["contact_share"].value == 1.0
+    assert found["end_force_mean_n"].value == pytest.approx(100.0)
+
+
+def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
+    """Nobody knows since when it touches; and no number comes from records that are not there."""
+    whole = pair(swinging, more=WALL)
+    torn = rewritten(whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140))
+    before, after = (compute_log_metrics(log).walls["s/1"]["hits"].value for log in (whole, torn))
+    assert (before, after) == (8.0, 4.0)
+
+
+def test_contact_as_scenarios_tell_of_it() -> None:
+    """20 ms: one hit, then 3.3 N."""
+    found = compute_log_metrics(
+        simulated("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 500})
+    ).walls["s/1"]
+    assert found["hits"].value == 1.0
+    assert found["end_force_mean_n"].value == pytest.approx(3.3, abs=0.05)
+    assert found["end_force_deviation_n"].value < 0.01
+
+
+def test_contact_at_200_ms_hammers() -> None:
+    """8 +- 14 N, peak 52 N."""
+    found = compute_log_metrics(simulated("contact")).walls["s/1"]
+    assert found["force_peak_n"].value == pytest.approx(52.0, abs=0.5)
+    assert found["end_force_mean_n"].value == pytest.approx(8.0, rel=0.15)
+    assert found["end_force_deviation_n"].value == pytest.approx(14.0, rel=0.05)
+    assert found["end_hits"].value >= 2.0
+
+
+def test_the_force_of_windup_creeps() -> None:
+    """4.3 and 8.5 N at 10 and 20 s."""
+    log = simulated("windup", {"duration_s": 20.0, "rate_hz": 250})
+    spec, track = log.scenario.sites["s"], align_records(log)["s"]
+    how = find_wall_contact(
+        list_walls(spec)[0], track, compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
+    )
+    assert how.force[250 * 10] == pytest.approx(4.3, abs=0.05)
+    assert how.force[-1] == pytest.approx(8.5, abs=0.1)

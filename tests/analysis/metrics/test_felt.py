@@ -1,0 +1,127 @@
+"""Ratios over frequency: decided where they are driven, undecided elsewhere, never the hand's own."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from trilat_net.analysis.metrics.impedance import ResponseSignals, estimate_response
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+
+from .written import simulated
+
+RATE_HZ = 200
+EVERYTHING = np.ones(60 * RATE_HZ, dtype=np.bool_)
+
+
+def noise(seed: int) -> np.ndarray:
+    white = np.random.default_rng(seed).normal(size=len(EVERYTHING))
+    b, a = signal.butter(2, 4.0, fs=RATE_HZ)
+    return signal.lfilter(b, a, white)
+
+
+def test_a_filter_is_found_again() -> None:
+    """Gain and phase of a known system, by SciPy's freqz."""
+    b, a = signal.butter(1, 3.0, fs=RATE_HZ)
+    x = noise(1)
+    found = estimate_response(ResponseSignals(x, x, signal.lfilter(b, a, x), EVERYTHING), RATE_HZ, 1e-3)
+    _, H = signal.freqz(b, a, worN=[found.frequency_hz], fs=RATE_HZ)
+    assert found.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * found.error))
+    assert found.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
+    assert found.coherence > 0.95
+
+
+def test_what_does_not_belong_together_is_undecided() -> None:
+    x = noise(1)
+    found = estimate_response(ResponseSignals(x, x, noise(2), EVERYTHING), RATE_HZ, 1e-3)
+    assert found.gain is None
+    assert "the coherence" in found.why
+
+
+def test_one_push_is_not_enough() -> None:
+    """A single event is coherent with anything."""
+    x = np.where(np.abs(np.arange(len(EVERYTHING)) - 2000) < 100, 1.0, 0.0)
+    found = estimate_response(ResponseSignals(x, x, 3.0 * x, EVERYTHING), RATE_HZ, 1e-3)
+    assert found.gain is None
+    assert "stretches of 4 s" in found.why
+
+
+def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
+    x = noise(1)
+    assert (
+        estimate_response(ResponseSignals(0.0 * x, x, x, EVERYTHING), RATE_HZ, 1e-3).why
+        == "nothing drives it"
+    )
+    gaps = EVERYTHING.copy()
+    gaps[::700] = False
+    assert "no 4 s are recorded" in estimate_response(ResponseSignals(x, x, x, gaps), RATE_HZ, 1e-3).why
+
+
+def test_in_a_closed_loop_the_one_who_drives_tells_whose_impedance_it_is() -> None:
+    """A spring k held against a damper b that others shake: torque / speed is b + noise's, not -k/s.
+
+    The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x the ratio is b;
+    the plain ratio of the two, without the drive, is far off.
+    """
+    k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
+    x, push = noise(3), 2.0 * noise(4)
+    q, torque, speed = 0.0, np.zeros(len(x)), np.zeros(len(x))
+    for n in range(len(x)):
+        torque[n] = k * (x[n] - q)
+        speed[n] = (torque[n] + push[n]) / b
+        q += h * speed[n]
+    plain = estimate_response(ResponseSignals(speed, speed, torque, EVERYTHING), RATE_HZ, 1e-6)
+    assert plain.gain is None or abs(plain.gain - b) > 0.2 * b
+    driven = estimate_response(ResponseSignals(x, speed, torque, EVERYTHING), RATE_HZ, 1e-6)
+    assert driven.gain is None  # half of what moves is not the hand's
+    calm = noise(3)
+    q = 0.0
+    for n in range(len(x)):
+        torque[n] = k * (calm[n] - q)
+        speed[n] = torque[n] / b
+        q += h * speed[n]
+    alone = estimate_response(ResponseSignals(calm, speed, torque, EVERYTHING), RATE_HZ, 1e-6)
+    assert alone.gain == pytest.approx(b, rel=1e-6)
+
+
+def shaken() -> dict[str, object]:
+    points = [[0.02 * n, 0.4 * math.sin(2.0 * math.pi * 0.02 * n), 0.0] for n in range(1501)]
+    return {
+        "control.law": "p_d",
+        "control.K": 20.0,
+        "control.d": 10.0,
+        "arm.g_m_s2": 0.0,
+        "link.delay_ms": 100.0,
+        "rate_hz": 200,
+        "duration_s": 30.0,
+        "sites.m.q0_rad": [0.3, 1.2],
+        "sites.s.q0_rad": [0.3, 1.2],
+        "sites.m.hands": [{"kind": "recorded", "points": points}],
+    }
+
+
+def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
+    """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
+    log = simulated("two_sites", shaken())
+    (found,) = (
+        one for one in compute_log_metrics(log).felt if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+    )
+    assert found.ratio.frequency_hz == 1.0
+    s = 2j * math.pi
+    c2 = math.cos(float(log["m"].q[:, 1].mean()))
+    M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
+    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
+    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    Z = 1.0 / (s * q[0])
+    assert found.ratio.gain == pytest.approx(abs(Z), rel=0.02)
+    assert found.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
+
+
+def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
+    """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
+    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).felt
+    for one in found:
+        if one.kind == "impedance":
+            assert one.ratio.gain is None

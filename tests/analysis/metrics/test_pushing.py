@@ -1,0 +1,75 @@
+"""What hands and environments do, over all rows, is what the integrator's own functions do at each."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.analysis.certificate import runs
+from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.torque_sources import compute_source_torque
+from trilat_net.analysis.torque_split import attribute_torque, compute_operator_script
+from trilat_net.core import exogenous
+from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_source_rows
+
+real = st.floats(-2.0, 2.0)
+pairs = st.tuples(real, real)
+gains = st.tuples(st.floats(0.0, 500.0), st.floats(0.0, 500.0))
+
+
+@st.composite
+def actors(draw: st.DrawFn) -> TorqueSource:
+    acts = draw(st.sampled_from([TorqueKind.HAND, TorqueKind.TASK_HAND, TorqueKind.VISCOUS, TorqueKind.WALL]))
+    start, move = draw(st.floats(0.0, 2.0)), draw(st.floats(0.0, 2.0))
+    angle = draw(st.floats(0.0, 6.3))
+    after = (float(np.cos(angle)), float(np.sin(angle))) if acts is TorqueKind.WALL else draw(pairs)
+    ends = (start, start + draw(st.floats(0.1, 2.0)), move, move + draw(st.sampled_from([0.0, 0.5, 1.5])))
+    return TorqueSource(acts, *ends, draw(pairs), after, draw(gains), draw(gains))
+
+
+@settings(max_examples=60, deadline=None)
+@given(actors(), st.lists(st.tuples(st.floats(0.0, 4.0), pairs, pairs), min_size=1, max_size=5))
+def test_every_actor_does_what_the_core_says(
+    actor: TorqueSource, states: list[tuple[float, tuple, tuple]]
+) -> None:
+    lengths = (0.8, 0.6)
+    t_s = np.array([state[0] for state in states])
+    q, qd = (np.array([state[n] for state in states]) for n in (1, 2))
+    rows, table = torque_source_rows((actor,))
+    expected = np.zeros_like(q)
+    for n in range(len(states)):
+        expected[n] = exogenous.source_torque(float(t_s[n]), q[n], qd[n], lengths, rows[0], table)
+    found = compute_source_torque(actor, t_s, q, qd, compute_end_effector(lengths, q, qd))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_hands_and_environment_are_told_apart_and_make_up_the_record() -> None:
+    log = runs.log("rich")
+    for site, track in align_records(log).items():
+        spec = log.scenario.sites[site]
+        by = attribute_torque(track, spec)
+        np.testing.assert_allclose(by.by_hand + by.by_wall, -track.tau_x, atol=1e-9)
+        assert by.by_hand.any() == bool(spec.hands)
+        assert by.by_wall.any() == bool(spec.environment)
+        assert by.script is not None  # every hand did what the scenario says
+
+
+def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
+    log = runs.log("rich")
+    track = align_records(log)["m2"]
+    other = track._replace(tau_x=track.tau_x + 0.1)
+    assert attribute_torque(other, log.scenario.sites["m2"]).script is None
+
+
+@pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])
+def test_a_script_is_the_torque_at_a_pose_that_does_not_move_but_for_a_constant(acts: TorqueKind) -> None:
+    actor = TorqueSource(acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0))
+    t_s = np.linspace(0.0, 4.0, 41)
+    still = np.tile([0.3, 1.1], (len(t_s), 1))
+    tip = compute_end_effector((1.0, 1.0), still, 0.0 * still)
+    torque, script = (
+        compute_source_torque(actor, t_s, still, 0.0 * still, tip),
+        compute_operator_script(actor, t_s, tip.J[0]),
+    )
+    np.testing.assert_allclose(script - script[0], torque - torque[0], atol=1e-12)

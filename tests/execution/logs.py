@@ -1,0 +1,50 @@
+"""Logs to ask what if of, and what a rerun of them says of each tick."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tests.log_editing import edited, opened, recorded
+from trilat_net.execution import virtual
+from trilat_net.execution.rerun import Rerun
+from trilat_net.log.log_reader import Log
+from trilat_net.net.messages import STATE_VECTORS, State
+from trilat_net.scenario import load_scenario
+
+SITES = ("m1", "m2", "s")
+TICKS = 120
+
+
+def numbers(state: State) -> list[list[float]]:
+    """All that a step computes of a tick but which samples came to it."""
+    return [*(getattr(state, field) for field in STATE_VECTORS), list(state.used.values()), state.mem]
+
+
+def motion(log: Log, site: str) -> list[tuple[int, str, list[list[float]]]]:
+    """Every tick of a site with its mode and numbers."""
+    return [(state.tick, state.mode, numbers(state)) for state in log[site].states]
+
+
+def simulated(name: str, overrides: Mapping[str, Any]) -> Log:
+    """A virtual run, by the plain driver."""
+    stream = io.BytesIO()
+    virtual.write_virtual_log(load_scenario(name, overrides), stream)
+    stream.seek(0)
+    return opened(stream.getvalue())
+
+
+def without_records(lost: Mapping[str, Sequence[int]], data: bytes | None = None) -> Log:
+    """A short log that lacks some records."""
+
+    def record(r: dict[str, Any]) -> dict[str, Any] | None:
+        return None if r["tick"] in lost.get(r["site"], ()) else r
+
+    return opened(edited(recorded("paper") if data is None else data, record=record))
+
+
+def all_identical(again: Rerun) -> bool:
+    """True where every record of every site that was executed has the bits of the log."""
+    return all(
+        effect.identical == effect.executed == len(again.before[name]) and effect.first is None
+        for name, effect in again.sites.items()
+    )

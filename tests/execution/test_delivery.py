@@ -1,0 +1,144 @@
+"""What came to a site, by its records; where there is none, what must have come."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.core.ticks import Arrival, Mode, TickRecord
+from trilat_net.errors import LogError
+from trilat_net.execution.virtual_network import (
+    Deliveries,
+    PeerTicks,
+    complete_deliveries,
+    recorded_deliveries,
+    retime_deliveries,
+)
+from trilat_net.log.site_log import SiteLog
+from trilat_net.net.wire import encode_state
+
+TICKS = 120
+PEERS = ("m1", "m2")
+SENDERS = [PeerTicks(1000, TICKS - 1)] * 2
+
+Sample = tuple[int, int]
+"""Index of the peer, tick of the sample."""
+Way = dict[Sample, int | None]
+"""How many ticks a sample is under way; None: it never comes."""
+
+delays = st.dictionaries(st.tuples(st.integers(0, 1), st.integers(0, 110)), st.integers(1, 12), max_size=60)
+lost_ticks = st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50)
+
+
+def steady(ticks: int = 1) -> Way:
+    """Every sample comes after so many ticks."""
+    return {(peer, tick): ticks for peer in (0, 1) for tick in range(TICKS)}
+
+
+def in_order(under_way: Way) -> Way:
+    """Holds each sample back until those of the same peer before it have come."""
+    held: Way = {}
+    for peer in (0, 1):
+        arrives = 0
+        for tick in range(TICKS):
+            arrives = max(arrives, tick + (under_way.get((peer, tick)) or 1))
+            held[peer, tick] = arrives - tick
+    return held
+
+
+def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
+    """The records of a site at 1 kHz, but for the ones that are lost."""
+    at: dict[int, list[Arrival]] = {}
+    for (peer, tick), ticks in way.items():
+        if ticks is not None:
+            at.setdefault(tick + ticks, []).append(Arrival(peer, tick, (), (), 1000 * ticks))
+    two, five = [0.0] * 2, [0.0] * 5
+    payloads = [
+        encode_state(
+            "s",
+            1,
+            PEERS,
+            TickRecord(k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []),
+            at.get(k, []),
+            0,
+            0,
+        )
+        for k in range(TICKS)
+        if k not in lost
+    ]
+    return SiteLog("s", PEERS, 1000, payloads, "a test")
+
+
+def entries(came: Deliveries) -> set[Sample]:
+    """Every sample that comes, at any tick."""
+    return {(entry[0], entry[1]) for at in came.at.values() for entry in at}
+
+
+def test_of_a_whole_log_it_is_what_the_records_list() -> None:
+    part = short(steady(3))
+    came = complete_deliveries(part, SENDERS)
+    assert came == recorded_deliveries(part)
+    assert came.at == {state.tick: state.rx for state in part.states}
+    assert (came.first, came.last, came.unrecorded) == (0, TICKS - 1, frozenset())
+
+
+@given(lost=lost_ticks, ticks=st.integers(1, 9))
+def test_on_a_steady_network_what_is_missing_is_found_at_its_own_ticks(lost: set[int], ticks: int) -> None:
+    whole, came = short(steady(ticks)), complete_deliveries(short(steady(ticks), lost), SENDERS)
+    assert came.unrecorded == lost
+    pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.at.items() if at}
+    assert pairs == {state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx}
+
+
+@given(under_way=delays, lost=lost_ticks)
+def test_on_any_network_every_sample_that_came_is_there_once_and_no_record_is_touched(
+    under_way: Way, lost: set[int]
+) -> None:
+    """In order, of samples older than the newest that a record lists: of later ones nobody knows."""
+    whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
+    came = complete_deliveries(gapped, SENDERS)
+    for state in gapped.states:
+        assert came.at[state.tick] == state.rx
+    assert sum(map(len, came.at.values())) == len(entries(came))
+    listed = entries(recorded_deliveries(gapped))
+    newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
+    assert {s for s in entries(came) if s[1] <= newest[s[0]]} == {
+        s for s in entries(recorded_deliveries(whole)) if s[1] <= newest[s[0]]
+    }
+    assert all(k > tick for k, at in came.at.items() for _, tick, _ in at)
+
+
+def test_what_never_came_does_not_come() -> None:
+    """Sample 50 was lost, far from any gap."""
+    came = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), SENDERS)
+    assert (0, 50) not in entries(came)
+    assert {(1, 50), (0, 20), (0, 79)} <= entries(came)
+
+
+def test_fewer_than_half_of_the_records_are_too_few() -> None:
+    with pytest.raises(LogError, match="s has records of 59 of 120 ticks"):
+        complete_deliveries(short(steady(), set(range(10, 71))), SENDERS)
+
+
+rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
+
+
+@given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
+def test_at_other_rates_every_sample_is_under_way_for_as_long(
+    ticks: int, rate_hz: int, peer_rate_hz: int
+) -> None:
+    came = recorded_deliveries(short(steady(ticks)))
+    there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
+    assert there.last == 119 * rate_hz // 1000
+    first = [(k, m) for k in sorted(there.at) for peer, m, _ in there.at[k] if peer == 0]
+    assert first
+    assert [m for _, m in first] == list(range(len(first)))
+    for k, m in first:
+        way_s = k / rate_hz - m / peer_rate_hz
+        assert ticks * 1e-3 - 1e-6 <= way_s <= ticks * 1e-3 + 1 / rate_hz
+
+
+def test_at_other_rates_what_never_came_does_not_come() -> None:
+    came = recorded_deliveries(short({**steady(), (0, 50): None}))
+    doubled = retime_deliveries(came, 1000, 1000, [1000, 1000], [2000, 1000])
+    assert not {(0, 100), (0, 101)} & entries(doubled)
+    assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)

@@ -1,0 +1,165 @@
+"""The fused driver is the per-tick driver, bit for bit; what is reduced is reduced from the same records."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
+from trilat_net.errors import ScenarioError
+from trilat_net.execution import virtual
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import Scenario, list_shipped, load_scenario
+
+Array = NDArray[np.float64]
+
+LINKS: tuple[dict[str, Any], ...] = (
+    {"link.delay_ms": 0.0},
+    {"link.delay_ms": 33.3},
+    {"link.delay_ms": 150.0},
+    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0, "link.loss": 0.3},
+    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0, "link.order": "in_order"},
+    {"link.model": "normal", "link.delay_ms": 30.0, "link.deviation_ms": 20.0, "link.playout_ms": 60.0},
+    {"link.model": "sine", "link.delay_ms": 50.0, "link.amplitude_ms": 50.0, "link.period_s": 0.3},
+    {"link.preset": "4g", "link.duplicate": 0.2},
+)
+
+
+def floats(output: TickRecord) -> list[float]:
+    o = output
+    return [*o.q, *o.qd, *o.q_des, *o.qd_des, *o.tau, *o.tau_x, *o.theta_hat]
+
+
+def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
+    ran: dict[str, list[TickRecord]] = {name: [] for name in scenario.names}
+    for site, _, output in virtual.execute_virtual(scenario):
+        ran[site.name].append(output)
+    return ran
+
+
+def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
+    """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
+    found = np.full((len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0)
+    for k, output in enumerate(outputs):
+        error = max(abs(a - b) for a, b in zip(output.q, output.q_des, strict=True))
+        speed = max(map(abs, output.qd))
+        n = k * BUCKETS_PER_S // rate_hz
+        found[n] = np.maximum(found[n], (error, speed))
+    return found
+
+
+def agree(scenario: Scenario) -> None:
+    expected = per_tick(scenario)
+    fused = FusedRun(scenario)
+    fused.advance(scenario.duration_s)
+    last = np.array([floats(outputs[-1]) for outputs in expected.values()])
+    np.testing.assert_array_equal(fused.records, last)
+    for found, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
+        np.testing.assert_array_equal(found, buckets(outputs, scenario.sites[name].rate_hz))
+    stops = [o.t_ns * 1e-9 for outputs in expected.values() for o in outputs if o.mode is Mode.DIVERGED]
+    assert fused.diverged_s == (pytest.approx(min(stops)) if stops else None)
+
+
+@pytest.mark.parametrize("name", list_shipped())
+def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
+    scenario = load_scenario(name)
+    agree(load_scenario(name, {"duration_s": min(scenario.duration_s, 4.0)}))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    name=st.sampled_from(["free", "paper", "p_d_margin", "asymmetric", "windup"]),
+    scheme=st.sampled_from(["second_order", "digital"]),
+    link=st.sampled_from(LINKS),
+    rates=st.tuples(*[st.sampled_from([7, 100, 333, 1000])] * 3),
+    seed=st.integers(0, 9),
+)
+def test_whatever_the_links_the_rates_and_the_scheme(
+    name: str, scheme: str, link: Mapping[str, Any], rates: tuple[int, ...], seed: int
+) -> None:
+    changes = {f"sites.{site}.rate_hz": rate for site, rate in zip(("m1", "m2", "s"), rates, strict=True)}
+    run = {"duration_s": 0.4, "seed": seed, "scheme": scheme}
+    agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
+
+
+def test_a_run_that_diverges_ends_with_the_ticks_of_that_instant() -> None:
+    scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
+    agree(scenario)
+    fused = FusedRun(scenario)
+    fused.advance(1.0)
+    assert fused.diverged_s is not None
+    before = fused.records
+    fused.advance(3.0)
+    np.testing.assert_array_equal(fused.records, before)
+
+
+@settings(max_examples=20, deadline=None)
+@given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
+def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
+    scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
+    whole, parts = FusedRun(scenario), FusedRun(scenario)
+    whole.advance(1.0)
+    for until_s in sorted(stops):
+        parts.advance(until_s)
+    parts.advance(1.0)
+    np.testing.assert_array_equal(parts.records, whole.records)
+    np.testing.assert_array_equal(np.array(parts.maxima), np.array(whole.maxima))
+    assert parts.settled_s == whole.settled_s
+
+
+def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
+    scenario = load_scenario("free", {"duration_s": 13.0})
+    fused = FusedRun(scenario, apart_rad=0.01)
+    fused.advance(13.0)
+    apart = [
+        output.t_ns
+        for outputs in per_tick(scenario).values()
+        for output in outputs
+        if max(abs(a - b) for a, b in zip(output.q, output.q_des, strict=True)) >= 0.01
+    ]
+    assert fused.settled_s == max(apart) / 1e9
+    early = FusedRun(scenario, apart_rad=0.01)
+    early.advance(2.0)
+    assert early.settled_s is None
+
+
+_PROGRAM = """
+from trilat_net.scenario import load_scenario
+from trilat_net.execution.fused import FusedRun
+for scheme in ("second_order", "digital"):
+    links = {"m2->m1": {"delay_ms": 33.5}, "s->m2": {"model": "gamma", "delay_ms": 9.0, "deviation_ms": 5.0}}
+    scenario = load_scenario("asymmetric", {"scheme": scheme, "link.delay_ms": 20, "links": links,
+                                   "sites.s.rate_hz": 333})
+    run = FusedRun(scenario)
+    for until_s in (0.05, 0.11, 0.25):
+        run.advance(until_s)
+        print(run.records.tobytes().hex())
+    print(run.maxima[1].tobytes().hex())
+"""
+
+
+def test_without_the_compiler_it_has_the_same_bits() -> None:
+    def text(disabled: str) -> str:
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        command = [sys.executable, "-c", _PROGRAM]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    plain = text("1")
+    assert plain.count("\n") == 8
+    assert plain == text("0")
+
+
+def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"sites\.m1\.plant: is external: .* runs live only"):
+        FusedRun(load_scenario("free", {"sites.m1.plant": "external"}))
+    with pytest.raises(ScenarioError, match=r"sites\.m1\.control\.law: tests\.laws:\w+ is a law in Python"):
+        FusedRun(load_scenario("free", {"control.law": "tests.laws:Adaptive"}))
+    with pytest.raises(ScenarioError, match="makes 10000 ticks within one of the slowest"):
+        FusedRun(load_scenario("free", {"rate_hz": 10_000, "sites.s.rate_hz": 1}))

@@ -1,0 +1,115 @@
+"""What a log does not know: what is executed all the same, what stands, and what is said of it."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.execution.deliveries import Sample, delivered, first_in_first_out
+from tests.log_editing import edited, opened, recorded
+from trilat_net.errors import LogError
+from trilat_net.execution.rerun import rerun
+
+from .logs import SITES, TICKS, all_identical, motion, without_records
+
+subsets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
+under_way = st.dictionaries(
+    st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110)), st.integers(1, 40), max_size=60
+)
+gaps = st.dictionaries(
+    st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=25), min_size=1
+)
+
+
+@settings(max_examples=15)
+@given(lost=gaps, replace=subsets, delays=under_way)
+def test_behind_a_gap_it_is_the_log_again_and_what_cannot_be_known_stands(
+    lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
+) -> None:
+    log = without_records(lost, delivered(first_in_first_out(delays)))
+    again = rerun(log, replace)
+    assert again.identical
+    for name, effect in again.sites.items():
+        assert effect.identical + effect.stands == len(log[name])
+        assert again.after[name].tick.tolist() == log[name].tick.tolist()
+        for ours, theirs in zip(again.after[name].states, log[name].states, strict=True):
+            assert numbers_of(ours) == numbers_of(theirs)
+
+
+def numbers_of(state: object) -> list[object]:
+    return [
+        getattr(state, field) for field in ("tick", "mode", "q", "qd", "q_des", "tau", "theta_hat", "used")
+    ]
+
+
+@settings(max_examples=15)
+@given(
+    replace=subsets,
+    lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50),
+    data=st.data(),
+)
+def test_a_changed_site_goes_through_gaps_as_if_there_were_none(
+    replace: list[str], lost: set[int], data: st.DataObject
+) -> None:
+    """Samples that came where no record is are inferred; as long as none was late, rightly."""
+    gapped = data.draw(st.sampled_from(replace))
+    changes = {"control.Kd": 5.0}
+    whole = rerun(opened(recorded("free")), replace, changes)
+    again = rerun(without_records({gapped: sorted(lost)}, recorded("free")), replace, changes)
+    assert again.sites[gapped].assumed == len(lost)
+    assert any("assumed" in note for note in again.notes)
+    for name in replace:
+        assert motion(again.after, name) == motion(whole.after, name)
+
+
+@pytest.mark.parametrize("changes", [{}, {"control.Kd": 5.0}], ids=["nothing changed", "changed"])
+def test_a_log_that_begins_late_is_executed_from_where_it_can_be(changes: dict[str, float]) -> None:
+    """Every recorder began at tick 40: with samples 20 ms old, from tick 61 on all in use are known."""
+    log = without_records({site: range(40) for site in SITES}, recorded("free"))
+    again = rerun(log, ["s"], changes)
+    effect = again.sites["s"]
+    assert 20 <= effect.stands <= 24
+    assert effect.stands + effect.executed == len(log["s"]) == 80
+    assert any("stand as they are" in note for note in again.notes)
+    assert again.identical is not bool(changes)
+    first = 40 + effect.stands
+    assert motion(again.after, "s")[: effect.stands] == motion(log, "s")[: effect.stands]
+    if changes:
+        assert effect.first is not None
+        assert effect.first.tick == first  # the gain acts from there
+
+
+def test_a_sample_that_came_and_is_not_in_the_log_is_told() -> None:
+    again = rerun(without_records({"m1": range(30, 35)}), ["s"], {"control.Kd": 5.0})
+    assert again.sites["s"].lacking == 5
+    assert any("5 samples that arrived are not in the log" in note for note in again.notes)
+
+
+def test_too_few_records_are_refused_where_something_is_changed() -> None:
+    log = without_records({"s": range(10, 110)})
+    with pytest.raises(LogError, match="20 of 120 ticks: too few"):
+        rerun(log, ["s"], {"control.Kd": 5.0})
+    assert rerun(log, ["s"]).identical
+
+
+def test_a_log_that_begins_late_keeps_its_rates() -> None:
+    log = without_records({site: range(40) for site in SITES})
+    with pytest.raises(LogError, match="begin at tick 40"):
+        rerun(log, [], {"rate_hz": 500}, closed_loop=True)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_torn_log_is_executed_as_far_as_it_goes(share: float) -> None:
+    data = edited(recorded("paper"), chunk_bytes=2048)
+    log = opened(data[: int(share * len(data))])
+    again = rerun(log, ["s"])
+    assert all_identical(again)
+    assert any("not finished" in note for note in again.notes)
+    assert 0 < rerun(log, [], {"control.Kd": 5.0}, closed_loop=True).sites["s"].executed < TICKS
+
+
+def test_a_log_without_records_has_nothing_to_execute() -> None:
+    log = without_records({site: range(TICKS) for site in SITES})
+    again = rerun(log, SITES, {"control.Kd": 5.0})
+    assert (again.sites["s"].executed, again.sites["s"].error_rms_rad) == (0, None)
+    assert "s: nothing could be executed" in again.notes
+    assert len(again.after["s"]) == 0

@@ -1,0 +1,222 @@
+"""Laws and arms from outside, executed from the log (L3)."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.execution.logs import numbers
+from tests.log_editing import Record, edited, opened, recorded
+from trilat_net.core.ticks import PlantState
+from trilat_net.errors import LawFailed, ScenarioError
+from trilat_net.execution import virtual
+from trilat_net.execution.verify import find_user_laws, verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.scenario import load_scenario
+
+LAW = "tests.laws:Adaptive"
+SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
+TICKS = 120
+SITES = ("m1", "m2", "s")
+OTHER_PLATFORM = {"fingerprint": "0" * 16}
+
+
+def own(law: str = LAW, **more: Any) -> bytes:
+    return recorded("paper", {**SHORT, "control.law": law, **more})
+
+
+@pytest.mark.parametrize("name", ["paper", "asymmetric"])
+def test_a_law_that_repeats_the_papers_gives_its_bits(name: str) -> None:
+    """Gains of the shipped scenarios are those of `tests.laws`."""
+    ours = opened(recorded(name, SHORT))
+    theirs = opened(recorded(name, {**SHORT, "control.law": LAW}))
+    for site in ours.sites:
+        for a, b in zip(ours[site].states, theirs[site].states, strict=True):
+            assert numbers(a)[:-1] == numbers(b)[:-1]  # but for what a law from outside remembers
+    verdict = verify(theirs)
+    assert verdict.whole_run
+    assert verdict.identical == verdict.records == 3 * TICKS
+    twins = compare_with_virtual(theirs)
+    assert twins.fed.identical == twins.plain.identical == 3 * TICKS
+
+
+def missing(data: bytes, site: str, first: int, last: int, session: dict[str, str] | None = None) -> bytes:
+    def record(r: Record) -> Record | None:
+        return None if r["site"] == site and first <= r["tick"] <= last else r
+
+    return edited(data, record=record, session=session)
+
+
+@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
+def test_behind_a_gap_it_goes_on_from_its_memory(session: dict[str, str] | None) -> None:
+    """As much can be judged as of a law of ours."""
+    verdict = verify(opened(missing(own(), "s", 50, 60, session)))
+    assert verdict.gaps == [("s", 50, 60)]
+    assert verdict.passed
+    ours = verify(opened(missing(recorded("paper", SHORT), "s", 50, 60, session)))
+    assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
+    assert verdict.identical > 3 * TICKS - 50
+
+
+@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
+def test_a_memory_that_does_not_say_all_is_found_out(session: dict[str, str] | None) -> None:
+    """Where nothing has to be recalled it passes; behind a gap, or tick by tick, it does not."""
+    data = own("tests.laws:Forgetful")
+    assert verify(opened(data)).passed
+    verdict = verify(opened(missing(data, "s", 50, 60, session)))
+    assert verdict.first is not None
+    assert verdict.first.field.startswith(("theta_hat", "tau"))
+
+
+def test_a_changed_memory_shows_at_its_own_tick() -> None:
+    def record(r: Record) -> Record:
+        if (r["site"], r["tick"]) == ("m2", 70):
+            r["mem"][4] += 1e-3
+        return r
+
+    verdict = verify(opened(edited(own(), record=record)))
+    assert verdict.differing == 1
+    assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Path:
+    """A law in a file of the folder that the person is in; its module is this test's own."""
+    monkeypatch.chdir(tmp_path)
+    name = "".join(letter for letter in request.node.name if letter.isalnum())
+    file = tmp_path / f"law_{name}.py"
+    file.write_text("from tests.laws import Adaptive\nclass Law(Adaptive):\n    pass\n")
+    return file
+
+
+def log_of(file: Path) -> io.BytesIO:
+    stream = io.BytesIO()
+    virtual.write_virtual_log(
+        load_scenario("two_sites", {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}), stream
+    )
+    stream.seek(0)
+    return stream
+
+
+def test_a_changed_file_is_told_and_judged_all_the_same(file: Path) -> None:
+    log = open_log(log_of(file))
+    (law,) = find_user_laws(log.scenario)
+    assert (law.sites, law.changed) == (("m", "s"), "")
+    assert "is the one that ran" in str(law)
+    file.write_text(file.read_text() + "# a word\n")
+    assert "was changed" in str(find_user_laws(log.scenario)[0])
+    assert verify(log).passed
+    file.write_text(file.read_text().replace("pass", "def memory(self): return [1.0]"))
+    assert verify(log).first.field == "mem"
+
+
+def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
+    log = open_log(log_of(file))
+    file.unlink()
+    advice = "install it, or be in the folder that it lies in"
+    with pytest.raises(ScenarioError, match=advice):
+        find_user_laws(log.scenario)
+    with pytest.raises(ScenarioError, match=advice):
+        verify(log)
+
+
+def test_a_law_that_fails_only_now_is_a_difference_and_the_other_sites_are_judged(file: Path) -> None:
+    log = open_log(log_of(file))
+    wrong = "1 / 0 if now.k == 7 and self._facts.site == 's'"
+    failing = f"def torque(self, now): return {wrong} else super().torque(now)"
+    file.write_text(file.read_text().replace("pass", failing))
+    verdict = verify(log)
+    assert (verdict.first.site, verdict.first.tick) == ("s", 7)
+    assert "ZeroDivisionError" in str(verdict.first)
+    assert (verdict.identical, verdict.differing, verdict.unjudged) == (50 + 7, 1, 42)
+    assert compare_with_virtual(log).fed.first.tick == 7
+
+
+FAILURES = {
+    "nan": "torque[1] is nan, no finite number",
+    "raises": "ValueError: out of",
+    "short": "torque has 1 numbers, not 2",
+    "none": "TypeError",
+    "remembers": "memory has 1025 numbers, at most 1024 are kept",
+    "leaves": "SystemExit: 0",
+}
+
+
+@pytest.mark.parametrize("how", FAILURES)
+@pytest.mark.parametrize("at", [0, 30])
+def test_a_law_that_fails_ends_the_run_with_a_finished_log_that_says_why(how: str, at: int) -> None:
+    law = {"law": "tests.laws:Failing", "how": how, "at": at}
+    stream = io.BytesIO()
+    with pytest.raises(LawFailed) as caught:
+        virtual.write_virtual_log(load_scenario("paper", {**SHORT, "sites.s.control": law}), stream)
+    text = str(caught.value)
+    assert text.startswith(f"the law tests.laws:Failing of s failed at tick {at}: {FAILURES[how]}")
+    assert "\n" not in text
+    stream.seek(0)
+    log = open_log(stream)
+    assert log.complete
+    assert [len(log[name]) for name in SITES] == [at + 1, at + 1, at]
+    assert [event.text for event in log.events if event.kind == "failed"] == [text]
+    assert {event.member: event.ticks for event in log.events if event.kind == "end"}["s"] == at
+    verdict = verify(log)
+    assert verdict.passed
+    assert verdict.identical == 3 * at + 2
+    assert compare_with_virtual(log).fed.first is None
+
+
+def external_log() -> bytes:
+    """A log as a live session with an arm outside writes it: s moved as nobody here computes."""
+    scenario = load_scenario("two_sites", {**SHORT, "sites.s.plant": "external", "sites.s.arm.known": False})
+    moves = {k: PlantState([0.01 * k, -0.3], [0.25 * (k % 3), 1e-3 * k]) for k in range(TICKS)}
+    return moved(scenario, moves)
+
+
+def moved(scenario: Any, moves: dict[int, Any]) -> bytes:
+    stream = io.BytesIO()
+    run = virtual.execute_virtual
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual, "execute_virtual", lambda s, n=None: run(s, n, measured={"s": moves}))
+        patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
+        virtual.write_virtual_log(scenario, stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
+def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | None) -> None:
+    log = opened(edited(external_log(), session=session))
+    assert log["s"].q[50].tolist() == [0.5, -0.3]
+    verdict = verify(log)
+    assert verdict.passed
+    assert verdict.identical == 2 * TICKS
+    twins = compare_with_virtual(log)
+    assert twins.fed.identical == 2 * TICKS
+    assert twins.plain.records == 0
+
+
+def test_an_arm_outside_is_executed_behind_a_gap_too() -> None:
+    """As much can be judged as of an arm of ours."""
+    verdict = verify(opened(missing(external_log(), "s", 40, 44)))
+    assert verdict.passed
+    ours = verify(opened(missing(recorded("two_sites", SHORT), "s", 40, 44)))
+    assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
+
+
+def test_another_measurement_in_the_record_is_another_torque() -> None:
+    def record(r: Record) -> Record:
+        if (r["site"], r["tick"]) == ("s", 70):
+            r["q"][1] += 1e-6
+        return r
+
+    verdict = verify(opened(edited(external_log(), record=record)))
+    assert (verdict.first.site, verdict.first.tick) == ("s", 70)
+    assert verdict.first.field.startswith("tau")
+
+
+def test_virtual_time_has_no_arm_outside() -> None:
+    scenario = load_scenario("two_sites", {"sites.s.plant": "external"})
+    with pytest.raises(ScenarioError, match="virtual time has none"):
+        virtual.write_virtual_log(scenario, io.BytesIO())
+    with pytest.raises(ScenarioError, match="virtual time has none"):
+        next(virtual.execute_virtual(scenario))

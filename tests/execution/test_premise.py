@@ -1,0 +1,143 @@
+"""What may be asked of a log, and what is refused, with the reason."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+from tests.log_editing import opened, recorded
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.execution.rerun_request import RerunRequest, describe_rerun_changes, resolve_rerun_request
+
+from .logs import SITES
+
+Overrides = Mapping[str, Any] | Sequence[str]
+
+
+def asked(replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False) -> RerunRequest:
+    return resolve_rerun_request(opened(recorded("paper")), replace, overrides, closed_loop=closed_loop)
+
+
+def test_nothing_changed_is_the_experiment_of_the_log() -> None:
+    for name in ("paper", "handover", "outage"):
+        log = opened(recorded(name, {"duration_s": 0.3}))
+        for replace in (log.sites[:1], log.sites):
+            found = resolve_rerun_request(log, replace, (), closed_loop=False)
+            assert found.scenario == log.scenario
+            assert (found.changes, found.without_effect, describe_rerun_changes(found)) == ([], [], [])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["control.Kd=5"], ["control.Kd of s: 3 -> 5"]),
+        (["sites.s.control.Kd=[5,6]"], ["control.Kd of s: 3 -> [5, 6]"]),
+        (["link.delay_ms=30"], ["m1->s, m2->s: 20 ms -> 30 ms"]),
+        (["links.m2->s.loss=0.25"], ["m2->s: 20 ms -> 20 ms, loss 25 %"]),
+        (
+            ["dominance.s.m1=0.9", "dominance.s.m2=0.1"],
+            ["dominance.s.m1: 0.5 -> 0.9", "dominance.s.m2: 0.5 -> 0.1"],
+        ),
+        (["seed=7"], ["seed: 1 -> 7"]),
+        (["duration_s=0.05"], ["duration_s: 0.12 -> 0.05"]),
+        (["control.Kd=3"], []),
+        (
+            ["control.law=p_d", "control.K=20"],
+            [
+                "control of s: adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0) -> "
+                "p_d (K 20, d 3, gravity 1)"
+            ],
+        ),
+    ],
+    ids=str,
+)
+def test_what_is_otherwise_is_told_in_lines_of_what_is_executed(
+    overrides: list[str], words: list[str]
+) -> None:
+    assert describe_rerun_changes(asked(["s"], overrides)) == words
+
+
+def test_what_stands_as_recorded_keeps_its_own() -> None:
+    found = asked(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
+    original = opened(recorded("paper")).scenario
+    for name in ("m1", "m2"):
+        assert found.scenario.sites[name] == original.sites[name]
+        assert found.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]
+    assert found.scenario.sites["s"].arm.m2_kg == 2.0
+    assert {changed.key for changed in found.without_effect} >= {
+        "sites.m1.control.Kd",
+        "links.s->m2.delay_ms",
+    }
+
+
+def test_a_timeline_is_each_sites_own() -> None:
+    timeline = [
+        {"at_s": 0.01, "link": "m1->s", "to": {"delay_ms": 5.0}},
+        {"at_s": 0.02, "link": "s->m1", "to": {"delay_ms": 6.0}},
+        {"at_s": 0.03, "dominance": "s", "to": {"m1": 1.0}},
+    ]
+    found = asked(["s"], {"timeline": timeline})
+    assert [(change.link, change.dominance) for change in found.scenario.timeline] == [
+        ("m1->s", ""),
+        ("", "s"),
+    ]
+    assert len(asked([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
+
+
+def test_every_site_is_a_closed_loop() -> None:
+    assert asked(SITES).mode == asked([], closed_loop=True).mode == "closed loop"
+    assert asked(["s", "m1", "s"]).replaced == ("m1", "s")
+    assert asked(["s", "m1"]).mode == "open loop"
+
+
+@pytest.mark.parametrize(
+    ("replace", "closed_loop", "facts"),
+    [([], False, ["--replace", "m1, m2, s", "--closed-loop"]), (["s"], True, ["--replace", "--closed-loop"])],
+)
+def test_it_must_be_said_which_sites_once(replace: list[str], closed_loop: bool, facts: list[str]) -> None:
+    with pytest.raises(UsageError) as caught:
+        asked(replace, closed_loop=closed_loop)
+    assert all(fact in str(caught.value) for fact in facts)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "facts"),
+    [
+        (["control.Kdd=5"], ["control.Kdd", "did you mean 'Kd'"]),
+        (["controll.Kd=5"], ["did you mean 'control'"]),
+        (["sites.q.control.Kd=5"], ["sites.q", "m1, m2, s"]),
+        (["links.m1->q.delay_ms=5"], ["m1->q", "did you mean"]),
+        (["control.Kd"], ["KEY=VALUE"]),
+        (["control.Kd=-1"], ["control.Kd", ">= 0"]),
+        (["rate_hz=500"], ["rate_hz", "--closed-loop"]),
+        (["sites.s.rate_hz=500"], ["sites.s.rate_hz", "--closed-loop"]),
+        (["sites.m1.rate_hz=500"], ["sites.m1.rate_hz", "--closed-loop"]),
+        (["sites.m1.control.Kd=5"], ["sites.m1.control.Kd", "--replace m1", "only s"]),
+        (["links.s->m1.delay_ms=5"], ["links.s->m1", "receiver", "--replace m1"]),
+        (["dominance.m2.s=1"], ["dominance.m2", "--replace m2"]),
+        (["duration_s=30"], ["duration_s", "0.12 s", "not known"]),
+        (["name=other"], ["name", "nothing that is executed"]),
+        (["expect.stable=true"], ["expect.stable", "nothing that is executed"]),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_otherwise_is_refused_with_the_reason(overrides: list[str], facts: list[str]) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        asked(["s"], overrides)
+    assert all(fact in str(caught.value) for fact in facts), caught.value
+
+
+def test_an_unknown_site_is_refused_with_the_nearest() -> None:
+    with pytest.raises(ScenarioError, match="no site 'm3'; did you mean 'm"):
+        asked(["m3"])
+
+
+@pytest.mark.parametrize("key", ["sites", "rate"])
+def test_a_whole_table_cannot_bring_other_sites_or_rates_in(key: str) -> None:
+    site = {"role": "slave"}
+    value = {
+        "sites": {"m1": site, "m2": site, "x": site},
+        "rate": {"m1": site, "m2": site, "s": {"rate_hz": 5}},
+    }
+    with pytest.raises(ScenarioError):
+        asked(["s"], {"sites": value[key]})

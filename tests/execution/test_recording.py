@@ -1,0 +1,129 @@
+"""A rerun as a log: sound, executed again, and honest about where it comes from."""
+
+import hashlib
+import io
+from pathlib import Path
+
+import pytest
+
+from tests.log_editing import opened, recorded
+from trilat_net.errors import UsageError
+from trilat_net.execution.log_checks import run_log_checks
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.verify import find_executed_sites, verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
+
+from .logs import SITES, TICKS, without_records
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "v2.mcap"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "field.mcap"
+    path.write_bytes(recorded("free"))
+    return path
+
+
+def test_the_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None:
+    after = rerun(file, ["s"], {"control.Kd": 5}).after
+    session = after.session
+    assert after.driver == "rerun"
+    assert session["rerun_mode"] == "open loop"
+    assert session["rerun_of"] == "field.mcap"
+    assert session["rerun_of_sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert session["rerun_of_driver"] == "virtual"
+    assert session["rerun_executed"] == "s"
+    assert session["rerun_changes"] == "control.Kd of s: 3 -> 5"
+    assert after.scenario.sites["s"].control.Kd == (5.0, 5.0)
+    assert after.scenario.sites["m1"].control.Kd == (3.0, 3.0)
+    assert after.scenario_sha256 == session["scenario_sha256"]
+
+
+def test_of_a_log_in_memory_it_has_no_name() -> None:
+    session = rerun(opened(recorded("free")), ["s"]).after.session
+    assert (session["rerun_of"], session["rerun_of_sha256"]) == ("", "")
+
+
+@pytest.mark.parametrize("changes", [{}, {"control.Kd": 5, "link.delay_ms": 12.0}], ids=["same", "changed"])
+def test_recorded_sites_stand_byte_for_byte(changes: dict[str, float]) -> None:
+    log = opened(recorded("free"))
+    after = rerun(log, ["s"], changes).after
+    for name in ("m1", "m2"):
+        assert list(after[name].payloads) == list(log[name].payloads)
+        assert after.link_stats(name) == log.link_stats(name)
+        assert [e for e in after.events if e.member == name] == [e for e in log.events if e.member == name]
+    assert after.complete
+    assert [e.ticks for e in after.events if e.kind == "end"] == [TICKS] * 3
+
+
+@pytest.mark.parametrize("replace", [["s"], ["m1", "s"], list(SITES)], ids=" ".join)
+def test_what_was_executed_is_verified_and_what_stands_is_not(replace: list[str]) -> None:
+    after = rerun(opened(recorded("free")), replace, {"control.Kd": 5}).after
+    verdict = verify(after)
+    assert find_executed_sites(after) == tuple(sorted(replace))
+    assert verdict.passed, str(verdict.first)
+    assert verdict.identical == verdict.records == TICKS * len(replace)
+    lines = run_log_checks(after, virtual=True).lines
+    assert all(line.passed for line in lines), lines
+    others = [name for name in SITES if name not in replace]
+    assert all(name in lines[1].text for name in others)
+    assert ("did not react" in lines[-1].text) == bool(others)
+
+
+def test_a_closed_loop_is_virtual_time_again() -> None:
+    twins = compare_with_virtual(
+        rerun(opened(recorded("free")), [], {"arm.m1_kg": 1.5}, closed_loop=True).after
+    )
+    for twin in (twins.fed, twins.plain):
+        assert (twin.identical, twin.first) == (3 * TICKS, None)
+
+
+def test_records_that_stand_are_not_judged() -> None:
+    log = without_records({"s": [40, 41, 70], "m1": [40, 41, 42]})
+    verdict = verify(rerun(log, ["s"]).after)
+    assert verdict.passed, str(verdict.first)
+    assert [gap[1:] for gap in verdict.gaps] == [(40, 41), (70, 70)]
+
+
+def test_an_older_log_becomes_one_of_this_version() -> None:
+    again = rerun(GOLDEN, ["m2"])
+    for name in again.before.sites:
+        for ours, theirs in zip(again.after[name].states, again.before[name].states, strict=True):
+            assert (ours.v, theirs.v) == (3, 2)
+            assert (ours.rx, ours.cmd) == (theirs.rx, theirs.cmd)
+            for mine, old in ((ours.q, theirs.q), (ours.tau, theirs.tau)):  # its sines were another library's
+                assert mine == (pytest.approx(old, abs=1e-9) if name == "m2" else old)
+    assert verify(again.after).passed
+    assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))
+
+
+def test_a_rerun_can_be_rerun_and_says_what_it_cannot_be(file: Path, tmp_path: Path) -> None:
+    made = tmp_path / "again.mcap"
+    rerun(file, ["s"], {"control.Kd": 5}).save(made)
+    again = rerun(made, ["s"])
+    assert again.identical
+    other = rerun(made, ["m1"])  # met the s that was, and meets the one that is in the file
+    assert not other.identical
+    assert not other.broken
+    assert any("is a rerun itself" in note and "m1" in note for note in other.notes)
+    back = rerun(made, ["s"], {"control.Kd": 3})
+    assert list(back.after["s"].q[-1]) == list(open_log(file)["s"].q[-1])
+
+
+def test_a_file_that_exists_is_kept(file: Path) -> None:
+    before = file.read_bytes()
+    again = rerun(file, ["s"])
+    with pytest.raises(UsageError, match="exists"):
+        again.save(file)
+    assert file.read_bytes() == before
+
+
+def test_two_reruns_are_the_same_file(file: Path) -> None:
+    written = []
+    for _ in range(2):
+        stream = io.BytesIO()
+        rerun(file, ["s"], {"control.Kd": 5}).write(stream)
+        written.append(stream.getvalue())
+    assert written[0] == written[1]

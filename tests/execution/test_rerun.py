@@ -1,0 +1,219 @@
+"""Sites of a log executed afresh: nothing changed gives the log; a change gives that experiment."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import trilat_net
+from tests.execution.deliveries import Sample, delivered
+from tests.log_editing import edited, opened, recorded
+from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.execution.difference import TOLERANCE, equal_record
+from trilat_net.execution.rerun import rerun
+from trilat_net.scenario import list_shipped, load_scenario
+
+from .logs import SITES, TICKS, all_identical, motion, simulated
+
+GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("v*.mcap"))
+SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
+
+subsets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
+samples = st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110))
+under_way = st.dictionaries(samples, st.integers(1, 40), max_size=60)
+never = st.frozensets(samples, max_size=40)
+
+
+@pytest.mark.parametrize("name", list_shipped())
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+def test_nothing_changed_any_site_is_the_logs_bit_for_bit(name: str, scheme: str) -> None:
+    log = opened(recorded(name, {"duration_s": 0.3, "scheme": scheme}))
+    for site in log.sites:
+        assert all_identical(rerun(log, [site]))
+    assert all_identical(rerun(log, closed_loop=True))
+
+
+def test_sites_with_rates_of_their_own_are_the_logs_too() -> None:
+    rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
+    log = opened(recorded("paper", {**rates, **SHORT}))
+    for replace in (["m2"], ["m2", "s"], list(SITES)):
+        assert all_identical(rerun(log, replace))
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+@pytest.mark.parametrize("replace", [["m1"], ["m2"], ["s"], ["m2", "s"], ["m1", "m2", "s"]], ids=" ".join)
+def test_logs_of_every_version_with_changes_losses_and_stale_peers_are_too(
+    path: Path, replace: list[str]
+) -> None:
+    again = rerun(path, replace)
+    assert not again.premise.changes
+    assert not again.broken
+    if again.before.session["fingerprint"] == compute_fingerprint():
+        assert all_identical(again)
+        return
+    assert any("fingerprint" in note or "arithmetic" in note for note in again.notes), again.notes
+    for site in replace:
+        for field in ("q", "qd", "tau", "theta_hat"):
+            ours, theirs = getattr(again.after[site], field), getattr(again.before[site], field)
+            assert abs(ours - theirs).max() <= 1e3 * TOLERANCE * (1 + abs(theirs).max())
+
+
+@settings(max_examples=15)
+@given(delays=under_way, lost=never, replace=subsets)
+def test_samples_late_reordered_or_never_come_as_they_came(
+    delays: dict[Sample, int], lost: frozenset[Sample], replace: list[str]
+) -> None:
+    assert all_identical(rerun(opened(delivered(delays, lost)), replace))
+
+
+def test_a_change_of_one_site_is_its_step_with_the_recorded_samples() -> None:
+    """By hand: the site of the changed scenario, fed what its records list of its peers' records."""
+    log = opened(delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)}))
+    changes = {"sites.s.control.Kd": 7.0, "links.m1->s.delay_ms": 11.0, "sites.s.q0_rad": [0.2, -0.1]}
+    again = rerun(log, ["s"], changes)
+    site = Site(load_scenario(log.scenario, changes).setup("s"))
+    samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
+    for state, made in zip(log["s"].states, again.after["s"].states, strict=True):
+        came = [Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx]
+        assert equal_record(made, site.step(TickInput(state.tick, came)), site.peers)
+    assert again.sites["s"].first is not None
+    assert not again.identical
+    assert not again.broken
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"control.Kd": 5.0},
+        {"control.law": "p_d", "control.K": 20.0},
+        {"link.delay_ms": 33.0},
+        {"link.model": "uniform", "link.delay_ms": 20.0, "link.half_width_ms": 15.0, "link.loss": 0.2},
+        {"link.playout_ms": 45.0},
+        {"arm.m2_kg": 2.5, "limits.tau_limit_nm": 12.0},
+        {"dominance.s.m1": 0.9, "dominance.s.m2": 0.1},
+        {"scheme": "digital", "sites.m1.q0_rad": [0.4, 0.1]},
+        {"duration_s": 0.05},
+        {"rate_hz": 500},
+        {"sites.m1.rate_hz": 700, "sites.s.rate_hz": 1500},
+        {"on_stale.action": "hold", "on_stale.age_ms": 25.0, "link.outages_s": [[0.03, 0.06]]},
+    ],
+    ids=lambda changes: " ".join(changes),
+)
+def test_a_change_in_a_closed_loop_is_the_changed_experiment(changes: dict[str, object]) -> None:
+    """Where every sample comes long before it is due, the network does not matter (L2)."""
+    again = rerun(opened(recorded("free")), [], changes, closed_loop=True)
+    twin = simulated("free", {**SHORT, **changes})
+    for site in SITES:
+        ours, theirs = motion(again.after, site), motion(twin, site)
+        assert ours == theirs[: len(ours)]
+        assert len(ours) >= len(theirs) - 2  # rates that do not divide: up to the last record of the log
+
+
+def test_a_delay_above_the_worst_lateness_makes_late_samples_harmless_in_a_closed_loop() -> None:
+    log = opened(delivered({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30}))
+    again = rerun(log, [], {"link.delay_ms": 31.0}, closed_loop=True)
+    twin = simulated("free", {"duration_s": 0.12, "link.delay_ms": 31.0})
+    assert all(motion(again.after, site) == motion(twin, site) for site in SITES)
+
+
+def test_on_a_measured_link_arrivals_are_all_that_counts() -> None:
+    log = opened(delivered({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
+    again = rerun(log, ["s"], {"link.model": "measured"})
+    assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == ((20.0, 9.0), (20.0, 9.0))
+
+
+def test_all_sites_replaced_are_a_closed_loop() -> None:
+    log = opened(recorded("free"))
+    changes = {"control.Kp": 2.0}
+    by_name, at_once = rerun(log, SITES, changes), rerun(log, [], changes, closed_loop=True)
+    assert by_name.premise == at_once.premise
+    assert by_name.facts() == at_once.facts()
+
+
+def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
+    """An m1 that moves otherwise is seen by s where s is executed, 20 ms later, and by nobody else."""
+    log = opened(recorded("free"))
+    stiff = {"sites.m1.control.Kd": 9.0}
+    alone, both = rerun(log, ["m1"], stiff), rerun(log, ["m1", "s"], stiff)
+    assert motion(alone.after, "s") == motion(log, "s")
+    assert alone.after["s"].payloads[50] == log["s"].payloads[50]
+    assert motion(both.after, "s")[:20] == motion(log, "s")[:20]
+    assert motion(both.after, "s")[30:] != motion(log, "s")[30:]
+    assert motion(alone.after, "m1")[:40] == motion(both.after, "m1")[:40]
+    assert motion(alone.after, "m1")[60:] != motion(both.after, "m1")[60:]
+
+
+def test_a_site_that_diverges_stops_there_and_says_so() -> None:
+    log = opened(recorded("free"))
+    again = rerun(log, ["s", "m1"], {"sites.s.limits.qd_limit_rad_s": 0.3})
+    effect = again.sites["s"]
+    assert effect.diverged_at_s is not None
+    assert effect.executed == round(1000 * effect.diverged_at_s) + 1 < TICKS
+    assert again.diverged
+    assert again.after["s"].states[-1].mode == "diverged"
+    assert "diverged" in {event.kind for event in again.after.events if event.member == "s"}
+    assert again.sites["m1"].executed <= effect.executed  # the run ends there
+    assert len(again.after["m2"]) == TICKS
+
+
+def test_a_log_that_diverged_is_executed_to_its_end() -> None:
+    log = opened(recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3}))
+    for replace in (["m1"], list(SITES)):
+        again = rerun(log, replace)
+        assert all_identical(again)
+        assert not again.diverged  # it is not what the rerun did
+    assert not rerun(log, SITES, {"limits.qd_limit_rad_s": 100.0}).diverged
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r["rx"].append([7, 3, 0]),
+        lambda r: r["rx"].append([-1, 3, 0]),
+        lambda r: r["rx"].append([0, 2**58, 0]),
+        lambda r: r["rx"].append([0, -5, 0]),
+        lambda r: r["rx"].insert(0, [1, r["tick"] + 9, 0]),  # of a tick that needs this one
+        lambda r: r.update(rx=r["rx"] * 3000),
+    ],
+    ids=[
+        "no peer",
+        "a peer before the first",
+        "far ahead",
+        "before the epoch",
+        "from the future",
+        "too many",
+    ],
+)
+def test_strange_arrivals_end_nothing(change: object) -> None:
+    def record(r: dict[str, object]) -> dict[str, object]:
+        if r["site"] == "s" and r["tick"] in (50, 51):
+            change(r)
+        return r
+
+    log = opened(edited(recorded("paper"), record=record))
+    for replace in (["s"], list(SITES)):
+        for changes in ({}, {"control.Kd": 5.0}):
+            assert rerun(log, replace, changes).sites["s"].executed >= 60
+
+
+def test_facts_are_plain_and_name_their_units() -> None:
+    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).facts()
+    assert facts["mode"] == "open loop"
+    assert facts["changes"] == [{"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}]
+    site = facts["sites"]["s"]
+    assert site["error_rms_rad"].keys() == {"before", "after"}
+    assert site["q_max_rad"] > site["q_rms_rad"] > 0.0
+    assert site["first"]["field"] == "tau[0]"
+
+
+def test_it_can_be_asked_of_the_package(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(recorded("paper"))
+    again = trilat_net.rerun(path, replace="s", set={"control.Kd": 5})
+    assert again.sites["s"].compared == TICKS
+    assert str(again) == repr(again)
+    assert "s" in repr(again)
+    assert len(repr(again)) < 200

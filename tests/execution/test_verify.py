@@ -1,0 +1,341 @@
+"""Execution from a log: what is untouched is identical, what was touched is named (L3, L5)."""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.execution.deliveries import Sample, delivered, first_in_first_out
+from tests.log_editing import Record, edited, opened, recorded, without
+from trilat_net.execution.verify import verify
+from trilat_net.scenario import list_shipped
+
+SITES = ("m1", "m2", "s")
+TICKS = 120
+VECTORS = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
+OTHER_PLATFORM = {"fingerprint": "0" * 16}
+
+ticks = st.one_of(st.sampled_from([0, 1, 2, TICKS - 2, TICKS - 1]), st.integers(0, TICKS - 1))
+some_ticks = st.sampled_from([0, 1, 21, 22, 60, TICKS - 1])
+
+
+def flipped(value: float, bit: int) -> float:
+    (bits,) = struct.unpack("<Q", struct.pack("<d", value))
+    return float(struct.unpack("<d", struct.pack("<Q", bits ^ (1 << bit)))[0])
+
+
+def at(site: str, tick: int, change: Callable[[Record], Any]) -> Callable[[Record], Record]:
+    """Changes one record in place."""
+
+    def record(r: Record) -> Record:
+        if r["site"] == site and r["tick"] == tick:
+            change(r)
+        return r
+
+    return record
+
+
+@pytest.mark.parametrize("name", list_shipped())
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -> None:
+    log = opened(recorded(name, {"duration_s": 0.5, "scheme": scheme}))
+    verdict = verify(log)
+    assert verdict.whole_run
+    assert verdict.passed
+    assert verdict.identical == verdict.records == 500 * len(log.sites)
+    assert (verdict.unjudged, verdict.differing, verdict.gaps) == (0, 0, [])
+
+
+def test_sites_with_rates_of_their_own_are_identical_too() -> None:
+    rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
+    log = opened(recorded("paper", {**rates, "duration_s": 0.5}))
+    assert verify(log).identical == 500 + 350 + 166
+
+
+def test_a_diverged_run_is_identical_to_its_last_record() -> None:
+    data = recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3})
+    log = opened(data)
+    assert log["m1"].states[-1].tick < 999
+    assert "diverged" in {log[name].states[-1].mode for name in log.sites}
+    verdict = verify(log)
+    assert verdict.identical == verdict.records
+
+
+@settings(max_examples=80)
+@given(
+    site=st.sampled_from(SITES),
+    field=st.sampled_from(sorted(VECTORS)),
+    tick=ticks,
+    entry=st.integers(0, 4),
+    bit=st.one_of(st.just(0), st.just(63), st.integers(0, 51)),
+)
+def test_one_bit_of_a_vector_is_found_and_named(
+    site: str, field: str, tick: int, entry: int, bit: int
+) -> None:
+    index = entry % VECTORS[field]
+
+    def change(r: Record) -> None:
+        r[field][index] = flipped(r[field][index], bit)
+
+    verdict = verify(opened(edited(recorded("paper"), record=at(site, tick, change))))
+    assert not verdict.passed
+    assert verdict.first is not None
+    assert verdict.first[:3] == (site, tick, f"{field}[{index}]")
+    assert verdict.first.logged.hex() != verdict.first.computed.hex()
+
+
+@settings(max_examples=30)
+@given(site=st.sampled_from(SITES), tick=ticks, peer=st.integers(0, 1), bit=st.integers(0, 12))
+def test_one_bit_of_used_is_found_and_named(site: str, tick: int, peer: int, bit: int) -> None:
+    name = [other for other in SITES if other != site][peer]
+
+    def change(r: Record) -> None:
+        r["used"][name] ^= 1 << bit
+
+    first = verify(opened(edited(recorded("paper"), record=at(site, tick, change)))).first
+    assert first is not None
+    assert first[:3] == (site, tick, f"used[{name}]")
+
+
+@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize("tick", [0, 1, 50, TICKS - 1])
+def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
+    record = at(site, tick, lambda r: r.update(mode="diverged"))
+    first = verify(opened(edited(recorded("paper"), record=record))).first
+    assert first is not None
+    assert first[:3] == (site, tick, "mode")
+
+
+@settings(max_examples=40)
+@given(
+    site=st.sampled_from(SITES), tick=ticks.filter(bool), arrival=st.integers(0, 1), bit=st.integers(0, 12)
+)
+def test_one_bit_of_an_arrivals_tick_is_found_and_named(site: str, tick: int, arrival: int, bit: int) -> None:
+    def change(r: Record) -> None:
+        r["rx"][arrival][1] ^= 1 << bit
+
+    first = verify(opened(edited(recorded("paper"), record=at(site, tick, change)))).first
+    assert first is not None
+    assert first[:2] == (site, tick)
+    assert first.field.startswith("rx")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r["rx"].pop(),
+        lambda r: r["rx"].append([0, 3, 0]),
+        lambda r: r["rx"].reverse(),
+        lambda r: r["rx"][0].__setitem__(0, 1),
+        lambda r: r["rx"][0].__setitem__(0, 7),
+        lambda r: r.update(rx_crc=r["rx_crc"] ^ 1),
+    ],
+    ids=["one less", "one more", "another order", "another peer", "no peer", "their CRC"],
+)
+@pytest.mark.parametrize("tick", [1, 50, TICKS - 1])
+def test_other_arrivals_are_found_and_named(change: Callable[[Record], Any], tick: int) -> None:
+    first = verify(opened(edited(recorded("paper"), record=at("m2", tick, change)))).first
+    assert first is not None
+    assert first[:2] == ("m2", tick)
+    assert first.field.startswith("rx")
+
+
+@pytest.mark.parametrize("field", ["cmd", "mem", "t_ns", "boot"])
+def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
+    value = {"cmd": ["stop"], "mem": [1.0], "t_ns": 50_000_001, "boot": 1}[field]
+    record = at("m2", 50, lambda r: r.update({field: value}))
+    first = verify(opened(edited(recorded("paper"), record=record))).first
+    assert first is not None
+    assert first[:3] == ("m2", 50, field)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Kd = [3.0, 3.0]", "Kd = [3.0, 3.0000000000000004]"),
+        ("Kp = [1.0, 1.0]", "Kp = [1.0000000000000002, 1.0]"),
+        ("Lambda = [1.0, 1.0]", "Lambda = [1.0, 1.0000000000000002]"),
+        ("Gamma = [1.0, 1.0, 1.0, 1.0, 1.0]", "Gamma = [1.0, 1.0, 1.0, 1.0, 1.0000000000000002]"),
+        ("g_m_s2 = 9.81", "g_m_s2 = 9.810000000000002"),
+        ("delay_ms = 20.0", "delay_ms = 20.001"),
+        ('scheme = "second_order"', 'scheme = "digital"'),
+    ],
+)
+def test_one_other_number_in_the_embedded_scenario_is_found(old: str, new: str) -> None:
+    def scenario(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    first = verify(opened(edited(recorded("free"), scenario=scenario))).first
+    assert first is not None
+    assert first.tick <= 25
+
+
+def judged(site: str, lost: set[int], whole_run: bool = True) -> Any:
+    """The verdict on a log that lacks some records of a site."""
+    session = {} if whole_run else OTHER_PLATFORM
+    return verify(opened(edited(recorded("paper"), record=without(site, lost), session=session)))
+
+
+def ranges(lost: set[int]) -> list[tuple[int, int]]:
+    starts = sorted(t for t in lost if t - 1 not in lost)
+    ends = sorted(t for t in lost if t + 1 not in lost)
+    return list(zip(starts, ends, strict=True))
+
+
+@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize(
+    "lost", [{0}, {0, 1, 2}, {1}, {40}, set(range(40, 45)), {40, 42}, {10, 50, 51, 90}, set(range(5, 80))]
+)
+def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[int]) -> None:
+    verdict = judged(site, lost)
+    assert verdict.passed, str(verdict.first)
+    assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
+    assert verdict.records == 3 * TICKS - len(lost)
+    assert verdict.identical + verdict.unjudged == verdict.records
+    # two records to resume from at the site itself, and at each peer no more than what was lost
+    assert verdict.unjudged <= sum(3 + 2 * (last - first + 4) for first, last in ranges(lost))
+
+
+@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize("first", [TICKS - 1, TICKS - 10])
+def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
+    verdict = judged(site, set(range(first, TICKS)))
+    assert verdict.passed, str(verdict.first)
+    assert verdict.gaps == [(site, first, TICKS - 1)]
+
+
+@settings(max_examples=60)
+@given(
+    site=st.sampled_from(SITES),
+    gaps=st.lists(st.tuples(st.integers(0, TICKS - 2), st.integers(1, 12)), min_size=1, max_size=4),
+    whole_run=st.booleans(),
+)
+def test_gaps_are_never_a_false_alarm(site: str, gaps: list[tuple[int, int]], whole_run: bool) -> None:
+    lost = {t for start, length in gaps for t in range(start, start + length) if t < TICKS - 1}
+    verdict = judged(site, lost, whole_run)
+    assert verdict.passed, str(verdict.first)
+    assert [gap[1:] for gap in verdict.gaps] == ranges(lost)
+    assert verdict.identical + verdict.unjudged == verdict.records
+
+
+@settings(max_examples=30)
+@given(
+    lost=st.dictionaries(
+        st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=30), min_size=2
+    )
+)
+def test_gaps_of_several_sites_are_never_a_false_alarm(lost: dict[str, set[int]]) -> None:
+    def record(r: Record) -> Record | None:
+        return None if r["tick"] in lost.get(r["site"], ()) else r
+
+    verdict = verify(opened(edited(recorded("paper"), record=record)))
+    assert verdict.passed, str(verdict.first)
+    assert {gap[0] for gap in verdict.gaps} == set(lost)
+
+
+samples = st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110))
+under_way = st.dictionaries(samples, st.integers(1, 40), max_size=60)
+never = st.frozensets(samples, max_size=40)
+
+
+@settings(max_examples=30)
+@given(delays=under_way, never=never)
+def test_samples_out_of_order_late_or_never_are_no_difference(
+    delays: dict[Sample, int], never: frozenset[Sample]
+) -> None:
+    verdict = verify(opened(delivered(delays, never)))
+    assert verdict.identical == verdict.records == 3 * TICKS
+
+
+@settings(max_examples=50)
+@given(
+    delays=under_way,
+    never=never,
+    lost=st.dictionaries(
+        st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=20), max_size=2
+    ),
+    whole_run=st.booleans(),
+)
+def test_gaps_where_samples_come_late_or_never_are_no_false_alarm(
+    delays: dict[Sample, int], never: frozenset[Sample], lost: dict[str, set[int]], whole_run: bool
+) -> None:
+    """On links that keep their order, as those of a session do."""
+
+    def record(r: Record) -> Record | None:
+        return None if r["tick"] in lost.get(r["site"], ()) else r
+
+    session = {} if whole_run else OTHER_PLATFORM
+    data = delivered(first_in_first_out(delays), never)
+    verdict = verify(opened(edited(data, record=record, session=session)))
+    assert verdict.passed, str(verdict.first)
+
+
+def test_a_gap_among_reordered_samples_is_no_false_alarm() -> None:
+    """Sample 45 comes at 53, after newer ones; record 50 is missing, and the first to be listed is 45."""
+    delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
+    data = delivered(delays)
+    verdict = verify(opened(edited(data, record=without("m2", {50}))))
+    assert verdict.passed, str(verdict.first)
+
+
+def test_a_change_behind_a_gap_is_still_found() -> None:
+    def record(r: Record) -> Record | None:
+        if r["site"] == "m2" and r["tick"] == 90:
+            r["tau"][0] = flipped(r["tau"][0], 0)
+        return without("m2", {40, 41})(r)
+
+    first = verify(opened(edited(recorded("paper"), record=record))).first
+    assert first is not None
+    assert first[:3] == ("m2", 90, "tau[0]")
+
+
+def test_a_record_that_stands_twice_is_found() -> None:
+    def record(r: Record) -> Record:
+        return {**r, "tick": 50} if r["site"] == "m2" and r["tick"] == 51 else r
+
+    verdict = verify(opened(edited(recorded("paper"), record=record)))
+    assert not verdict.passed
+
+
+@pytest.mark.parametrize("name", list_shipped())
+def test_on_another_platform_each_tick_follows_from_the_two_before_it(name: str) -> None:
+    data = recorded(name, {"duration_s": 0.5})
+    verdict = verify(opened(edited(data, session=OTHER_PLATFORM)))
+    assert not verdict.whole_run
+    assert verdict.passed, str(verdict.first)
+    assert verdict.identical == verdict.records
+
+
+@pytest.mark.parametrize("field", sorted(VECTORS))
+@pytest.mark.parametrize("tick", [0, 1, 60, TICKS - 1])
+def test_on_another_platform_a_change_beyond_the_tolerance_is_found(field: str, tick: int) -> None:
+    def change(r: Record) -> None:
+        r[field][1] += 1e-6 * (1 + abs(r[field][1]))
+
+    data = edited(recorded("free"), record=at("m2", tick, change), session=OTHER_PLATFORM)
+    first = verify(opened(data)).first
+    assert first is not None
+    assert first[:3] == ("m2", tick, f"{field}[1]")
+
+
+def test_on_another_platform_rounding_is_no_difference() -> None:
+    def record(r: Record) -> Record:
+        r["tau"] = [v * (1 + 1e-13) for v in r["tau"]]
+        return r
+
+    assert verify(opened(edited(recorded("free"), record=record, session=OTHER_PLATFORM))).passed
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_a_torn_log_is_verified_as_far_as_it_is_whole(share: float) -> None:
+    data = edited(recorded("paper"), chunk_bytes=2048)
+    log = opened(data[: int(share * len(data))])
+    assert not log.complete
+    verdict = verify(log)
+    assert verdict.passed, str(verdict.first)
+    assert 0 < verdict.identical + verdict.unjudged == verdict.records < 3 * TICKS
+    assert verdict.unjudged <= 3

@@ -1,0 +1,118 @@
+"""Virtual time: who steps when, what arrives when, and what the driver may not decide (L2)."""
+
+import io
+from collections.abc import Sequence
+from fractions import Fraction
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.log_editing import opened
+from trilat_net import simulate
+from trilat_net.core.ticks import Arrival, TickRecord
+from trilat_net.execution import virtual
+from trilat_net.execution.virtual_network import PromptNetwork
+from trilat_net.scenario import Scenario, load_scenario
+
+rates = st.sampled_from([1, 7, 100, 333, 450, 1000])
+
+
+def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.0) -> Scenario:
+    changes = {f"sites.{name}.rate_hz": rate for name, rate in zip(("m1", "m2", "s"), rate_hz, strict=True)}
+    return load_scenario("free", {**changes, "duration_s": duration_s, "link.delay_ms": delay_ms})
+
+
+@settings(max_examples=30)
+@given(rate_hz=st.tuples(rates, rates, rates))
+def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: tuple[int, ...]) -> None:
+    scenario = small(rate_hz)
+    ran = [
+        (o.t_ns, scenario.names.index(site.name), o.tick) for site, _, o in virtual.execute_virtual(scenario)
+    ]
+    assert ran == sorted(ran)
+    for index, name in enumerate(scenario.names):
+        made = [tick for _, i, tick in ran if i == index]
+        assert made == list(range(scenario.ticks(name)))
+        assert scenario.ticks(name) == max(1, round(Fraction(1, 10) * rate_hz[index]))
+
+
+@settings(max_examples=30)
+@given(rate_hz=st.tuples(rates, rates, rates))
+def test_every_sample_arrives_once_in_order_at_the_first_tick_after_its_stamp(
+    rate_hz: tuple[int, ...],
+) -> None:
+    scenario = small(rate_hz)
+    stamps: dict[tuple[str, int], int] = {}
+    ran = list(virtual.execute_virtual(scenario))
+    for site, _, output in ran:
+        stamps[site.name, output.tick] = output.t_ns
+    for site, arrivals, output in ran:
+        for arrival in arrivals:
+            stamp = stamps[site.peers[arrival.peer], arrival.tick]
+            assert stamp < output.t_ns
+            assert output.tick == 0 or stamp >= stamps[site.name, output.tick - 1]
+            assert arrival.latency_us == (output.t_ns - stamp) // 1000
+
+
+class ScatteredNetwork(PromptNetwork):
+    """Delivers each sample some ticks later than it could, in any order, as long as it is not due."""
+
+    def __init__(self, scenario: Scenario, slack: Sequence[int]) -> None:
+        super().__init__({name: spec.rate_hz for name, spec in scenario.sites.items()})
+        self._held: dict[str, list[tuple[int, int, Arrival]]] = {name: [] for name in scenario.names}
+        self._slack = slack
+
+    def deliver(self, receiver: str, k: int) -> list[Arrival]:
+        held = self._held[receiver]
+        for arrival in super().deliver(receiver, k):
+            slack = self._slack[(arrival.tick + 3 * arrival.peer) % len(self._slack)]
+            held.append((k + slack, -arrival.tick, arrival))
+        held.sort(key=lambda entry: entry[:2])
+        now = [entry for entry in held if entry[0] <= k]
+        del held[: len(now)]
+        return [arrival for _, _, arrival in now]
+
+
+def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
+    return [stepped.output._replace(rx_crc=0) for stepped in ran]
+
+
+@settings(max_examples=20)
+@given(slack=st.lists(st.integers(0, 17), min_size=1, max_size=12))
+def test_the_network_decides_nothing_as_long_as_samples_come_before_they_are_due(slack: list[int]) -> None:
+    scenario = small((1000, 1000, 1000))
+    scattered = virtual.execute_virtual(scenario, ScatteredNetwork(scenario, slack))
+    assert without_arrivals(list(scattered)) == without_arrivals(list(virtual.execute_virtual(scenario)))
+
+
+def test_a_sample_beyond_its_due_tick_does_change_the_run() -> None:
+    scenario = small((1000, 1000, 1000))
+    late = list(virtual.execute_virtual(scenario, ScatteredNetwork(scenario, [0, 25])))
+    assert without_arrivals(late) != without_arrivals(list(virtual.execute_virtual(scenario)))
+    assert any(sum(c.late for c in site.counts()) for site, _, _ in late)
+
+
+def test_record_says_whether_the_run_stayed_within_its_limits() -> None:
+    fine, wild = io.BytesIO(), io.BytesIO()
+    assert virtual.write_virtual_log(small((1000,) * 3), fine)
+    assert not virtual.write_virtual_log(load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild)
+    assert [e.kind for e in opened(fine.getvalue()).events] == ["end"] * 3
+    kinds = [(e.member, e.kind) for e in opened(wild.getvalue()).events]
+    assert "diverged" in {kind for _, kind in kinds}
+    assert [kind for _, kind in kinds].count("end") == 3
+
+
+def test_simulate_gives_the_log_of_a_scenario_with_overrides() -> None:
+    log = simulate("paper", set={"control.Kd": 5, "duration_s": 0.05})
+    assert log.scenario.sites["s"].control.Kd == (5.0, 5.0)
+    assert (log.driver, len(log["s"])) == ("virtual", 50)
+    assert log["s"].q.tolist() == simulate("paper", ["control.Kd=5", "duration_s=0.05"])["s"].q.tolist()
+
+
+@pytest.mark.parametrize("site", ["m1", "s"])
+def test_a_virtual_boot_is_a_function_of_scenario_and_name(site: str) -> None:
+    one, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
+    assert virtual.virtual_boot(one, site) == virtual.virtual_boot(load_scenario("paper"), site)
+    assert virtual.virtual_boot(one, site) != virtual.virtual_boot(other, site)
+    assert virtual.virtual_boot(one, "m1") != virtual.virtual_boot(one, "s")

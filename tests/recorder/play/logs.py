@@ -1,0 +1,56 @@
+"""What a log holds, by an independent reader; and logs whose messages lie as a test wants them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from trilat_net.log.log_writer import LogWriter
+from trilat_net.net import topics
+from trilat_net.net.messages import Event
+from trilat_net.net.wire import encode
+from trilat_net.scenario import load_scenario
+
+BOOT = 7
+EPOCH_UNIX_NS = 1_700_000_000_000_000_000
+
+
+def payloads(path: Path) -> dict[str, list[bytes]]:
+    """Every payload of a finished file by topic, in file order, read by the `mcap` package."""
+    found: dict[str, list[bytes]] = {}
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            found.setdefault(channel.topic, []).append(message.data)
+    return found
+
+
+def session_payloads(path: Path) -> dict[str, list[bytes]]:
+    """The same, of what sites published: by member and channel, as in "m1/state"."""
+    return {
+        "/".join(topic.split("/")[3:]): found
+        for topic, found in payloads(path).items()
+        if topic.startswith("/trilat/") and "/recorder/" not in topic
+    }
+
+
+def event(site: str, n: int) -> bytes:
+    """A small message that is numbered."""
+    return encode(Event(member=site, boot=BOOT, kind="mode", text=f"{site} {n}", n=n))
+
+
+def write(path: Path, messages: Iterable[tuple[str, int, int, int]], session: str = "paper") -> Path:
+    """Writes a log of events.
+
+    Args:
+        path: where.
+        messages: (site, number, when it was sent, when it came; ms since the epoch), in file order.
+        session: its name.
+    """
+    with path.open("wb") as stream:
+        writer = LogWriter(stream, load_scenario("paper"), session, "live", EPOCH_UNIX_NS)
+        for site, n, sent_ms, came_ms in messages:
+            key = topics.key(session, site, topics.EVENT)
+            came_ns = EPOCH_UNIX_NS + came_ms * 1_000_000
+            writer.add(key, event(site, n), sent_ms * 1_000_000, came_ns, n)
+        writer.finish({})
+    return path

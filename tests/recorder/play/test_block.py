@@ -1,0 +1,53 @@
+"""Messages held tight are the same messages."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.batch import BatchBuilder, unpack_batch
+
+messages = st.lists(
+    st.tuples(
+        st.integers(-(2**60), 2**60),
+        st.integers(0, 3),
+        st.integers(0, 2**40) | st.integers(0, 3),
+        st.binary(max_size=9) | st.binary(max_size=1),
+    ),
+    max_size=20,
+)
+Messages = list[tuple[int, int, int, bytes]]
+
+
+def gathered(given: Messages) -> BatchBuilder:
+    gathering = BatchBuilder()
+    for message in given:
+        gathering.add(*message)
+    return gathering
+
+
+@given(messages)
+def test_every_payload_stays_with_its_channel_and_number(given: Messages) -> None:
+    """And what is there twice, as in two parts of one session, is there once."""
+    block = gathered(given).ordered()
+    assert sorted(message[1:] for message in block.messages()) == sorted({message[1:] for message in given})
+    assert [block.payload(n) for n in range(len(block))] == [message[3] for message in block.messages()]
+
+
+@given(messages, st.integers(1, 7))
+def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, count: int) -> None:
+    block = gathered(given).ordered()
+    whole = list(block.messages())
+    pieces = list(block.pieces(count))
+    assert all(1 <= len(piece) <= count for piece in pieces)
+    assert [message for piece in pieces for message in piece.messages()] == whole
+    assert [message for piece in pieces for message in unpack_batch(piece.packed()).messages()] == whole
+
+
+@given(messages, messages)
+def test_what_was_put_in_order_may_be_put_in_order_again_with_more(one: Messages, two: Messages) -> None:
+    """For messages whose numbers ascend in the file, as they come of a log that misses nothing."""
+    rising = [(t_ns, channel, n, payload + b".") for n, (t_ns, channel, _, payload) in enumerate(one + two)]
+    again = gathered([])
+    again.keep(gathered(rising[: len(one)]).ordered())
+    for message in rising[len(one) :]:
+        again.add(*message)
+    assert list(again.ordered().messages()) == list(gathered(rising).ordered().messages())

@@ -1,0 +1,89 @@
+"""What a replay tells of its past is what a site would."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.batch import BatchBuilder
+from recorder.play.site_stand_ins import PlayedHistory
+from sites.retransmit_buffer import ChannelBuffer
+from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES
+
+CHANNEL, OTHER = 3, 4
+
+
+def remembered(numbers: list[int], played: int, size: int = 1, kept_ns: int | None = None) -> PlayedHistory:
+    """A memory of messages of one channel among another's, of which so many have been played."""
+    memory = PlayedHistory(kept_ns)
+    gathering = BatchBuilder()
+    for place, number in enumerate(numbers):
+        gathering.add(place, CHANNEL, number, number.to_bytes(2, "big") * size)
+        gathering.add(place, OTHER, number, b"other")
+    for piece in gathering.ordered().pieces(7):
+        memory.add(piece)
+    if played:
+        memory.made[CHANNEL] = numbers[played - 1] + 1
+    return memory
+
+
+def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
+    """From the first number there is, one after the other, as long as there is no gap."""
+    made = numbers[-1] + 1 if numbers else 0
+    if first >= made:
+        return first, []
+    begin = next(n for n in numbers if n >= first)
+    run = []
+    for number in range(begin, min(last, begin + BACKFILL_MESSAGES - 1) + 1):
+        if number not in numbers:
+            break
+        run.append(number)
+    return begin, run
+
+
+@given(
+    st.lists(st.integers(0, 120), unique=True, max_size=60).map(sorted),
+    st.data(),
+    st.integers(0, 130),
+    st.integers(0, 130),
+)
+def test_it_tells_what_there_is_from_a_number_on_up_to_the_next_gap(
+    numbers: list[int], data: st.DataObject, first: int, more: int
+) -> None:
+    played = data.draw(st.integers(0, len(numbers)))
+    memory = remembered(numbers, played)
+    told_first, payloads = memory.chunk(CHANNEL, first, first + more)
+    assert (told_first, [int.from_bytes(p, "big") for p in payloads]) == naive(
+        numbers[:played], first, first + more
+    )
+
+
+@given(st.integers(0, 150), st.integers(0, 150), st.integers(0, 150), st.sampled_from([1, 900]))
+def test_where_nothing_is_missing_it_answers_as_a_site(count: int, first: int, more: int, size: int) -> None:
+    """Messages of 2 bytes, and of 1800, of which fewer fit an answer."""
+    ring = ChannelBuffer(200, 400_000)
+    for number in range(count):
+        ring.keep(number.to_bytes(2, "big") * size)
+    memory = remembered(list(range(count)), count, size)
+    told = memory.chunk(CHANNEL, first, first + more)
+    assert told == ring.chunk(first, first + more)
+    assert sum(map(len, told[1])) <= BACKFILL_BYTES
+
+
+def test_what_has_not_been_played_is_not_told() -> None:
+    memory = remembered(list(range(30)), 10)
+    assert len(memory.chunk(CHANNEL, 0, 29)[1]) == 10
+    assert memory.chunk(CHANNEL, 10, 29) == (10, [])
+
+
+def test_what_is_older_than_is_remembered_is_gone() -> None:
+    memory = remembered(list(range(200)), 200, kept_ns=50)
+    first, payloads = memory.chunk(CHANNEL, 0, 199)
+    assert 130 <= first <= 150
+    assert int.from_bytes(payloads[0], "big") == first
+
+
+def test_after_forgetting_all_before_is_gone() -> None:
+    memory = remembered(list(range(30)), 30)
+    memory.forget()
+    assert memory.chunk(CHANNEL, 3, 9) == (30, [])
+    assert memory.chunk(CHANNEL, 40, 50) == (40, [])
+    assert memory.chunk(99, 0, 9) == (0, [])

@@ -1,0 +1,71 @@
+"""The order of play: by time, and never against the numbers of a channel."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.batch import order_for_play
+
+messages = st.lists(
+    st.tuples(st.integers(-50, 50), st.integers(0, 3), st.integers(0, 12)), min_size=0, max_size=40
+)
+
+
+def ordered(given: list[tuple[int, int, int]]) -> tuple[list[int], list[int]]:
+    columns = np.array(given, dtype=np.int64).reshape(-1, 3)
+    order, due_ns = order_for_play(columns[:, 0], columns[:, 1], columns[:, 2])
+    return order.tolist(), due_ns.tolist()
+
+
+@given(messages)
+def test_every_message_comes_once_and_times_never_go_back(
+    given: list[tuple[int, int, int]],
+) -> None:
+    order, due_ns = ordered(given)
+    assert sorted(order) == list(range(len(given)))
+    assert due_ns == sorted(due_ns)
+
+
+@given(messages)
+def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_file(
+    given: list[tuple[int, int, int]],
+) -> None:
+    order, _ = ordered(given)
+    for channel in range(4):
+        own = [(given[place][2], place) for place in order if given[place][1] == channel]
+        assert own == sorted(own)
+
+
+@given(messages)
+def test_none_is_due_later_than_its_time_and_earlier_only_for_a_later_number(
+    given: list[tuple[int, int, int]],
+) -> None:
+    order, due_ns = ordered(given)
+    for place, due in zip(order, due_ns, strict=True):
+        t_ns, channel, number = given[place]
+        behind = [t for n, (t, c, k) in enumerate(given) if c == channel and (k, n) >= (number, place)]
+        assert due == min(behind) <= t_ns
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), max_size=30))
+def test_where_numbers_go_with_the_file_it_is_sorting_by_time_that_keeps_the_file_within_an_instant(
+    given: list[tuple[int, int]],
+) -> None:
+    """As in every log whose recorder missed nothing; channels' times there never go back."""
+    latest: dict[int, int] = {}
+    rising = []
+    for number, (step, channel) in enumerate(given):
+        latest[channel] = latest.get(channel, 0) + step
+        rising.append((latest[channel], channel, number))
+    order, due_ns = ordered(rising)
+    assert order == sorted(range(len(rising)), key=lambda n: rising[n][0])
+    assert due_ns == [rising[n][0] for n in order]
+
+
+def test_a_record_that_was_filled_in_later_is_played_in_its_place() -> None:
+    """By its time of sending; and by its time of arrival right before the one that it belongs before."""
+    state, other = 0, 1
+    by_sending = [(0, state, 0), (2, state, 2), (2, other, 0), (1, state, 1)]
+    assert ordered(by_sending) == ([0, 3, 1, 2], [0, 1, 2, 2])
+    by_arrival = [(0, state, 0), (2, state, 2), (2, other, 0), (9, state, 1)]
+    assert ordered(by_arrival) == ([0, 3, 1, 2], [0, 2, 2, 2])

@@ -1,0 +1,66 @@
+"""When messages are due, as a function of their times."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.pace import SPIN_NS, Pace, parse_rate, wait_until
+from trilat_net.errors import UsageError
+
+from .clocks import LookedAt
+
+times = st.integers(-(10**12), 10**14)
+rates = st.one_of(st.floats(1e-3, 1e3), st.just(math.inf))
+paces = st.builds(Pace, st.integers(0, 10**15), times, rates)
+
+
+@given(paces, times, times)
+def test_what_is_later_in_the_log_is_never_due_earlier(pace: Pace, one: int, other: int) -> None:
+    assert (pace.due_ns(min(one, other))) <= pace.due_ns(max(one, other))
+
+
+@given(paces, times)
+def test_a_deadline_is_the_origin_and_what_passed_by_the_rate(pace: Pace, t_ns: int) -> None:
+    assert pace.due_ns(pace.start_ns) == pace.origin_ns
+    passed_ns = pace.due_ns(t_ns) - pace.origin_ns
+    if math.isinf(pace.rate):
+        assert passed_ns == 0
+    else:
+        assert passed_ns * pace.rate == pytest.approx(t_ns - pace.start_ns, rel=1e-9, abs=pace.rate)
+
+
+@given(paces, st.integers(0, 10**13), times)
+def test_the_next_round_is_the_same_by_so_much_later(pace: Pace, length_ns: int, t_ns: int) -> None:
+    later_ns = pace.due_ns(pace.start_ns + length_ns) - pace.origin_ns
+    assert pace.later(length_ns).due_ns(t_ns) == pace.due_ns(t_ns) + later_ns
+
+
+@given(st.integers(0, 10**6), st.integers(0, 10**6), st.sampled_from([0, SPIN_NS]), st.integers(0, 200_000))
+def test_waiting_ends_at_the_deadline_or_at_once(
+    now_ns: int, due_ns: int, spin_ns: int, oversleep_ns: int
+) -> None:
+    clock = LookedAt(now_ns, oversleep_ns)
+    read_ns = wait_until(clock, due_ns, spin_ns)
+    assert read_ns == clock.now_ns
+    assert read_ns >= due_ns
+    if now_ns >= due_ns:
+        assert read_ns == now_ns + 1_000
+    elif spin_ns:
+        assert read_ns <= due_ns + 1_000 + max(0, oversleep_ns - spin_ns)
+    else:
+        assert read_ns == due_ns + oversleep_ns + 1_000
+
+
+@pytest.mark.parametrize(
+    ("text", "rate"), [("1", 1.0), ("0.5", 0.5), ("1e3", 1000.0), ("0", math.inf), ("max", math.inf)]
+)
+def test_rates(text: str, rate: float) -> None:
+    assert parse_rate(text) == rate
+
+
+@pytest.mark.parametrize("text", ["-1", "nan", "inf", "", "fast", "1e-4", "1001", "1e-300"])
+def test_what_is_no_rate_is_refused_with_what_would_be(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--rate is how much faster than it was, from 0\.001 to 1000, or"):
+        parse_rate(text)

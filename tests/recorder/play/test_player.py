@@ -1,0 +1,179 @@
+"""The player on a clock of the test's own: every message once, in order, when it is due."""
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.batch import BatchBuilder, MessageBatch
+from recorder.play.pace import Pace
+from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Player, PlayProgress
+from recorder.play.reader_process import MemorySource
+from recorder.play.site_stand_ins import PlayedHistory
+
+from .clocks import LookedAt
+
+MS = 1_000_000
+messages = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 2)), min_size=1, max_size=60)
+
+
+def block(given: Iterable[tuple[int, int]]) -> MessageBatch:
+    """Messages at (ms, on a channel), numbered by their time, told by their place."""
+    gathering = BatchBuilder()
+    for number, (t_ms, channel) in enumerate(sorted(given)):
+        gathering.add(t_ms * MS, channel, number, bytes([number]))
+    return gathering.ordered()
+
+
+class Trickle:
+    """A source that gives its messages in pieces, and between two of them sometimes nothing."""
+
+    whole, strays = False, 0
+
+    def __init__(self, blocks: list[MessageBatch | None]) -> None:
+        self._blocks = blocks
+        self._left = iter(blocks)
+        self.ended = False
+
+    def poll(self) -> MessageBatch | None:
+        try:
+            return next(self._left)
+        except StopIteration:
+            self.ended = True
+            return None
+
+    def fill(self) -> bool:
+        return False
+
+    def again(self) -> None:
+        self._left, self.ended = iter(self._blocks), False
+
+    def close(self) -> None:
+        pass
+
+
+class Stage:
+    """What a player needs, and what came of it: (when, on which channel, what)."""
+
+    def __init__(
+        self, source: MemorySource | Trickle, *, low_cpu: bool = False, stop_at: int = 10**9
+    ) -> None:
+        self.clock = LookedAt()
+        self.memory = PlayedHistory()
+        self.heard: list[tuple[int, int, int]] = []
+        self.looks: list[tuple[int, PlayProgress]] = []
+        self.stall_ns: dict[int, int] = {}
+        self.player = Player(
+            source,
+            self.memory,
+            self.clock,
+            lambda channel: lambda payload: self._hear(channel, payload),
+            lambda progress: self.looks.append((self.clock.now_ns, progress)),
+            lambda: len(self.heard) >= stop_at,
+            low_cpu=low_cpu,
+        )
+
+    def _hear(self, channel: int, payload: bytes) -> None:
+        self.heard.append((self.clock.now_ns, channel, payload[0]))
+        self.clock.now_ns += self.stall_ns.get(len(self.heard), 0)
+
+
+@pytest.mark.parametrize("low_cpu", [False, True])
+@given(given=messages, rate=st.sampled_from([0.5, 1.0, 4.0, math.inf]), cuts=st.lists(st.integers(0, 60)))
+def test_every_message_is_published_once_in_order_at_its_deadline(
+    given: list[tuple[int, int]], rate: float, cuts: list[int], low_cpu: bool
+) -> None:
+    whole = block(given)
+    edges = sorted({0, len(whole), *(cut for cut in cuts if cut < len(whole))})
+    pieces: list[MessageBatch | None] = []
+    for begin, end in pairwise(edges):
+        pieces += [whole.part(slice(begin, end)), None]
+    for source in (MemorySource(whole), Trickle(pieces)):
+        stage = Stage(source, low_cpu=low_cpu)
+        first_ns = stage.player.prepare()
+        assert first_ns == whole.times_ns[0]
+        pace = Pace(stage.clock.now_ns + 50 * MS, first_ns, rate)
+        stage.player.play(pace)
+        assert [number for _, _, number in stage.heard] == list(range(len(given)))
+        assert [channel for _, channel, _ in stage.heard] == whole.channels.tolist()
+        for (heard_ns, _, _), t_ns in zip(stage.heard, whole.times_ns.tolist(), strict=True):
+            assert heard_ns >= pace.due_ns(t_ns)
+            if math.isfinite(rate):  # a source that trickles makes wait for a millisecond
+                assert heard_ns <= pace.due_ns(t_ns) + (
+                    len(pieces) * MS if isinstance(source, Trickle) else 10**5
+                )
+        assert sum(stage.player.counts) == len(given)
+        assert stage.memory.made == {c: n + 1 for _, c, n in stage.heard}
+
+
+def test_a_late_message_makes_no_later_one_late() -> None:
+    """A publisher that waits for 30 ms: what was due meanwhile follows at once, the rest is in time."""
+    stage = Stage(MemorySource(block((t, 0) for t in range(60))))
+    stage.stall_ns[10] = 30 * MS
+    pace = Pace(stage.clock.now_ns, 0)
+    stage.player.prepare()
+    stage.player.play(pace)
+    late_ms = [round((ns - pace.due_ns(n * MS)) / MS) for ns, _, n in stage.heard]
+    assert late_ms == [0] * 10 + list(range(29, 0, -1)) + [0] * 21
+    assert stage.player.lateness is not None
+    assert 28_900 <= stage.player.lateness.max_us <= 29_100
+    assert stage.player.stalls == 0
+    assert stage.player.held_ns == pytest.approx(30 * MS, rel=0.01)
+
+
+def test_who_makes_a_publisher_wait_for_seconds_is_counted() -> None:
+    stage = Stage(MemorySource(block([(0, 0), (1, 0)])))
+    stage.stall_ns[1] = CUT_NS
+    stage.player.prepare()
+    stage.player.play(Pace(stage.clock.now_ns, 0))
+    assert stage.player.stalls == 1
+
+
+def test_rounds_follow_each_other_with_the_same_messages() -> None:
+    stage = Stage(MemorySource(block([(0, 0), (5, 1), (7, 0)])), stop_at=7)
+    stage.player.prepare()
+    pace = Pace(stage.clock.now_ns + MS, 0)
+    stage.player.play(pace, loop=True)
+    assert [n for _, _, n in stage.heard] == [0, 1, 2, 0, 1, 2, 0]
+    assert stage.player.rounds == 3
+    round_ns = 7 * MS + LOOP_PAUSE_NS
+    due_ns = [pace.due_ns(t * MS) + n * round_ns for n in range(3) for t in (0, 5, 7)][:7]
+    assert [heard - due for (heard, _, _), due in zip(stage.heard, due_ns, strict=True)] == pytest.approx(
+        [0] * 7, abs=10_000
+    )
+    assert stage.memory.chunk(0, 0, 9) == (0, [b"\0"])
+
+
+@pytest.mark.parametrize("count", [1, 5, 300])
+def test_it_stops_when_asked(count: int) -> None:
+    """Between two messages, and no later than it looks at anything else."""
+    stage = Stage(MemorySource(block((t % 60, 0) for t in range(250))), stop_at=count)
+    stage.player.prepare()
+    stage.player.play(Pace(stage.clock.now_ns, 0))
+    assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
+
+
+def test_everything_else_has_its_turn_even_where_no_time_is_left() -> None:
+    """As fast as can be: a hundred times a second; and while nothing is due: a thousand times."""
+    stage = Stage(MemorySource(block((0, 0) for _ in range(200))))
+    for n in range(200):
+        stage.stall_ns[n] = MS
+    stage.player.prepare()
+    stage.player.play(Pace(stage.clock.now_ns, 0, math.inf))
+    looked = [ns for ns, _ in stage.looks]
+    assert len(looked) >= 10
+    assert max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
+    quiet = Stage(MemorySource(block([(0, 0), (60, 0)])))
+    quiet.player.prepare()
+    quiet.player.play(Pace(quiet.clock.now_ns, 0))
+    assert len(quiet.looks) >= 40
+    assert [progress.published for _, progress in quiet.looks][-1] == 1
+
+
+def test_where_nothing_comes_nothing_is_played() -> None:
+    stage = Stage(Trickle([None, None]))
+    assert stage.player.prepare() is None
+    assert stage.player.lateness is None

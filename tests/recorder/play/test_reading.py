@@ -1,0 +1,159 @@
+"""What is read of a log for a replay."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.session_reader import PlaySelection, preload_messages
+from tests.golden import test_golden
+from trilat_net.errors import LogError, UsageError
+from trilat_net.execution.virtual import virtual_boot
+
+from .logs import BOOT, event, payloads, write
+
+TmpFactory = pytest.TempPathFactory
+GOLDEN = Path(test_golden.__file__).parent
+LARGE = 1 << 28
+
+
+def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -> None:
+    facts, block = preload_messages([log_file], PlaySelection(), LARGE)
+    assert block is not None
+    played: dict[str, list[bytes]] = {topic: [] for topic in facts.topics}
+    for _, channel, _, payload in block.messages():
+        played[facts.topics[channel]].append(payload)
+    published = {topic: found for topic, found in payloads(log_file).items() if topic.startswith("/trilat/")}
+    assert played == published
+    assert facts.session == "paper"
+    assert facts.boots == {name: virtual_boot(facts.scenario, name) for name in ("m1", "m2", "s")}
+    assert facts.scenario_sha256 == facts.scenario.sha256
+    assert facts.torn == {}
+
+
+def test_numbers_are_ticks_of_records_and_places_of_the_rest(log_file: Path) -> None:
+    facts, block = preload_messages([log_file], PlaySelection(), LARGE)
+    assert block is not None
+    for channel, topic in enumerate(facts.topics):
+        numbers = block.numbers[block.channels == channel].tolist()
+        assert numbers == list(range(len(numbers))), topic
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_logs_of_older_versions_are_read_too(version: int) -> None:
+    path = GOLDEN / f"v{version}.mcap"
+    facts, block = preload_messages([path], PlaySelection(), LARGE)
+    assert block is not None
+    assert facts.version == version
+    assert set(facts.boots) == {"m1", "m2", "s"}
+    read = sorted(payload for _, _, _, payload in block.messages())
+    assert read == sorted(p for found in payloads(path).values() for p in found)
+
+
+@given(start_ms=st.integers(-10, 250), length_ms=st.integers(11, 320))
+def test_a_window_is_read_and_nothing_else(
+    start_ms: int, length_ms: int, tmp_path_factory: TmpFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "window.mcap"
+    if not path.exists():
+        write(path, [("m1", n, n, n) for n in range(300)])
+    start_ns, stop_ns = start_ms * 1_000_000, (start_ms + length_ms) * 1_000_000
+    _, block = preload_messages([path], PlaySelection(start_ns=start_ns, stop_ns=stop_ns), LARGE)
+    assert block is not None
+    first, last = max(0, start_ms), min(299, start_ms + length_ms)
+    assert block.numbers.tolist() == list(range(first, last + 1))
+
+
+def test_times_are_those_of_sending_or_of_coming(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.mcap", [("m1", 0, -20, 5), ("s", 0, 1, 6), ("m1", 1, 3, 90)])
+    for time, expected in (("publish", [-20, 1, 3]), ("log", [5, 6, 90])):
+        _, block = preload_messages([path], PlaySelection(time=time), LARGE)  # type: ignore[arg-type]
+        assert block is not None
+        assert block.times_ns.tolist() == [t * 1_000_000 for t in expected]
+
+
+def test_parts_of_one_session_are_one_log_and_other_sessions_are_refused(tmp_path: Path) -> None:
+    one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
+    two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
+    facts, block = preload_messages([one, two], PlaySelection(), LARGE)
+    assert block is not None
+    assert [payload for _, _, _, payload in block.messages()] == [event("m1", n) for n in range(4)]
+    assert facts.boots == {"m1": BOOT}
+    other = write(tmp_path / "3.mcap", [("m1", 0, 0, 0)], "other")
+    with pytest.raises(LogError, match=r"3\.mcap: is of another session than .*1\.mcap"):
+        preload_messages([one, other], PlaySelection(), LARGE)
+
+
+def test_a_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "torn.mcap"
+    path.write_bytes(short_log[: len(short_log) * 95 // 100])
+    facts, block = preload_messages([path], PlaySelection(), LARGE)
+    assert block is not None
+    assert len(block) > 100
+    assert facts.torn == {path: "the file was not finished"}
+
+
+def test_more_than_the_limit_is_left_to_be_read_while_it_plays(log_file: Path) -> None:
+    for limit_bytes in (0, 50_000):
+        facts, block = preload_messages([log_file], PlaySelection(), limit_bytes)
+        assert block is None
+        assert facts.session == "paper"
+        assert set(facts.boots) == {"m1", "m2", "s"}
+
+
+@pytest.mark.parametrize(
+    ("selection", "problem"),
+    [
+        (
+            PlaySelection(start_ns=5 * 10**9),
+            r"--start 5 s: is beyond the end; .* from 0\.000 s to 0\.299 s",
+        ),
+        (PlaySelection(stop_ns=-(10**9)), r"--stop -1 s: is before the beginning"),
+        (
+            PlaySelection(include=("a/b",)),
+            r"no message for this selection; .* like trilat/paper/m1/state",
+        ),
+    ],
+)
+def test_where_nothing_is_to_be_played_it_is_said_what_there_is(
+    selection: PlaySelection, problem: str, log_file: Path
+) -> None:
+    with pytest.raises(UsageError, match=problem):
+        preload_messages([log_file], selection, LARGE)
+
+
+def test_a_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)])
+    _, block = preload_messages([path], PlaySelection(), LARGE)
+    assert block is not None
+    assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]
+
+
+@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255), keep=st.floats(0.2, 1.0))
+def test_a_file_that_was_changed_or_cut_is_read_or_refused(
+    place: float, bits: int, keep: float, tmp_path_factory: TmpFactory
+) -> None:
+    base = tmp_path_factory.getbasetemp()
+    path, whole = base / "changed.mcap", base / "whole.mcap"
+    if not whole.exists():
+        write(whole, [("m1", n, n, n) for n in range(5)])
+    data = bytearray(whole.read_bytes())
+    data[int(place * len(data))] ^= bits
+    path.write_bytes(data[: int(keep * len(data))])
+    try:
+        facts, block = preload_messages([path], PlaySelection(), LARGE)
+    except (LogError, UsageError):
+        return
+    assert block is not None
+    assert facts.torn or keep == 1.0 or len(block) == 5
+
+
+def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.mcap"
+    with pytest.raises(LogError, match=r"missing\.mcap: cannot be read"):
+        preload_messages([missing], PlaySelection(), LARGE)
+    garbage = tmp_path / "garbage.mcap"
+    garbage.write_bytes(b"garbage" * 100)
+    with pytest.raises(LogError, match="is no MCAP file"):
+        preload_messages([garbage], PlaySelection(), LARGE)

@@ -1,0 +1,76 @@
+"""What is played of a log."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.session_reader import PlaySelection, parse_selection
+from trilat_net.errors import UsageError
+
+SITES = ("m1", "m2", "s")
+TOPICS = [
+    "/trilat/paper/m1/state",
+    "/trilat/paper/m1/link",
+    "/trilat/paper/s/event",
+    "/trilat/paper/recorder/event",
+    "/trilat/paper/recorder/stats",
+    "/viz/m1/joint_states",
+]
+
+
+def taken(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
+    selection = parse_selection(include, exclude, None, None, None, "publish")
+    return [topic for topic in TOPICS if selection.takes(topic, SITES)]
+
+
+def test_by_default_all_that_sites_published_and_nothing_else() -> None:
+    assert taken() == TOPICS[:3]
+
+
+def test_what_is_included_is_all_that_is_played() -> None:
+    assert taken(("/viz/**",)) == TOPICS[5:]
+    assert taken(("**/state", "trilat/*/s/*")) == [TOPICS[0], TOPICS[2]]
+    assert taken(("**",)) == TOPICS
+
+
+def test_what_is_excluded_is_not_whatever_is_included() -> None:
+    assert taken(exclude=("**/link",)) == [TOPICS[0], TOPICS[2]]
+    assert taken(("**",), ("/trilat/**",)) == TOPICS[5:]
+
+
+@given(st.none() | st.integers(-5, 5), st.none() | st.integers(-5, 5), st.integers(-9, 9))
+def test_a_window_holds_its_ends(start_ns: int | None, stop_ns: int | None, t_ns: int) -> None:
+    inside = (start_ns is None or start_ns <= t_ns) and (stop_ns is None or t_ns <= stop_ns)
+    assert PlaySelection(start_ns=start_ns, stop_ns=stop_ns).holds(t_ns) == inside
+
+
+def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
+    window = parse_selection((), (), 2.0, None, 0.5, "log")
+    assert (window.start_ns, window.stop_ns, window.time) == (2_000_000_000, 2_500_000_000, "log")
+    window = parse_selection((), (), None, None, 0.5, "publish")
+    assert (window.start_ns, window.stop_ns) == (None, 500_000_000)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "stop_s", "duration_s", "problem"),
+    [
+        (None, 1.0, 1.0, "--stop and --duration say the same"),
+        (2.0, 2.0, None, r"--stop is after --start \(2 s\), not 2 s"),
+        (None, None, 0.0, "--duration is more than 0 s"),
+        (None, None, -1.0, "--duration is more than 0 s"),
+        (float("nan"), None, None, "--start is a number of seconds"),
+        (None, float("inf"), None, "--stop is a number of seconds"),
+        (1e300, None, None, "--start is a number of seconds"),
+    ],
+)
+def test_windows_that_cannot_be_meant(
+    start_s: float | None, stop_s: float | None, duration_s: float | None, problem: str
+) -> None:
+    with pytest.raises(UsageError, match=problem):
+        parse_selection((), (), start_s, stop_s, duration_s, "publish")
+
+
+@pytest.mark.parametrize("text", ["", "/", "a//b", "m*", "**x/state", "a/*b"])
+def test_what_is_no_key_expression_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--exclude is a key expression like"):
+        parse_selection((), (text,), None, None, None, "publish")

@@ -1,0 +1,167 @@
+"""Figures for papers: sizes, fonts, words, files. What they show is tested beside what draws them."""
+
+import re
+from functools import cache
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+import trilat_net
+from tests.analysis import logs
+from tests.reporting.layout import misplaced
+from trilat_net.errors import UsageError
+from trilat_net.reporting.figure_size import COLUMN_IN, PAGE_IN, make_print_size
+from trilat_net.reporting.figures import contact_force, registry
+from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
+from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
+
+UNIT = re.compile(r"\((s|rad|rad/s|m|mm|N|N m|kg m|kg m²|J|ms|µs|count|%|1)\)$")
+WALLED = {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 20}
+"""Until the tip is in the wall."""
+
+
+@cache
+def walled():
+    return trilat_net.simulate("contact", WALLED)
+
+
+@cache
+def example(name):
+    """A log that has something to show in a figure: changes and marks where it may."""
+    if name in ("operation", "operator_torques", "hands_moved"):
+        return logs.simulated("paper")
+    return walled() if name == "contact" else logs.timed(logs.busy().log)
+
+
+@cache
+def drawn(name, width_in):
+    return figure(example(name), name, width_in)
+
+
+def pdf_of(name, folder, width_in=COLUMN_IN):
+    path = folder / f"{name}.pdf"
+    write_figure(drawn(name, width_in), path, make_print_size(width_in).dpi)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_in_one_column_no_word_is_cut_off_or_lies_on_another(name):
+    made = drawn(name, COLUMN_IN)
+    assert made.get_figwidth() == COLUMN_IN
+    assert misplaced(made) == []
+
+
+@pytest.mark.parametrize("name", ["positions", "authority", "certificate"])
+def test_nor_in_two(name):
+    made = drawn(name, PAGE_IN)
+    assert made.get_figwidth() == PAGE_IN
+    assert misplaced(made) == []
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_all_type_is_8_pt(name):
+    made = drawn(name, COLUMN_IN)
+    assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {8.0}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_axis_says_its_unit(name):
+    for axes in drawn(name, COLUMN_IN).axes:
+        spec = axes.get_subplotspec()
+        below_it_is_the_same = len(axes.get_shared_x_axes().get_siblings(axes)) > 1
+        if spec.is_last_row() or not below_it_is_the_same:
+            assert UNIT.search(axes.get_xlabel()), axes.get_xlabel()
+        if spec.is_first_col():
+            assert UNIT.search(axes.get_ylabel()), axes.get_ylabel()
+
+
+@pytest.mark.parametrize("name", ["parameter_estimates", "contact", "certificate"])
+def test_a_pdf_is_one_page_of_the_width_with_its_fonts_and_no_date(name, tmp_path):
+    """252 pt are 3.5 in; Type 42 is TrueType, which journals take where they refuse Type 3."""
+    data = pdf_of(name, tmp_path)
+    (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+) ?\]", data)
+    left, bottom, right, top = map(float, box.split())
+    assert (left, bottom, right) == (0.0, 0.0, pytest.approx(252.0))
+    assert top == pytest.approx(72.0 * drawn(name, COLUMN_IN).get_figheight())
+    assert len(re.findall(rb"/Type /Page\b(?!s)", data)) == 1
+    assert b"/Type3" not in data
+    assert data.count(b"/Subtype /Type0") == data.count(b"/FontFile2") > 0
+    assert b"CreationDate" not in data
+    assert b"/Subtype /Image" not in data
+
+
+@pytest.mark.parametrize("kind", FIGURE_FORMATS)
+def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
+    first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
+    for path in (first, second):
+        write_figure(figure(walled(), "contact"), path, make_print_size(COLUMN_IN).dpi)
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_png_has_600_dots_per_inch(tmp_path):
+    (path,) = write_figures(walled(), tmp_path, ["contact"], formats=["png"])
+    assert int.from_bytes(path.read_bytes()[16:20], "big") == 2100
+
+
+def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
+    before = dict(mpl.rcParams)
+    pdf_of("contact", tmp_path)
+    assert dict(mpl.rcParams) == before
+
+
+def test_every_figure_of_the_report_can_be_had_for_a_paper():
+    of_report = {name for name, _ in registry.draw_report_figures(logs.busy().log, None)}
+    assert of_report <= set(FIGURES)
+
+
+def test_a_log_has_the_figures_that_it_has_something_for():
+    have = set(list_drawable_figures(walled()))
+    assert {"contact", "operation", "positions"} <= have
+    assert (
+        not {"authority", "certificate", "parameter_estimates", "loop_timing", "delay_distributions"} & have
+    )
+    assert "contact" not in list_drawable_figures(logs.busy().log)
+    assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
+
+
+def test_the_force_of_a_wall_is_what_the_record_says_of_the_arm():
+    """J'F of the drawn force along the normal is the recorded torque ON the arm: the wall is all there is."""
+    log = walled()
+    part, wall = log["s"], log.scenario.sites["s"].environment[0]
+    above = contact_force.draw_contact(log).axes[0]
+    t_s, force = above.lines[0].get_data()
+    rows = np.rint(t_s * part.rate_hz).astype(int)
+    q = part.q[rows]
+    outer = np.sin(q.sum(axis=1))
+    into_x = np.stack([-np.sin(q[:, 0]) - outer, -outer], axis=1)  # d x_tip / d q, links of 1 m
+    assert force.max() > 1.0
+    assert -part.tau_x[rows] == pytest.approx(into_x * (wall.normal[0] * force)[:, None], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "said"),
+    [
+        (["setling"], {}, "did you mean 'settling'"),
+        (["x"], {}, "there are operation"),
+        (["authority"], {}, "shares of all sites are constant"),
+        (["contact"], {"width_in": 5.0}, "3.5 or 7 in"),
+        (["contact"], {"formats": ["eps"]}, "pdf, png, svg"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is(names, options, said, tmp_path):
+    with pytest.raises(UsageError, match=said):
+        write_figures(walled(), tmp_path / "new", ["positions", *names], **options)
+    assert not (tmp_path / "new").exists()
+
+
+def test_files_are_replaced_only_by_force(tmp_path):
+    (path,) = write_figures(walled(), tmp_path, ["contact"], formats=["pdf"])
+    data = path.read_bytes()
+    with pytest.raises(UsageError, match="exists"):
+        write_figures(walled(), tmp_path, ["contact"], formats=["svg", "pdf"])
+    assert not path.with_suffix(".svg").exists()
+    path.write_bytes(b"")
+    write_figures(walled(), tmp_path, ["contact"], formats=["pdf"], force=True)
+    assert path.read_bytes() == data

@@ -1,0 +1,164 @@
+"""What other programs read of an export is the log, bit for bit."""
+
+import csv
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.io
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from tests.reporting.exported import expected, exported, log
+from trilat_net.scenario import parse_scenario
+
+
+def bits(value: float) -> bytes:
+    return struct.pack("<d", value)
+
+
+def same(value: Any, wanted: Any) -> bool:
+    """Equal as numbers, and a float bit for bit."""
+    if isinstance(wanted, float):
+        return isinstance(value, float) and bits(value) == bits(wanted)
+    return type(value) is type(wanted) and value == wanted
+
+
+def test_there_is_something_to_export() -> None:
+    wanted = expected()
+    assert len(wanted) == 3 * 3 + 1
+    assert None in wanted["a_state"]["used_b_tick"]
+    assert {"run", "hold", "return"} & set(wanted["a_state"]["mode"])
+    assert any("\n" in text for text in wanted["events"]["text"])
+    assert None in wanted["a_link"]["offset_c_us"]
+
+
+def test_csv_read_by_the_standard_library(tmp_path: Path) -> None:
+    folder = exported("csv", tmp_path)
+    for name, columns in expected().items():
+        with (folder / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
+            rows = list(csv.reader(stream))
+        assert rows[0] == list(columns)
+        for place, (_, values) in enumerate(columns.items()):
+            for row, wanted in zip(rows[1:], values, strict=True):
+                text = row[place]
+                read = text if isinstance(wanted, str) else None if text == "" else type(wanted)(text)
+                assert same(read, wanted)
+
+
+def test_csv_read_by_polars(tmp_path: Path) -> None:
+    folder = exported("csv", tmp_path)
+    wanted = expected()["b_state"]
+    frame = pl.read_csv(folder / "b_state.csv")
+    assert frame.columns == list(wanted)
+    for name, values in wanted.items():
+        assert all(map(same, frame[name].to_list(), values))
+
+
+def test_parquet_read_by_polars(tmp_path: Path) -> None:
+    folder = exported("parquet", tmp_path)
+    for name, columns in expected().items():
+        frame = pl.read_parquet(folder / f"{name}.parquet")
+        assert frame.columns == list(columns)
+        for column, values in columns.items():
+            assert all(map(same, frame[column].to_list(), values))
+
+
+def test_npz_read_by_numpy(tmp_path: Path) -> None:
+    arrays = np.load(exported("npz", tmp_path))  # which refuses pickles
+    found = set()
+    for name, columns in expected().items():
+        site, _, kind = name.partition("_")
+        place = site if kind in ("", "state") else f"{site}/{kind}"
+        for column, values in columns.items():
+            found.add(f"{place}/{column}")
+            read = arrays[f"{place}/{column}"].tolist()
+            for value, wanted in zip(read, values, strict=True):
+                if None in values:  # NaN needs a float
+                    assert np.isnan(value) if wanted is None else value == wanted
+                else:
+                    assert same(value, wanted)
+    assert set(arrays) == found | {"about_json", "scenario_toml"}
+    assert parse_scenario(str(arrays["scenario_toml"])) == log().scenario
+    assert json.loads(str(arrays["about_json"]))["session"] == log().session
+
+
+def test_mat_read_by_scipy(tmp_path: Path) -> None:
+    variables = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)
+    about = json.loads(variables["about_json"])
+    assert about["tables"].keys() == {
+        *(f"{site}{kind}" for site in "abc" for kind in ("", ".link", ".arrivals")),
+        "events",
+    }
+    assert parse_scenario(variables["scenario_toml"]) == log().scenario
+    for name, columns in expected().items():
+        site, _, kind = name.partition("_")
+        struct_ = variables[site] if kind in ("", "state") else variables[site][kind]
+        for column, values in columns.items():
+            read = np.atleast_1d(struct_[column]).tolist()
+            for value, wanted in zip(read, values, strict=True):
+                if isinstance(wanted, str):
+                    text = value if isinstance(value, str) else ""  # an empty cell is an empty array
+                    assert text.rstrip() == wanted
+                elif wanted is None:
+                    assert np.isnan(value)
+                else:
+                    assert value == wanted
+                    assert bits(float(value)) == bits(float(wanted))
+            said = about["tables"][site if kind in ("", "state") else f"{site}.{kind}"]["columns"][column]
+            units = struct_["units"][column]
+            assert (units if isinstance(units, str) else "") == said["unit"]
+
+
+def test_stamps_of_a_live_log_are_exact_in_matlab(tmp_path: Path) -> None:
+    """1.7e18 ns are no exact double."""
+    sites = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)
+    assert sites["a"]["publish_time_ns"].dtype == np.int64
+    assert sites["a"]["publish_time_ns"].tolist() == log()["a"].publish_time_ns.tolist()
+    assert sites["a"]["tick"].dtype == np.float64
+
+
+def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
+    path, wanted = exported("ros2", tmp_path), expected()
+    found: dict[str, list[list[float]]] = {}
+    with path.open("rb") as stream:
+        for _, channel, message, decoded in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages(topics=[f"/{site}/joint_states" for site in "abc"]):
+            row = [*decoded.position, *decoded.velocity, *decoded.effort, message.publish_time]
+            found.setdefault(channel.topic.split("/")[1], []).append(row)
+    names = ("q1_rad", "q2_rad", "qd1_rad_s", "qd2_rad_s", "tau1_nm", "tau2_nm", "publish_time_ns")
+    for site in "abc":
+        rows = zip(*(wanted[f"{site}_state"][name] for name in names), strict=True)
+        assert found[site] == [list(row) for row in rows]
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
+    folder = exported(form, tmp_path)
+    about = json.loads((folder / "about.json").read_text())
+    assert set(about["tables"]) == {path.name for path in folder.iterdir()} - {"about.json", "scenario.toml"}
+    assert about["session"] == log().session
+    assert about["complete"] is True
+    state = about["tables"][f"a_state.{form}"]
+    assert state["rows"] == len(log()["a"])
+    assert state["columns"]["q1_rad"] == {"unit": "rad", "meaning": "joint angles, joint 1", "source": "q[0]"}
+    assert (folder / "scenario.toml").read_bytes().decode() == log().scenario_text
+
+
+@pytest.mark.parametrize("form", ["ros2", "csv", "parquet", "npz", "mat"])
+def test_an_export_has_no_stamp_of_its_own(form: str, tmp_path: Path) -> None:
+    """The same log gives the same bytes, but where a format stamps its file."""
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        exported(form, tmp_path / name)
+    one, two = (
+        {p.name: p.read_bytes() for p in (tmp_path / n).rglob("*") if p.is_file()} for n in ("one", "two")
+    )
+    if form == "mat":  # its first 116 bytes are a text with the date
+        one, two = ({name: data[128:] for name, data in files.items()} for files in (one, two))
+    assert one == two

@@ -1,0 +1,84 @@
+"""An export is there as a whole or not at all, and replaces only what one asks it to replace."""
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from trilat_net.errors import LogRefused, UsageError
+from trilat_net.files import EXPORT_MANIFEST, refuse_existing_export, stage_export
+
+
+def everything(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): path.read_text() if path.is_file() else ""
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def make(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
+    with stage_export(path, folder=folder, force=force) as made:
+        (made / EXPORT_MANIFEST if folder else made).write_text(text)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) -> None:
+    make(tmp_path / "out", "1", folder=folder)
+    there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
+    assert everything(tmp_path) == there
+    with pytest.raises(UsageError, match="exists; choose another name with -o, or replace it with --force"):
+        make(tmp_path / "out", "2", folder=folder)
+    assert everything(tmp_path) == there
+    make(tmp_path / "out", "3", folder=folder, force=True)
+    assert everything(tmp_path) == {name: text and "3" for name, text in there.items()}
+
+
+def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
+    with stage_export(path, folder=folder, force=True) as made:
+        (made / "half" if folder else made).write_text("half")
+        raise error
+
+
+@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])
+def test_whatever_goes_wrong_leaves_what_was_there(
+    folder: bool, before: bool, error: BaseException, tmp_path: Path
+) -> None:
+    if before:
+        make(tmp_path / "out", "1", folder=folder)
+    there = everything(tmp_path)
+    with pytest.raises(type(error)):
+        break_off(tmp_path / "out", error, folder=folder)
+    assert everything(tmp_path) == there
+
+
+def test_a_full_disk_is_told_with_its_exit_code_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(LogRefused, match="No space left") as raised:
+        break_off(tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False)
+    assert raised.value.exit_code == 5
+    assert everything(tmp_path) == {}
+
+
+def test_a_folder_that_was_not_made_here_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years")
+    with pytest.raises(UsageError, match="is no folder that was exported"):
+        make(tmp_path / "mine", "1", folder=True, force=True)
+    with pytest.raises(UsageError, match="is no file that was exported"):
+        make(tmp_path / "mine", "1", folder=False, force=True)
+    (tmp_path / "notes").write_text("notes")
+    with pytest.raises(UsageError, match="is no folder that was exported"):
+        refuse_existing_export(tmp_path / "notes", folder=True, force=True)
+    assert everything(tmp_path)["mine/thesis.tex"] == "years"
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    make(tmp_path / "out", "1", folder=True)
+    assert everything(tmp_path)[f"out/{EXPORT_MANIFEST}"] == "1"
+
+
+def test_a_place_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"out: cannot be written: No such file"):
+        make(tmp_path / "none" / "out", "1", folder=False)

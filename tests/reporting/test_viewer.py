@@ -1,0 +1,152 @@
+"""How Rerun is called: with the log itself, or with what was made of it, and with its layout."""
+
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from tests.log.programs import RERUN, printed
+from tests.log.standard_files import made
+from trilat_net.errors import LogError, RunFailed, UsageError
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.ros2.ros2_messages import read_ros2_channels
+from trilat_net.reporting import rerun_viewer
+from trilat_net.reporting.rerun_viewer import ViewerOptions, open_rerun
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return made(tmp_path_factory.mktemp("files"))
+
+
+class Rerun:
+    """A stand-in for the program: looks at its files while they are there, where it is called first."""
+
+    def __init__(self, code: int = 0) -> None:
+        self.code = code
+        self.command: list[str] = []
+        self.environment: Mapping[str, str] = {}
+        self.log = self.layout = Path()
+        self.topics: set[str] = set()
+
+    def __call__(self, command: list[str], environment: Mapping[str, str]) -> int:
+        self.command, self.environment = command, environment
+        for file in map(Path, command):
+            if file.suffix == ".mcap":
+                self.log, self.topics = file, set(read_ros2_channels(file))
+            if file.suffix == ".rbl":
+                self.layout = file
+                assert file.stat().st_size > 0
+        return self.code
+
+
+def shown(paths: list[Path], show: ViewerOptions, code: int = 0) -> tuple[Rerun, list[str]]:
+    said: list[str] = []
+    rerun = Rerun(code)
+    open_rerun(paths, lambda: open_log(*paths), show, said.append, rerun)
+    return rerun, said
+
+
+def never() -> Log:
+    raise AssertionError("it was read")
+
+
+def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> None:
+    rerun = Rerun()
+    open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)
+    assert rerun.log == files["live"]
+    assert rerun.command[:3] == [sys.executable, "-m", "rerun"]
+    assert rerun.command[rerun.command.index("--bind") + 1] == "127.0.0.1"
+    assert rerun.environment["RERUN_ANALYTICS_ENABLED"] == "false"
+
+
+def test_what_was_made_for_it_is_gone_when_the_viewer_is(files: dict[str, Path]) -> None:
+    rerun, said = shown([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
+    assert "/m/joint_states" in rerun.topics
+    assert said == ["making standard channels of every record ..."]
+    assert not rerun.log.exists()
+    assert not rerun.layout.exists()
+    assert files["live"].exists()
+
+
+def test_parts_are_shown_as_one(files: dict[str, Path]) -> None:
+    parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
+    rerun, _ = shown(parts, ViewerOptions(save=Path("x.rrd")))
+    assert rerun.log.name == parts[0].name
+    assert "/m/joint_states" in rerun.topics
+
+
+def test_a_log_that_was_not_finished_is_shown_as_far_as_it_is_whole(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
+    torn = tmp_path / "run.mcap.active"
+    torn.write_bytes(files["live"].read_bytes()[:150_000])
+    rerun, _ = shown([torn], ViewerOptions(save=Path("x.rrd")))
+    assert rerun.log.name == "run.mcap"
+    assert "/s/error" in rerun.topics
+
+
+@pytest.mark.parametrize(
+    ("name", "called"),
+    [("run.mcap", "run"), ("my run.2.mcap", "my-run-2"), ("-x.mcap.active", "x"), ("ü.mcap", "log")],
+)
+def test_a_name_that_rerun_does_not_take_is_replaced(
+    files: dict[str, Path], tmp_path: Path, name: str, called: str
+) -> None:
+    """It would find another one for the log than for its layout, and complain."""
+    (tmp_path / name).write_bytes(files["live"].read_bytes())
+    rerun, _ = shown([tmp_path / name], ViewerOptions(save=Path("x.rrd")))
+    assert rerun.log.stem == called
+    assert "/viz/m/error" in rerun.topics
+
+
+def test_a_browser_is_told_where_to_go(files: dict[str, Path]) -> None:
+    rerun, (told,) = shown([files["live"]], ViewerOptions(web=True))
+    page = rerun.command[rerun.command.index("--web-viewer-port") + 1]
+    port = rerun.command[rerun.command.index("--port") + 1]
+    assert "--serve-web" in rerun.command
+    assert told.startswith(
+        f"open http://127.0.0.1:{page}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
+    )
+
+
+def test_a_window_needs_a_display(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
+    with pytest.raises(UsageError, match=r"no display here; .* --web"):
+        shown([files["live"]], ViewerOptions())
+    monkeypatch.setenv("DISPLAY", ":0")
+    rerun, _ = shown([files["live"]], ViewerOptions())
+    assert "--serve-web" not in rerun.command
+    assert "--save" not in rerun.command
+
+
+def test_an_end_that_was_bad_is_told(files: dict[str, Path]) -> None:
+    with pytest.raises(RunFailed, match="Rerun ended with exit code 3"):
+        shown([files["live"]], ViewerOptions(web=True), code=3)
+
+
+def test_without_rerun_it_says_what_to_install(
+    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(UsageError, match=r"pip install 'trilat-net\[view\]'"):
+        shown([files["live"]], ViewerOptions(web=True))
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="No such file"):
+        shown([tmp_path / "none.mcap"], ViewerOptions(web=True))
+
+
+def test_rerun_takes_log_and_layout_into_one_recording(files: dict[str, Path], tmp_path: Path) -> None:
+    """The program itself: the layout is of the log's own application, so that Rerun applies it."""
+    recording = tmp_path / "run.rrd"
+    open_rerun([files["live"]], never, ViewerOptions(save=recording), lambda _: None)
+    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', text))
+    assert stores == {("Blueprint", "live"), ("Recording", "live")}
+    assert [name for name in read_ros2_channels(files["live"]) if name not in text] == []

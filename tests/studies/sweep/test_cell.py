@@ -1,0 +1,46 @@
+"""One run: what its command makes is what was judged."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tests.studies.sweep.quick import Judge, asked
+from trilat_net.cli.options import load_chosen_scenario
+from trilat_net.errors import ScenarioError
+from trilat_net.studies.sweep import cell_result
+from trilat_net.studies.sweep.sweep_cell import apply_diff, build_sim_command, run_cell
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
+    found = Judge()
+    monkeypatch.setattr(cell_result, "classify_cell", found)
+    return found
+
+
+def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
+    plan = asked(tmp_path, "link.loss=0.1", seeds=2)
+    entry = run_cell(plan.task(5, 2))
+    (text,) = judge.texts
+    assert apply_diff(entry.scenario, plan.base.text) == text
+    assert entry.outcome == judge(text, plan.longest_s)
+    assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
+    assert not run_cell(asked(tmp_path).task(5, 1)).random
+
+
+def test_the_command_of_a_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
+    plan = asked(tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"])
+    run_cell(plan.task(1, 1))
+    words = shlex.split(build_sim_command(plan.written, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
+    assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
+    assert words[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
+    settings = words[3:-6]
+    assert settings[::2] == ["--set"] * (len(settings) // 2)
+    assert load_chosen_scenario(words[2], settings[1::2], 0.25, 1).text == judge.texts[0]
+
+
+def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
+    task = asked(tmp_path).task(7, 1)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
+    with pytest.raises(ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"):
+        run_cell(task)

@@ -1,0 +1,114 @@
+"""A cell's word is the certificate's on a log of the same run, and extending is running longer."""
+
+import io
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from trilat_net.analysis.run_end import EndBehaviour, classify_log_end
+from trilat_net.execution import virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.studies.sweep.cell_result import (
+    CLASS_OF_MOTION,
+    CellClass,
+    CellResult,
+    classify_cell,
+    is_conclusive,
+)
+
+RUNS: dict[str, tuple[str, dict[str, Any]]] = {
+    "converged": ("two_sites", {"duration_s": 20.0}),
+    "decaying": ("free", {"duration_s": 8.0}),
+    "growing": ("p_d_margin", {"control.d": 0.7, "duration_s": 15.0}),
+    "diverged": ("p_d_margin", {"control.d": 0.2, "duration_s": 20.0, "limits.qd_limit_rad_s": 5.0}),
+    "short": ("free", {"duration_s": 0.3}),
+    "rates": ("free", {"duration_s": 4.0, "sites.s.rate_hz": 300, "sites.m1.rate_hz": 30}),
+}
+
+
+def judged(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
+    return classify_cell(scenario.text, longest_s)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
+    name, changes = RUNS[run]
+    scenario = load_scenario(name, changes)
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream)
+    stream.seek(0)
+    log = open_log(stream)
+    found, expected = judged(scenario), classify_log_end(log)
+    assert found.motion is expected.motion
+    assert found.verdict is CLASS_OF_MOTION[expected.motion]
+    assert (found.end_error_rad, found.end_speed_rad_s) == (
+        expected.end.end_error_rad,
+        expected.end.end_speed_rad_s,
+    )
+    rate = expected.end.error.rate_per_s
+    assert found.error_rate_per_s == (None if math.isnan(rate) else rate)
+    assert found.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "verdict"),
+    [
+        ("free", {}, CellClass.CONVERGED),
+        ("p_d_margin", {"control.d": 2.5}, CellClass.CONVERGED),
+        ("p_d_margin", {"control.d": 0.5}, CellClass.DIVERGED),
+        ("contact", {"duration_s": 60.0}, CellClass.BOUNDED),
+        ("contact", {"duration_s": 60.0, "sites.m.control.k_f": 0.2}, CellClass.CONVERGED),
+    ],
+)
+def test_what_the_scenarios_are_known_to_do(name: str, changes: dict[str, Any], verdict: CellClass) -> None:
+    """The figures of these scenarios, from an independent implementation, stand in their texts."""
+    assert judged(load_scenario(name, changes)).verdict is verdict
+
+
+def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
+    """Of a growth of 0.01/s nothing is to be seen in 4 s."""
+    changes = {"control.d": 0.95, "duration_s": 4.0}
+    scenario = load_scenario("p_d_margin", changes)
+    assert not is_conclusive(judged(scenario))
+    found = judged(scenario, longest_s=256.0)
+    assert found.verdict is CellClass.DIVERGED
+    assert found.extended > 0
+    assert found.ran_s == 4.0 * 2**found.extended
+    whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
+    assert msgspec.structs.replace(found, extended=0) == whole
+
+
+def test_a_slow_trend_of_a_run_with_chance_in_it_decides_nothing() -> None:
+    """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
+    found = judged(
+        load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}), longest_s=160.0
+    )
+    assert (found.motion, found.verdict) == (EndBehaviour.DECAYS, CellClass.UNDECIDED)
+    assert found.end_speed_rad_s > 5.0
+
+
+def test_it_is_never_extended_beyond_what_was_asked() -> None:
+    scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
+    found = judged(scenario, longest_s=10.0)
+    assert (found.ran_s, found.extended) == (10.0, 2)
+    assert not is_conclusive(found)
+
+
+@pytest.mark.parametrize("d", [0.95, 1.0])
+def test_a_few_per_cent_beside_the_edge_the_word_is_right(d: float) -> None:
+    """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here: what 20 s cannot tell, 160 s do."""
+    scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
+    found = judged(scenario, longest_s=160.0)
+    assert found.extended > 0
+    assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
+
+
+def test_a_run_that_diverges_says_when() -> None:
+    found = judged(load_scenario(*RUNS["diverged"]), longest_s=100.0)
+    assert found.motion is EndBehaviour.DIVERGED
+    assert found.diverged_s == found.ran_s
+    assert found.extended == 0
+    assert found.end_speed_rad_s > 5.0

@@ -1,0 +1,153 @@
+"""Margins over a plane: a function of each place alone, beside theory, as table, page and JSON."""
+
+import json
+
+import pytest
+
+from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.errors import UsageError
+from trilat_net.scenario import parse_scenario
+from trilat_net.studies.sweep import cell_result
+from trilat_net.studies.sweep.cell_result import CellClass, CellResult
+from trilat_net.studies.sweep.margin_search import (
+    GridPointMargin,
+    KeyMargin,
+    SearchRange,
+    StableInterval,
+    build_margin_command,
+    build_margin_page,
+    format_range_axis,
+    margins_to_json,
+    parse_search_range,
+    search_margins,
+    tabulate_margins,
+)
+from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_sweep
+
+WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
+
+
+def asked(*over: str, **settings: object) -> SweepPlan:
+    axes = over or ("link.delay_ms=100,200",)
+    return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A judge that goes by the condition of P+d, and remembers nothing."""
+
+    def judge(text: str, _: float) -> CellResult:
+        scenario = parse_scenario(text)
+        delay_s = max(link.moments().mean_ms for link in scenario.links.values()) / 1e3
+        stable = scenario.sites["s"].control.d[0] > 5.0 * delay_s  # type: ignore[union-attr]
+        verdict = CellClass.CONVERGED if stable else CellClass.DIVERGED
+        motion = EndBehaviour.CONVERGED if stable else EndBehaviour.DIVERGED
+        return CellResult(verdict, motion, 1.0, 0, 0.0, 0.0, None, None, 0.0, None, None)
+
+    monkeypatch.setattr(cell_result, "classify_cell", judge)
+
+
+@pytest.mark.usefixtures("by_the_line")
+def test_every_place_has_its_edge_beside_theory() -> None:
+    found = search_margins(asked(), WITHIN, 1)
+    assert [one.cell.values for one in found] == [(100.0,), (200.0,)]
+    for one, edge in zip(found, (0.5, 1.0), strict=True):
+        (span,) = one.margin.spans
+        assert span.low <= edge <= span.high
+        assert one.closed == pytest.approx(edge)
+        assert one.linear == (pytest.approx(edge, rel=0.04),)
+        assert one.remark == ""
+
+
+@pytest.mark.usefixtures("by_the_line")
+def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
+    lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
+    assert [(one.cell.values, one.seed) for one in lossy] == [((0.0,), 1), ((0.1,), 1), ((0.1,), 2)]
+
+
+@pytest.mark.usefixtures("by_the_line")
+def test_progress_is_told_to_its_end() -> None:
+    told: list[tuple[int, int]] = []
+    search_margins(asked(), WITHIN, 1, lambda done, total: told.append((done, total)))
+    assert told == [(1, 2), (2, 2)]
+
+
+def test_the_number_of_processes_changes_nothing() -> None:
+    """Runs of p_d at 100 Hz, 1 s: what they show is another question."""
+    brief = ["duration_s=1.0", "rate_hz=100"]
+    within = WITHIN._replace(tolerance=0.2)
+    wanted = plan_sweep(
+        "p_d_margin", brief, over=["link.delay_ms=100,400", format_range_axis(within)], longest_s=1.0
+    )
+    assert search_margins(wanted, within, 1) == search_margins(wanted, within, 2)
+
+
+@pytest.mark.usefixtures("by_the_line")
+def test_a_key_of_whole_numbers_is_searched_in_them() -> None:
+    """The judge calls 300 Hz and 50 Hz alike: what counts is that no value between whole numbers is run."""
+    within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
+    wanted = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
+    assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
+
+
+def found(*spans: StableInterval, stable: bool | None = None) -> GridPointMargin:
+    cell = asked().cell(0)
+    return GridPointMargin(
+        cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
+    )
+
+
+def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
+    edges = (StableInterval(0.49, 0.492, False, True), StableInterval(1.8, 2.1, True, False))
+    grid = tabulate_margins(
+        asked(), WITHIN, [found(*edges), found(stable=True), found(stable=False), found()]
+    )
+    edge = grid.heads.index("edge of d (N m s/rad)")
+    assert [row[edge] for row in grid.rows] == [
+        "0.49 to 0.492",
+        "1.8 to 2.1 (undecided between)",
+        "none: all stable",
+        "none: nothing stable",
+        "none: nothing decided",
+    ]
+    assert [row[edge + 1] for row in grid.rows] == ["above", "below", "-", "-", "-"]
+    linear = grid.heads.index("linear")
+    assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
+    assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
+    assert "not monotone in 1 of 2 places" in build_margin_page(
+        asked(), WITHIN, [found(*edges), found(stable=True)]
+    )
+
+
+def test_the_facts_are_json_and_name_the_command() -> None:
+    told = json.loads(
+        json.dumps(
+            margins_to_json(asked(), WITHIN, [found(StableInterval(0.49, 0.492, False, True))]),
+            allow_nan=False,
+        )
+    )
+    assert told["command"] == build_margin_command(asked(), WITHIN)
+    assert told["command"].endswith("--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005")
+    (place,) = told["places"]
+    assert place["link.delay_ms"] == 100.0
+    assert place["edges"] == [{"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}]
+
+
+def test_remarks_are_told_once() -> None:
+    text = build_margin_page(asked(), WITHIN, [found()._replace(remark="as it is")] * 2)
+    assert text.count("As it is.") == 1
+
+
+@pytest.mark.parametrize(
+    "text", ["control.d", "control.d=1", "control.d=3:1", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
+)
+def test_what_is_no_range_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--margin reads KEY=FROM:TO"):
+        parse_search_range(text)
+
+
+def test_a_range_is_read_as_it_is_written() -> None:
+    assert parse_search_range("control.d=0.2:3") == WITHIN
+    assert format_range_axis(WITHIN) == "control.d=0.2,3"
+    with pytest.raises(UsageError, match="share of the edge's value"):
+        parse_search_range("control.d=0.2:3", 0.0)

@@ -1,0 +1,53 @@
+"""Places: every run is counted once, and a share has its interval."""
+
+from pathlib import Path
+
+import pytest
+
+from trilat_net.studies.sweep import cell_result, prepare_sweep_folder, run_sweep
+from trilat_net.studies.sweep.cell_result import CellClass
+from trilat_net.studies.sweep.sweep_results import (
+    GRID_POINTS_FILE,
+    GridPoint,
+    collect_grid_points,
+    wilson_interval,
+)
+
+from .quick import DELAYS, Judge, asked
+
+
+@pytest.fixture
+def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
+    monkeypatch.setattr(cell_result, "classify_cell", Judge())
+    sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
+    return collect_grid_points(run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results)
+
+
+def test_every_run_is_counted_once(found: list[GridPoint]) -> None:
+    assert [place.cell for place in found] == list(range(18))
+    assert [sum(place.counts) for place in found] == [1] * 3 + [12] * 15
+    for place in found:
+        converged, bounded, diverged, undecided = place.counts
+        assert (place.stable, place.decided) == (converged, converged + bounded + diverged)
+        assert place.decided + undecided == sum(place.counts)
+        assert place.doubtful == (0 < converged < place.decided)
+        assert place.interval == wilson_interval(converged, converged + bounded + diverged)
+
+
+def test_they_stand_in_a_file_where_there_are_seeds(found: list[GridPoint], tmp_path: Path) -> None:
+    polars = pytest.importorskip("polars")
+    rows = polars.read_parquet(tmp_path / "o" / GRID_POINTS_FILE).to_dicts()
+    for row, place in zip(rows, found, strict=True):
+        assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
+        assert (row["link.loss"], row["link.delay_ms"]) == place.values
+        assert (row["stable_share_low"], row["stable_share_high"]) == place.interval
+        if place.decided:
+            assert row["stable_share_low"] <= row["stable_share"] <= row["stable_share_high"]
+        else:
+            assert row["stable_share"] is None
+
+
+def test_without_seeds_there_is_no_such_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cell_result, "classify_cell", Judge())
+    folder = run_sweep(prepare_sweep_folder(asked(tmp_path), tmp_path / "o"), 1).folder
+    assert not (folder.path / GRID_POINTS_FILE).exists()

@@ -1,0 +1,161 @@
+"""Plans: cells are numbered row by row, and what cannot run is refused before anything does."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_from_json, plan_sweep
+
+from .quick import SHORT, asked
+
+
+def refused(source: str, *overrides: str, **settings: object) -> str:
+    with pytest.raises((ScenarioError, UsageError)) as error:
+        plan_sweep(source, overrides, **settings)  # type: ignore[arg-type]
+    assert error.value.exit_code == 2
+    return str(error.value)
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
+    """Two laws, and three axes."""
+    over = ["link.delay_ms=0:40:20", "sites.s.q0_rad.0=0.1,0.2", "link.order=newest,in_order"]
+    return asked(tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"])
+
+
+@given(places=st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 1), st.integers(0, 1)))
+def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...]) -> None:
+    law, delay, pose, order = places
+    cell = cube.cell(((law * 3 + delay) * 2 + pose) * 2 + order)
+    assert cell == cube.cell_at(places)
+    assert cell.law == ["p_d", "adaptive"][law]
+    assert cell.values == (20.0 * delay, [0.1, 0.2][pose], ["newest", "in_order"][order])
+
+
+@given(number=st.integers(0, 23), seed=st.integers(1, 3))
+def test_a_cell_is_what_its_overrides_make_of_the_scenario(cube: SweepPlan, number: int, seed: int) -> None:
+    task = cube.task(number, seed)
+    scenario = task.written.scenario(*task.overrides, f"seed={seed}")
+    delay_ms, pose, order = cube.cell(number).values
+    assert {link.delay_ms for link in scenario.links.values()} == {delay_ms}
+    assert {link.order for link in scenario.links.values()} == {order}
+    assert (scenario.sites["s"].q0_rad, scenario.seed) == ((pose, 0.1), seed)
+    assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {cube.cell(number).law}
+
+
+def test_there_is_no_cell_beyond_the_last(cube: SweepPlan) -> None:
+    assert cube.shape == (2, 3, 2, 2)
+    assert cube.cells == 24
+    for number in (-1, 24):
+        with pytest.raises(UsageError, match="numbered from 0 to 23"):
+            cube.cell(number)
+
+
+def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
+    again = plan_from_json(json.loads(json.dumps(cube.facts())))
+    assert again.facts() == cube.facts()
+    assert again.base == cube.base
+    assert [again.cell(n) for n in range(24)] == [cube.cell(n) for n in range(24)]
+    assert (again.seeds, again.longest_s) == (cube.seeds, cube.longest_s)
+
+
+def test_a_law_that_all_sites_have_keeps_the_gains_of_the_scenario() -> None:
+    found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
+    stays, other = (found.written.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
+    assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
+    assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
+
+
+def test_another_law_replaces_that_of_every_site_its_own_gains_too() -> None:
+    found = plan_sweep("contact", laws=["p_f", "p_d"])
+    assert found.cell(0).overrides == ()
+    of_all = found.written.scenario(*found.cell(1).overrides)
+    assert {spec.control for spec in of_all.sites.values()} == {
+        load_scenario("paper", ["control.law=p_d"]).sites["s"].control
+    }
+
+
+def test_seeds_are_counted_from_the_scenarios_own_or_named(tmp_path: Path) -> None:
+    assert asked(tmp_path).seeds == (1,)
+    assert asked(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
+    assert asked(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
+    assert "1 to 100000" in refused("paper", seeds=0)
+    assert "1 to 100000" in refused("paper", seeds=100_001)
+    assert "from 0 to 2^63 - 1, not -1" in refused("paper", seeds=[-1])
+
+
+def test_an_undecided_cell_may_run_eight_times_as_long_unless_told_otherwise(tmp_path: Path) -> None:
+    assert asked(tmp_path).longest_s == 4.0
+    assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
+    assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
+    for longest_s in (0.4, 1e6, float("nan")):
+        assert "from its 0.5 s to 86400 s" in refused(str(tmp_path / "trio.toml"), longest_s=longest_s)
+
+
+@pytest.mark.parametrize(
+    ("over", "words"),
+    [
+        (["link.delay=0:1:1"], ("p_d_margin: link.delay: unknown key", "did you mean 'delay_ms'?")),
+        (["lnk.delay_ms=1,2"], ("did you mean 'link'?",)),
+        (["control.dd=1,2"], ("control.dd: unknown key", "did you mean 'd'?")),
+        (["sites.q.rate_hz=1,2"], ("no such site", "m1, m2, s")),
+        (["links.m1-s.delay_ms=1,2"], ("did you mean 'm1->s'?",)),
+        (["link.order=newest,in_ordr"], ("'in_ordr'", "'newest' or 'in_order'")),
+        (["control.d=-1:1:0.5"], ("d[0]", ">= 0")),
+        (["control.d=0:1:0.5", "control.K=0,1"], ("K[0]", "> 0")),
+        (["sites.s.environment.0.stiffness_n_m=1,2"], ("sites.s.environment.0: no such entry",)),
+        (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
+        (["link.delay_ms=5:1:1"], ("is empty", "did you mean 1:5:1?")),
+        (["arm.g_m_s2=0,0x0"], ("arm.g_m_s2: has 0x0 twice",)),
+    ],
+)
+def test_an_axis_that_cannot_be_right_is_refused_before_anything_runs(
+    over: list[str], words: tuple[str, ...]
+) -> None:
+    problem = refused("p_d_margin", over=over)
+    for word in words:
+        assert word in problem
+
+
+def test_a_key_that_nothing_follows_is_refused(tmp_path: Path) -> None:
+    own = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
+    (tmp_path / "own.toml").write_text(own)
+    problem = refused(str(tmp_path / "own.toml"), over=["control.Kd=1:3:1"])
+    assert "control.Kd: 1 and 2 are the same experiment" in problem
+    assert "sites.NAME.control" in problem
+
+
+def test_a_scenario_that_is_live_only_is_refused() -> None:
+    outside = refused("paper", "sites.s.plant=external", over=["control.Kd=1,2"])
+    assert "paper: sites.s.plant: is external" in outside
+    assert "live only" in outside
+    measured = refused("paper", "link.model=measured", over=["control.Kd=1,2"])
+    assert "paper: link.model: a measured link has the delay of a real network" in measured
+    assert "link.model=constant" in measured
+
+
+@pytest.mark.parametrize(
+    ("laws", "words"),
+    [
+        (["p_dd"], ("--law", "no law 'p_dd'", "did you mean 'p_d'?")),
+        (["zzz"], ("laws are adaptive, adaptive_box, p_d, pd_d, p_f",)),
+        (["mine.laws:Law"], ("laws from outside are not swept",)),
+        (["own"], ("laws from outside are not swept",)),
+        (["p_d", "p_f"], ("with law p_f", "two sites")),
+    ],
+)
+def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str, ...]) -> None:
+    problem = refused("p_d_margin", laws=laws)
+    for word in words:
+        assert word in problem
+
+
+def test_an_axis_that_a_swept_law_has_not_is_refused_with_the_law() -> None:
+    problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
+    assert "control.d: with law adaptive: unknown key" in problem
+    assert "is swept twice" in refused("p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"])

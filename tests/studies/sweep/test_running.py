@@ -1,0 +1,189 @@
+"""Runs of a sweep: the same results however they were made, and nothing twice."""
+
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilat_net.errors import RunFailed, ScenarioError, UsageError
+from trilat_net.studies.executor import WorkerPool
+from trilat_net.studies.sweep import (
+    cell_result,
+    open_sweep_folder,
+    prepare_sweep_folder,
+    run_sweep,
+    sweep_run,
+)
+from trilat_net.studies.sweep.sweep_cell import run_cell
+from trilat_net.studies.sweep.sweep_plan import plan_sweep
+from trilat_net.studies.sweep.sweep_run import (
+    DurationEstimate,
+    estimate_sweep,
+    format_wall_time,
+    refuse_oversized_sweep,
+)
+
+from .quick import DELAYS, Judge, asked
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
+    found = Judge()
+    monkeypatch.setattr(cell_result, "classify_cell", found)
+    return found
+
+
+def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
+    """The judge of the package, in this process and in two others."""
+    sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
+    alone, others = (run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2))
+    assert alone.folder.results.read_bytes() == others.folder.results.read_bytes()
+    assert [row["cell"] for row in others.results.rows] == [0, 0, 1, 1, 2, 2]
+    assert (alone.speed.runs, others.speed.jobs) == (6, 2)
+
+
+class _StopError(Exception):
+    pass
+
+
+def test_what_is_done_is_not_done_again_wherever_it_was_interrupted(tmp_path: Path, judge: Judge) -> None:
+    sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
+    whole = run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1).folder.results.read_bytes()
+    texts = judge.texts.copy()
+    assert len(texts) == 24
+    judge.texts.clear()
+    folder = prepare_sweep_folder(sweep, tmp_path / "parts")
+    for stop in (1, 2, 7, 20):
+
+        def stopped(done: int, _total: int, stop: int = stop) -> None:
+            if done >= stop:
+                raise _StopError
+
+        with pytest.raises(_StopError):
+            run_sweep(folder, 1, stopped)
+        assert not folder.results.exists()
+        folder = open_sweep_folder(folder.path)
+    swept = run_sweep(folder, 1)
+    assert folder.results.read_bytes() == whole
+    assert Counter(judge.texts) == Counter(texts)
+    assert run_sweep(folder, 1).speed.runs == 0
+    assert Counter(judge.texts) == Counter(texts)
+    assert 0 < swept.speed.runs < 24
+
+
+def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -> None:
+    told: list[tuple[int, int]] = []
+    sweep = asked(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
+    rows = run_sweep(
+        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: told.append(one)
+    ).results.rows
+    seeds_of = [(row["cell"], row["seed"]) for row in rows]
+    assert seeds_of == [(0, 1), *((1, seed) for seed in range(1, 6)), (2, 1)]
+    assert [row["random"] for row in rows] == [False, *[True] * 5, False]
+    assert told == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
+    assert len(judge.texts) == 7
+
+
+def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge) -> None:
+    sweep = asked(tmp_path)
+    expected = estimate_sweep(sweep, jobs=1)
+    assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
+    assert (expected.runs, expected.seconds > 0.0) == (12, True)
+    judge.texts.clear()
+    run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1, known=expected.entries)
+    assert len(judge.texts) == 5
+    assert estimate_sweep(sweep, [(0, 1), (1, 1)], 1).entries[0].cell == 3
+    assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
+
+
+def test_an_estimate_counts_seeds_where_something_is_random(tmp_path: Path, judge: Judge) -> None:
+    assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
+    assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
+    assert judge.texts
+
+
+def test_an_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
+    over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
+    sweep = plan_sweep("p_d_margin", over=over)
+    with pytest.raises(UsageError) as error:
+        refuse_oversized_sweep(sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2)
+    assert error.value.exit_code == 2
+    for word in ("2000000 cells (10000 x 200)", "25 h on 2 cores", "larger steps", "--yes"):
+        assert word in str(error.value)
+    many = DurationEstimate(1_000_001, 60.0, [])
+    with pytest.raises(UsageError, match="would take about 60 s"):
+        refuse_oversized_sweep(sweep, many)
+    refuse_oversized_sweep(sweep, DurationEstimate(1_000_000, 86_400.0, []))
+    assert len(judge.texts) == 8
+
+
+def test_a_cell_that_cannot_run_is_named_and_what_is_done_is_kept(tmp_path: Path, judge: Judge) -> None:
+    """The ends of both axes are fine alone and together; a pair between them is not."""
+    sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
+    folder = prepare_sweep_folder(sweep, tmp_path / "o")
+    with pytest.raises(ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"):
+        run_sweep(folder, 1)
+    with folder.journal() as journal:
+        assert sorted(journal.done) == [(n, 1) for n in range(4)]
+    assert judge.texts
+
+
+class _Pool:
+    """Stands for processes; remembers how much was asked of it at a time."""
+
+    def __init__(self, *, broken: bool = False) -> None:
+        self.most = self.under_way = 0
+        self.broken = broken
+
+    def submit(self, work: Any, task: Any) -> "Future[Any]":
+        self.under_way += 1
+        self.most = max(self.most, self.under_way)
+        future: Future[Any] = Future()
+        if self.broken:
+            future.set_exception(BrokenProcessPool())
+        else:
+            future.set_result(work(task))
+        return future
+
+
+def test_few_runs_wait_at_a_time_however_many_there_are(tmp_path: Path, judge: Judge) -> None:
+    pool = _Pool()
+    sweep = asked(tmp_path, over=["control.Kd=1:300:1"])
+    asked_for: list[int] = []
+
+    def tasks() -> Iterator[Any]:
+        for number in range(300):
+            asked_for.append(number)
+            yield sweep.task(number, 1)
+
+    cells = []
+    for _, entry in WorkerPool(pool, 6).each(run_cell, tasks()):  # type: ignore[arg-type]
+        pool.under_way -= 1
+        cells.append(entry.cell)
+        assert len(asked_for) - len(cells) <= 6
+    assert sorted(cells) == list(range(300))
+    assert pool.most <= 6
+    assert len(judge.texts) == 300
+
+
+def test_a_process_that_was_ended_is_told_of_with_what_to_do(tmp_path: Path) -> None:
+    task = asked(tmp_path).task(0, 1)
+    with pytest.raises(RunFailed, match="what is done is kept: go on with --resume"):
+        list(WorkerPool(_Pool(broken=True), 2, sweep_run._RESUME_HINT).each(run_cell, [task]))  # type: ignore[arg-type]
+
+
+def test_times_are_said_as_people_say_them() -> None:
+    assert [format_wall_time(s) for s in (0.2, 45.0, 89.0, 90.0, 5399.0, 5400.0, 172_799.0, 1e6)] == [
+        "1 s",
+        "45 s",
+        "89 s",
+        "1.5 min",
+        "90 min",
+        "1.5 h",
+        "48 h",
+        "11.6 days",
+    ]

@@ -1,0 +1,137 @@
+"""Results: what was run, number for number, in a file that other programs read."""
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from trilat_net.errors import UsageError
+from trilat_net.studies.sweep import SweepResults, cell_result, prepare_sweep_folder, read_results, run_sweep
+from trilat_net.studies.sweep.sweep_cell import CellRun, diff_lines
+from trilat_net.studies.sweep.sweep_plan import plan_sweep
+from trilat_net.studies.sweep.sweep_results import (
+    build_result_rows,
+    encode_results,
+    reproduction_duration_s,
+    require_polars,
+)
+
+from .quick import DELAYS, Judge, asked, outcome_of
+
+ORDERS = "link.order=newest,in_order"
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults, Judge]:
+    """Numbers and words, two laws, two seeds where something is random; its folder, and who judged."""
+    path = tmp_path_factory.mktemp("swept")
+    sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(cell_result, "classify_cell", judge := Judge())
+        return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
+
+
+def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -> None:
+    path, results, judge = swept
+    again = read_results(path)
+    assert list(again.rows) == list(results.rows)
+    assert again.plan.facts() == results.plan.facts()
+    assert read_results(path / "results.parquet") == again
+    for row in again.rows:
+        assert again.outcome(row) == judge(row["scenario"], 4.0)
+        assert f"seed = {row['seed']}" in row["scenario"]
+        assert f'order = "{row["link.order"]}"' in row["scenario"] or row["link.order"] == "newest"
+
+
+def test_rows_are_in_the_order_of_cells_and_seeds(swept: tuple[Path, SweepResults, Judge]) -> None:
+    _, results, _ = swept
+    assert [(row["cell"], row["seed"]) for row in results.rows] == [
+        (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
+    ]
+    assert [row["law"] for row in results.rows] == ["adaptive"] * 6 + ["p_d"] * 6
+    assert [row["seed"] for row in results.of_cell(3)] == [1, 2]
+    assert "cell-0.mcap" in results.of_cell(0)[0]["command"]
+    assert "cell-3-seed-2.mcap" in results.of_cell(3)[1]["command"]
+    with pytest.raises(UsageError, match="from 0 to 7"):
+        results.of_cell(8)
+
+
+def test_bytes_do_not_depend_on_the_order_in_which_runs_ended(
+    swept: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = swept
+    with prepare_sweep_folder(results.plan, path).journal() as journal:
+        entries = list(journal.done.values())
+    for order in (entries, entries[::-1]):
+        facts = json.loads((path / "plan.json").read_text())
+        data = encode_results(results.plan, build_result_rows(results.plan, order), facts)
+        assert data == (path / "results.parquet").read_bytes()
+
+
+def test_another_program_reads_it_and_what_it_is(swept: tuple[Path, SweepResults, Judge]) -> None:
+    arrow = pytest.importorskip("pyarrow.parquet")
+    path, results, _ = swept
+    table = arrow.read_table(path / "results.parquet")
+    assert table.to_pylist() == [dict(row) for row in results.rows]
+    kinds = dict(zip(table.schema.names, map(str, table.schema.types), strict=True))
+    assert (kinds["link.loss"], kinds["cell"], kinds["random"]) == ("double", "int64", "bool")
+    assert "string" in kinds["link.order"]
+    facts = json.loads(arrow.read_metadata(path / "results.parquet").metadata[b"trilat_net.sweep"])
+    assert facts["scenario_sha256"] == results.plan.base.sha256
+    assert facts["text"] == results.plan.written.text
+    assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
+
+
+def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
+    sweep = plan_sweep("p_d_margin", over=["link.delay_ms=0:1980:20", "control.d=0.2:10.1:0.1"])
+    base = sweep.base.text
+    entries = []
+    for number in range(sweep.cells):
+        delay, damping = sweep.cell(number).values
+        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}").replace("1.1", f"{damping}")
+        entries.append(
+            CellRun(number, 1, False, "p_d", f"{number:064x}", diff_lines(text, base), outcome_of(text))
+        )
+    data = encode_results(sweep, build_result_rows(sweep, entries), sweep.facts())
+    assert len(entries) == 10_000
+    assert len(data) < 4e6
+    (tmp_path / "results.parquet").write_bytes(data)
+    assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
+
+
+def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> None:
+    sweep = asked(tmp_path, over=[DELAYS])
+    outcomes = [outcome_of(str(n)) for n in range(100)]
+    for outcome in outcomes:
+        lasts_s = reproduction_duration_s(sweep, outcome)
+        if outcome.diverged_s is None:
+            assert lasts_s == outcome.ran_s
+        else:
+            assert lasts_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
+
+
+def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
+    def refused(path: Path, *words: str) -> None:
+        with pytest.raises(UsageError) as error:
+            read_results(path)
+        for word in (str(path), *words):
+            assert word in str(error.value)
+
+    begun = prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+    refused(begun, "no results", f"trilat sweep --resume {begun}")
+    refused(tmp_path / "none.parquet", "no results")
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1 nothing PAR1")
+    refused(tmp_path / "bad.parquet", "cannot be read as Parquet")
+    require_polars().DataFrame({"a": [1]}).write_parquet(tmp_path / "other.parquet")
+    refused(tmp_path / "other.parquet", "holds no results of a sweep")
+
+
+def test_without_polars_or_with_an_old_one_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "polars", types.ModuleType("polars"))
+    with pytest.raises(UsageError, match=r"polars 1\.30 or newer: pip install"):
+        require_polars()
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(UsageError, match=r"sweeps need polars: pip install 'trilat-net\[frames\]'"):
+        require_polars()

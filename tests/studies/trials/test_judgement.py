@@ -1,0 +1,166 @@
+"""Figures against expectations: both directions, every key, and what no figure can meet."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.scenario import Expect
+from trilat_net.scenario.expect import ExpectWindow
+from trilat_net.studies.trials.expectations import ExpectationResult, evaluate_expectations
+from trilat_net.studies.trials.site_stats import Range
+
+from .results import CALM, figures
+
+READINGS: dict[str, float] = {
+    "synchronised_by_s": 11.0,
+    "peak_error_max_rad": 0.9,
+    "peak_error_min_rad": 0.9,
+    "rms_error_max_rad": 0.1,
+    "end_error_max_rad": 0.003,
+    "end_error_min_rad": 0.003,
+    "end_spread_max_rad": 0.002,
+    "peak_torque_max_nm": 50.0,
+    "peak_speed_max_rad_s": 1.5,
+    "age_max_ms": 210.0,
+    "mean_age_max_ms": 200.0,
+    "mean_age_min_ms": 100.0,
+    "late_samples_max": 3,
+}
+"""What the calm run measured, by the key that asks for it."""
+
+OTHERS: dict[str, Any] = {"stable": True, "end_pose_rad": {"s": (0.1, 0.2)}, "no_gaps": True}
+TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
+
+
+def only(expect: Expect, **changes: Any) -> ExpectationResult:
+    outcomes = evaluate_expectations(expect, figures(**changes))
+    assert len(outcomes) == 1
+    return outcomes[0]
+
+
+def test_every_key_that_asks_is_answered_and_no_other() -> None:
+    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | {"windows"} == set(Expect.__struct_fields__)
+    assert evaluate_expectations(Expect(), CALM) == []
+    for key, value in {**READINGS, **OTHERS}.items():
+        assert only(Expect(**{key: value})).key.split(".")[0] == key
+
+
+@pytest.mark.parametrize("key", READINGS)
+@given(limit=st.floats(1e-4, 1e4))
+def test_a_limit_holds_just_where_the_figure_is_within_it(key: str, limit: float) -> None:
+    if key == "late_samples_max":
+        limit = int(limit)
+    outcome = only(Expect(**{key: limit}))
+    measured = READINGS[key]
+    assert outcome.held == (measured >= limit if "_min_" in key else measured <= limit)
+    if limit:
+        assert outcome.margin is not None
+        assert outcome.margin == pytest.approx(abs(measured - limit) / limit * (1 if outcome.held else -1))
+
+
+@pytest.mark.parametrize("key", READINGS)
+def test_a_limit_itself_still_holds(key: str) -> None:
+    outcome = only(Expect(**{key: READINGS[key]}))
+    assert outcome.held
+    assert outcome.margin == 0.0
+
+
+@pytest.mark.parametrize(
+    ("key", "field"),
+    [("synchronised_by_s", "synchronised_at_s"), ("end_spread_max_rad", "end_spread_rad")],
+)
+def test_what_was_not_measured_does_not_hold(key: str, field: str) -> None:
+    outcome = only(Expect(**{key: 1e9}), **{field: None})
+    assert not outcome.held
+    assert outcome.measured == "never"
+
+
+def test_a_link_without_samples_meets_no_limit_of_age() -> None:
+    ages = {**CALM.ages, "m1->m2": type(CALM.ages["m1->s"])(None, None)}
+    for key in ("age_max_ms", "mean_age_max_ms"):
+        assert not only(Expect(**{key: 1e9}), ages=ages).held
+    assert not only(Expect(mean_age_min_ms=0.0), ages=ages).held
+
+
+@pytest.mark.parametrize("stable", [True, False])
+@pytest.mark.parametrize("trend", list(EnvelopeTrend))
+def test_stable_is_no_growth_and_undecided_is_neither(trend: EnvelopeTrend, stable: bool) -> None:
+    outcome = only(Expect(stable=stable), trend=trend)
+    assert (
+        outcome.held
+        == {
+            EnvelopeTrend.DECAYS: stable,
+            EnvelopeTrend.STEADY: stable,
+            EnvelopeTrend.GROWS: not stable,
+            EnvelopeTrend.UNDECIDED: False,
+        }[trend]
+    )
+    assert outcome.measured.startswith(trend.value)
+
+
+@pytest.mark.parametrize("stable", [None, True, False])
+@pytest.mark.parametrize("trend", list(EnvelopeTrend))
+def test_a_run_that_diverged_fails_unless_that_was_expected(
+    trend: EnvelopeTrend, stable: bool | None
+) -> None:
+    outcome = only(Expect(stable=stable), trend=trend, diverged_at_s=3.25)
+    assert outcome.held == (stable is False)
+    assert "3.25 s" in outcome.measured
+
+
+@given(off=st.floats(-0.1, 0.1), within=st.floats(1e-3, 0.05))
+def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: float) -> None:
+    for wanted in ((0.1 + off, 0.2), (0.1, 0.2 - off)):
+        outcome = only(Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within))
+        assert outcome.margin is not None
+        assert outcome.held == (outcome.margin >= 0.0)
+        if abs(abs(off) - within) > 1e-9:
+            assert outcome.held == (abs(off) < within)
+
+
+def test_every_site_with_a_pose_has_an_outcome_of_its_own() -> None:
+    outcomes = evaluate_expectations(Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM)
+    assert [(o.key, o.held) for o in outcomes] == [("end_pose_rad.m1", True), ("end_pose_rad.s", False)]
+    assert not only(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
+
+
+def test_gaps_are_counted() -> None:
+    assert not only(Expect(no_gaps=True)).held
+    assert only(Expect(no_gaps=True), missing=0).held
+    assert evaluate_expectations(Expect(no_gaps=False), CALM) == []
+
+
+SPANS = {"error_peak_rad": Range(0.5, 0.5), "speed_peak_rad_s": Range(2.0, 2.0), "q1_rad": Range(-0.2, 0.4)}
+
+
+def window(**limits: Any) -> Expect:
+    return Expect(windows=(ExpectWindow(from_s=9.0, to_s=15.5, site="s", **limits),))
+
+
+@given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
+def test_a_quantity_of_a_window_holds_where_all_of_it_lies_between_its_limits(
+    least: float, width: float
+) -> None:
+    most = least + width
+    for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
+        outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
+        assert outcome.key == f"{key} s 9-15.5 s"
+        assert outcome.held == (least <= low and high <= most)
+        if most > least:
+            assert outcome.margin is not None
+            assert outcome.held == (outcome.margin >= 0.0)
+
+
+def test_a_window_that_the_run_did_not_reach_does_not_hold() -> None:
+    outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
+    assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
+
+
+def test_a_window_names_its_units_and_all_sites_where_it_is_of_all() -> None:
+    asked = ExpectWindow(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0))
+    outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
+    assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
+    assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]

@@ -1,0 +1,103 @@
+"""Which trials a scenario has, what one says when it fails, and the command that repeats it."""
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import trilat_net
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import apply_overrides, load_scenario
+from trilat_net.studies.trials.trial import _texts
+
+from .results import TOO_MUCH, quick
+
+CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
+
+
+def test_a_random_scenario_has_a_trial_per_seed_each_with_its_own_run(quick_file: Path) -> None:
+    batch = trilat_net.trials(quick_file, [3, 1, 3, 2])
+    assert [trial.scenario.seed for trial in batch] == [3, 1, 2]
+    assert len({trial.scenario.sha256 for trial in batch}) == 3
+    assert [str(trial) for trial in batch] == ["quick-seed3", "quick-seed1", "quick-seed2"]
+    assert len({trial.run().outcomes[-1].measured for trial in batch}) == 3
+
+
+def test_where_nothing_is_random_one_run_tells_all_unless_a_network_has_a_say() -> None:
+    constant = quick(**CONSTANT)
+    assert [trial.scenario.seed for trial in trilat_net.trials(constant, range(4, 9))] == [4]
+    assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
+
+
+def test_without_seeds_the_scenarios_own_counts() -> None:
+    assert [trial.scenario.seed for trial in trilat_net.trials(quick(seed=42))] == [42]
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_out_of_range_is_refused(seed: int) -> None:
+    with pytest.raises(ScenarioError, match="seed"):
+        trilat_net.trials(quick(), [seed])
+
+
+def test_a_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file: Path) -> None:
+    quick_file.write_text(quick_file.read_text().partition("[expect]")[0])
+    for source in (quick_file, load_scenario(quick_file)):
+        with pytest.raises(ScenarioError, match=r"quick.*\[expect\].*stable = true"):
+            trilat_net.trials(source)
+
+
+def test_what_is_expected_of_a_time_that_no_run_reaches_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"synchronised_by_s.*0\.5 s"):
+        trilat_net.trials(quick(), set={"expect.synchronised_by_s": 0.5})
+    window = {"from_s": 0.4, "to_s": 0.6, "error_peak_rad": [0.0, 1.0]}
+    with pytest.raises(ScenarioError, match=r"expect\.windows\[0\]\.to_s: .*0\.5 s, is 0\.6"):
+        trilat_net.trials(quick(), set={"expect.windows": [window]})
+
+
+def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
+    result = trilat_net.trials(quick_file)[0].check()
+    assert result.held
+    assert result.simulated_s == 0.5
+    assert [outcome.key for outcome in result.outcomes] == ["peak_error_max_rad", "mean_age_max_ms"]
+
+
+def test_a_trial_that_fails_says_what_by_how_much_and_how_to_repeat_it(quick_file: Path) -> None:
+    (trial,) = trilat_net.trials(quick_file, [7], TOO_MUCH)
+    with pytest.raises(AssertionError) as failed:
+        trial.check()
+    lines = [line.strip() for line in str(failed.value).splitlines()]
+    assert lines[0] == "quick-seed7:"
+    assert lines[1].startswith("mean_age_max_ms: ")
+    assert lines[1].endswith(" ms, asked ≤ 1 ms")
+    assert lines[2:] == [
+        f"trilat test {quick_file} --seeds 7 --set expect.mean_age_max_ms=1.0",
+        f"trilat sim {quick_file} --seed 7 -o quick-seed7.mcap --set expect.mean_age_max_ms=1.0",
+    ]
+
+
+words = st.sampled_from(["it's", "a b", '"x"', "", "=", "é", "true", "a\nb\t"])
+values = st.one_of(st.integers(-5, 5), st.floats(-1e3, 1e3), st.booleans(), words)
+tables = st.dictionaries(
+    st.sampled_from(["a", "b.c", "d.e-f"]), st.one_of(values, st.lists(values, max_size=3)), max_size=3
+)
+
+
+@given(overrides=tables)
+def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) -> None:
+    by_text: dict[str, Any] = {}
+    by_value: dict[str, Any] = {}
+    apply_overrides(by_text, shlex.split(shlex.join(_texts(overrides))))
+    apply_overrides(by_value, overrides)
+    assert by_text == by_value
+
+
+def test_a_table_as_an_override_is_told_key_by_key() -> None:
+    (trial,) = trilat_net.trials(quick(), set=CONSTANT)
+    assert shlex.split(trial.again)[-4:] == ["--set", 'link.model="constant"', "--set", "link.delay_ms=60.0"]
+
+
+def test_a_scenario_in_memory_is_called_by_a_file_that_it_could_be_saved_in() -> None:
+    assert trilat_net.trials(quick())[0].again == "trilat test ./quick.toml --seeds 1"

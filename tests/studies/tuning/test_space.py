@@ -1,0 +1,83 @@
+import pytest
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.studies.tuning.candidate import TuningScenario, load_tuning_scenario
+from trilat_net.studies.tuning.search_space import (
+    DEFAULT_LAWS,
+    SEARCH_SPACES,
+    ModelInformation,
+    select_search_spaces,
+)
+
+from .experiments import trio
+
+MIDDLE = {
+    law: {knob.name: (knob.low * knob.high) ** 0.5 for knob in space.knobs}
+    for law, space in SEARCH_SPACES.items()
+}
+
+
+@pytest.mark.parametrize("law", sorted(SEARCH_SPACES))
+@pytest.mark.parametrize("scenario", ["contact", "free"])
+def test_a_candidate_is_its_law_at_every_site_and_nothing_else_changes(law: str, scenario: str) -> None:
+    if law == "p_f" and scenario == "free":
+        return
+    experiment = load_tuning_scenario(scenario, ["limits.tau_limit_nm=60"])
+    found = experiment.with_gains(SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]).scenario
+    for name, site in found.sites.items():
+        assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
+        assert site.limits == experiment.scenario.sites[name].limits
+        assert site.limits.tau_limit_nm == 60.0
+        known = site.control.gains(site.arm.theta)
+        first = known.known if known.known[3] else known.theta_hat0
+        assert first[3:] == pytest.approx(0.95 * site.arm.theta[3:])
+    with_same_control = {name: site.control for name, site in found.sites.items()}
+    assert found.links == experiment.scenario.links
+    assert len(with_same_control) == len(experiment.scenario.names)
+
+
+def test_a_scenario_whose_sites_have_their_own_control_is_changed_site_by_site() -> None:
+    found: TuningScenario = load_tuning_scenario("contact").with_gains(
+        SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
+    )
+    assert [text.partition("=")[0] for text in found.overrides] == ["sites.m.control", "sites.s.control"]
+    free: TuningScenario = load_tuning_scenario("free").with_gains(
+        SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
+    )
+    assert free.command == "trilat sim free --set 'control={law = \"p_d\", K = 31.2, d = 7.1, gravity = 1}'"
+
+
+def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
+    ranges: dict[str, set[tuple[str, float, float]]] = {}
+    for space in SEARCH_SPACES.values():
+        for knob in space.knobs:
+            ranges.setdefault(knob.name.partition("_")[0], set()).add((knob.unit, knob.low, knob.high))
+    assert all(len(found) == 1 for found in ranges.values())
+    assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
+
+
+def test_the_usual_laws_take_any_number_of_sites() -> None:
+    assert [space.law for space in select_search_spaces((), trio())] == list(DEFAULT_LAWS)
+
+
+@pytest.mark.parametrize(
+    ("law", "facts"),
+    [
+        ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
+        ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
+        ("", ["no law ''", "tuned are adaptive, adaptive_box, p_d, pd_d, p_f, known"]),
+        ("my.file:Law", ["nobody has said where a law from outside is to be searched"]),
+        ("own", ["a law from outside"]),
+    ],
+)
+def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:
+    with pytest.raises(UsageError) as refused:
+        select_search_spaces([law], trio())
+    assert all(fact in str(refused.value) for fact in facts)
+
+
+def test_force_reflection_is_refused_for_three_sites_with_the_reason() -> None:
+    with pytest.raises(ScenarioError, match="between one master and one slave; this has 3 sites, 2 of them"):
+        select_search_spaces(["p_d", "p_f"], load_scenario("free"))
+    assert [space.law for space in select_search_spaces(["p_f"], load_scenario("contact"))] == ["p_f"]

@@ -1,0 +1,152 @@
+"""The procedure as a whole: small budgets, short runs."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.studies.tuning import TuningResult, plan_tuning
+from trilat_net.studies.tuning.candidate import measure_candidate
+from trilat_net.studies.tuning.final_posture import CandidateClass
+from trilat_net.studies.tuning.pareto_search import dominates, find_pareto_front
+from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+from trilat_net.studies.tuning.tuning_tables import tuning_to_json
+
+from .experiments import asked
+
+LAWS = ("adaptive", "p_d", "known")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
+    """Three laws, six candidates each."""
+    return asked(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(jobs=1)
+
+
+def test_the_same_request_makes_the_same_result_whatever_the_number_of_processes(
+    found: TuningResult, tmp_path: Path
+) -> None:
+    again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
+    assert again.found == found.found
+    assert [one.score for one in again.printed] == [one.score for one in found.printed]
+
+
+def test_every_law_has_its_budget_and_every_run_one_outcome(found: TuningResult) -> None:
+    for one in found.found:
+        assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
+
+
+def test_the_clamp_and_all_but_the_law_are_the_same_for_every_candidate(found: TuningResult) -> None:
+    shared = set()
+    for one in found.found:
+        for place in range(len(one.tried)):
+            scenario = found.candidate(one, place).scenario
+            limits = tuple(site.limits for site in scenario.sites.values())
+            starts = tuple(
+                (site.q0_rad, site.arm, site.rate_hz, site.hands) for site in scenario.sites.values()
+            )
+            shared.add((limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links)))
+    assert len(shared) == 1
+    assert next(iter(shared))[0][0].tau_limit_nm == 60.0
+
+
+def test_a_front_is_not_dominated_and_what_all_share_is_not_by_any_law(found: TuningResult) -> None:
+    points = {
+        one.space.law: [found.plan.objective.point(score) for score in one.scores] for one in found.found
+    }
+    every = [point for law in points.values() for point in law if point is not None]
+    for one in found.found:
+        own = points[one.space.law]
+        assert one.front == find_pareto_front(own)
+        shared = found.shared(one)
+        assert set(shared) <= set(one.front)
+        for place in one.front:
+            point = own[place]
+            assert point is not None
+            assert (place in shared) == (not any(dominates(other, point) for other in every))
+
+
+def test_a_points_command_runs_what_was_measured(found: TuningResult) -> None:
+    for one in found.found:
+        for place in one.front:
+            words = shlex.split(found.candidate(one, place).command)
+            assert words[:2] == ["trilat", "sim"]
+            assert words[3::2] == ["--set"] * (len(words[3:]) // 2)
+            assert measure_candidate(load_scenario(words[2], words[4::2]).text, None) == one.scores[place]
+
+
+def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> None:
+    told, untold = found.printed
+    assert [told.name, untold.name] == ["as printed", "as printed, told nothing"]
+    controls = [one.candidate.scenario.sites["s"].control.gains(None) for one in (told, untold)]  # type: ignore[arg-type]
+    assert [tuple(c.Lambda) for c in controls] == [(1.0, 1.0)] * 2
+    assert [tuple(c.theta_hat0) for c in controls] == [(0.0, 0.0, 0.0, 2.0, 1.0), (0.0,) * 5]
+    every = {tuple(gains.values()) for one in found.found for gains in one.tried}
+    assert (1.0, 1.0, 3.0, 1.0) not in every
+
+
+def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
+    """A speed limit that nothing keeps: no front, and no silence about it."""
+    found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
+    law = tuning_to_json(found)["laws"]["p_d"]
+    assert law["outcomes"] == {word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass}
+    assert law["front"] == []
+    assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
+    assert found.at_edge(found.found[0]) == []
+
+
+def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
+    """Gravity is told for half of what it is: no law that only knows it can stand, some that learn it can."""
+    settings = ("duration_s=10.0", "control.Kd=1")
+    found = asked(tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0).run(jobs=1)
+    learns, knows = found.found
+    assert knows.front == []
+    assert knows.outcomes[CandidateClass.STRAYED] >= 1
+    assert knows.outcomes[CandidateClass.SETTLED] == 0
+    for place in learns.front:
+        assert learns.scores[place].outcome is CandidateClass.SETTLED
+
+
+def test_progress_is_told_to_the_end(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    asked(tmp_path, "duration_s=0.1", laws=["p_d"], budget=3).run(1, lambda *one: told.append(one))
+    assert told == [(n, 5) for n in range(1, 6)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"budget": 0}, "--budget is the number of candidates per law, 1 to 100000, not 0"),
+        ({"budget": 10**6}, "1 to 100000, not 1000000"),
+        ({"seed": -1}, "--seed is from 0"),
+        ({"objective": "rank"}, "--objective is error or settling, not 'rank'"),
+        ({"gravity_percent": 0.0}, "--gravity is from 50 to 150"),
+        ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(tmp_path: Path, settings: dict[str, object], words: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        asked(tmp_path, **settings)
+    assert words in str(refused.value)
+
+
+def test_a_search_that_would_take_days_is_refused() -> None:
+    with pytest.raises(ScenarioError, match="duration_s: a candidate would take 259200000 ticks"):
+        plan_tuning("free", ["duration_s=86400"])
+
+
+def test_the_time_is_told_before_and_is_of_the_right_order(tmp_path: Path) -> None:
+    few = asked(tmp_path, laws=["p_d"], budget=8)
+    assert 0.0 < few.estimate_s(1) < 600.0
+    assert few.runs == 10
+    assert asked(tmp_path, 'sites.s.environment=[{kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], '
+                 "stiffness_n_m = 1.0}]", laws=["p_d"], budget=8).runs == 20  # fmt: skip
+
+
+def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
+    one = found.found[1]
+    knob = SEARCH_SPACES["p_d"].knobs[0]
+    at_edge = one._replace(tried=[{"K": knob.high, "d": 10.0}] * 6, front=[0])
+    assert found.at_edge(at_edge) == ["K"]

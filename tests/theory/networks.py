@@ -1,0 +1,79 @@
+"""Hand-made loops whose answers are known in closed form: masses, dampers, springs, and links with delays."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.theory.linear_loop import DelayedTerm, LinearLoop
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+class Wire(NamedTuple):
+    """A torque on `at` towards where `of` was, by K and B after a delay; and a share of what pushed `of`."""
+
+    at: int
+    of: int
+    K: float
+    B: float = 0.0
+    delay_s: float = 0.0
+    k_f: float = 0.0
+
+
+class Network(NamedTuple):
+    m: tuple[float, ...]
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    wires: tuple[Wire, ...] = ()
+
+    @property
+    def loop(self) -> LinearLoop:
+        count = len(self.m)
+        names = tuple(f"{site}.{x}1" for site in "abcd"[:count] for x in ("q", "qd"))
+        A, B, C = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, count)), np.zeros((count, 2 * count))
+        late: dict[float, DelayedTerm] = {}
+        for i in range(count):
+            q, qd = 2 * i, 2 * i + 1
+            A[q, qd] = C[i, qd] = 1.0
+            A[qd, q], A[qd, qd], B[qd, i] = -self.k[i] / self.m[i], -self.d[i] / self.m[i], 1.0 / self.m[i]
+        for wire in self.wires:
+            at, of, m = 2 * wire.at + 1, 2 * wire.of, self.m[wire.at]
+            A[at, at - 1 : at + 1] -= np.array([wire.K, wire.B]) / m
+            there = late.setdefault(
+                wire.delay_s, DelayedTerm(wire.delay_s, np.zeros_like(A), np.zeros_like(B))
+            )
+            there.A[at, of : of + 2] += np.array([wire.K, wire.B]) / m
+            there.B[at, wire.of] += wire.k_f / m
+        if 0.0 in late:
+            now = late.pop(0.0)
+            A, B = A + now.A, B + now.B
+        ports = [tuple(f"{site}.{x}1" for site in "abcd"[:count]) for x in ("tau", "qd")]
+        return LinearLoop(names, ports[0], ports[1], A, B, C, tuple(late[T] for T in sorted(late)))
+
+    def impedance(self, w_rad_s: Sequence[float] | Array) -> Complex:
+        """Z with Z qd = (1 + reflection) u, from the equations of motion as they stand on paper."""
+        s = 1j * np.asarray(w_rad_s)
+        Z = np.zeros((len(s), len(self.m), len(self.m)), np.complex128)
+        reflected = np.zeros_like(Z) + np.eye(len(self.m))
+        for i, (m, d, k) in enumerate(zip(self.m, self.d, self.k, strict=True)):
+            Z[:, i, i] = m * s + d + k / s
+        for wire in self.wires:
+            late, link = np.exp(-s * wire.delay_s), wire.B + wire.K / s
+            Z[:, wire.at, wire.at] += link
+            Z[:, wire.at, wire.of] -= link * late
+            reflected[:, wire.at, wire.of] += wire.k_f * late
+        return np.asarray(np.linalg.solve(reflected, Z), dtype=np.complex128)
+
+
+def pair(
+    K: tuple[float, float] = (10.0, 10.0),
+    d: tuple[float, float] = (1.0, 1.0),
+    T: tuple[float, float] = (0.2, 0.2),
+    B: float = 0.0,
+) -> Network:
+    """Two sites that follow each other: P+d with B = 0."""
+    wires = (Wire(0, 1, K[0], B, T[0]), Wire(1, 0, K[1], B, T[1]))
+    return Network((1.0, 1.5), d, (0.0, 0.0), wires)

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.theory.networks import Array, Network, pair
+from trilat_net.theory.frequency_search import (
+    build_frequency_grid,
+    cache_response,
+    find_minima,
+    find_resolved_hz,
+    refine_frequencies,
+)
+from trilat_net.theory.port_response import build_admittance
+
+HZ = 2.0 * np.pi
+
+
+@given(low_hz=st.floats(1e-4, 1.0), decades=st.floats(0.1, 5.0), delay_s=st.floats(0.0, 3.0))
+def test_a_grid_spans_its_band_in_order_and_follows_a_round_trip(
+    low_hz: float, decades: float, delay_s: float
+) -> None:
+    high_hz = low_hz * 10.0**decades
+    w = build_frequency_grid(low_hz, high_hz, delay_s)
+    assert w[0] == pytest.approx(HZ * low_hz)
+    assert w[-1] == pytest.approx(HZ * high_hz)
+    assert (np.diff(w) > 0.0).all()
+    followed = w[w <= HZ * find_resolved_hz(low_hz, high_hz, delay_s)]
+    assert (2.0 * delay_s * np.diff(followed) <= HZ / 4.0 * 1.03).all()
+
+
+@given(at_hz=st.floats(0.01, 10.0), width=st.floats(0.002, 1.0))
+def test_a_dip_is_found_to_a_percent_though_the_grid_steps_over_its_bottom(
+    at_hz: float, width: float
+) -> None:
+    """A Lorentzian whose half width is down to a thirtieth of the grid's steps."""
+
+    def curve(w: Array) -> Array:
+        return np.asarray(0.1 - 1.0 / (1.0 + (np.log(w / (HZ * at_hz)) / width) ** 2))
+
+    found = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert found.least == pytest.approx(-0.9, rel=0.02)
+    assert found.least_hz == pytest.approx(at_hz, rel=0.2 * width)
+    (span,) = found.below
+    assert span.from_hz == pytest.approx(max(1e-3, at_hz * np.exp(-3.0 * width)), rel=1e-6)
+    assert span.to_hz == pytest.approx(min(100.0, at_hz * np.exp(3.0 * width)), rel=1e-6)
+
+
+def test_ranges_below_a_level_have_the_edges_of_the_curve_and_those_of_the_band() -> None:
+    found = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
+    expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
+    np.testing.assert_allclose(found.below, np.array(expected), rtol=1e-6)
+    begun = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
+    np.testing.assert_allclose(begun.below, [(0.6, 1.0)], rtol=1e-6)
+    ended = find_minima(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)
+    np.testing.assert_allclose(ended.below, [(0.5, 0.9)], rtol=1e-6)
+
+
+def test_what_is_below_by_less_than_the_tolerance_is_not_below() -> None:
+    def shallow(w: Array) -> Array:
+        return np.full(len(w), -1e-9)
+
+    w = build_frequency_grid(0.1, 1.0, 0.0)
+    assert not find_minima(shallow, w, tolerance=lambda at: np.full(len(at), 1e-8)).below
+    assert find_minima(shallow, w).below
+
+
+def test_a_band_that_is_wide_for_its_delay_is_followed_in_part_and_says_so() -> None:
+    assert find_resolved_hz(1e-3, 100.0, 0.2) == 100.0
+    assert find_resolved_hz(1e-3, 100.0, 1.6) == 100.0
+    assert find_resolved_hz(1e-3, 1000.0, 1.6) == pytest.approx(1.3, rel=0.05)
+
+
+def test_a_flat_curve_and_a_rising_one_have_no_dip() -> None:
+    w = build_frequency_grid(0.1, 1.0, 0.0)
+    assert find_minima(lambda at: np.asarray(at), w).least == w[0]
+    assert not find_minima(lambda at: np.asarray(at), w).below
+
+
+def test_a_sharp_resonance_is_resolved() -> None:
+    """Quality 1000: the peak is a thousandth wide, the grid's steps are sixty times that."""
+    network = Network((1.0,), (1e-3,), (1.0,))
+    Y = build_admittance(network.loop)
+    w = refine_frequencies(Y, build_frequency_grid(1e-2, 10.0, 0.0))
+    assert np.abs(Y(w)).max() == pytest.approx(1000.0, rel=0.01)
+    size = np.abs(Y(w))[:, 0, 0]
+    assert (np.abs(np.diff(Y(w)[:, 0, 0])) <= 0.1 * np.maximum(size[1:], size[:-1])).all()
+
+
+def test_an_undamped_resonance_ends_the_refinement() -> None:
+    Y = build_admittance(Network((1.0,), (0.0,), (1.0,)).loop)
+    w = refine_frequencies(Y, build_frequency_grid(1e-2, 10.0, 0.0))
+    assert np.isfinite(Y(w)).all()
+    assert len(w) < 6000
+
+
+def test_an_answer_that_is_remembered_is_the_same_and_asked_once() -> None:
+    asked: list[int] = []
+    Y = build_admittance(pair().loop)
+
+    def counted(w: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
+        asked.append(len(w))
+        return Y(w)
+
+    w = build_frequency_grid(0.1, 1.0, 0.2)
+    known = cache_response(counted, w)
+    np.testing.assert_array_equal(known(w), Y(w))
+    np.testing.assert_array_equal(known(w), Y(w))
+    np.testing.assert_array_equal(known(w[:3]), Y(w[:3]))
+    assert asked == [len(w), 3]

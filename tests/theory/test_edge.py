@@ -1,0 +1,125 @@
+"""Where stability changes over a key, against the lines of the theory and what they leave out."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.linalg import eigvalsh
+from scipy.optimize import brentq
+
+from tests.theory.loops import Array
+from trilat_net.core.two_link_arm import inertia
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.theory import find_equilibrium, find_linear_edge, iterate_linear_edges
+from trilat_net.theory.equilibrium import predict_equilibrium
+from trilat_net.theory.linear_edge import LinearEdge
+
+
+def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float:
+    """d where M w^2 = K (1 + share cos w T) and d w = share K sin w T, the largest over M's eigenvalues.
+
+    The equations of a mode v of M and of an eigenvalue -share of alpha on the imaginary axis.
+    """
+    rest = predict_equilibrium(scenario)
+    theta = scenario.sites["s"].arm.theta
+    found = []
+    for mass in eigvalsh(np.array(inertia(theta, rest.q[0]))):
+
+        def balance(w: float, mass: float = mass) -> float:
+            return mass * w * w - K * (1 + share * math.cos(w * T))
+
+        w = brentq(balance, 1e-9, math.sqrt(K * (1 + share) / mass))
+        found.append(share * K * math.sin(w * T) / w)
+    return max(found)
+
+
+@pytest.mark.parametrize(("name", "share"), [("p_d_margin", 0.5), ("p_d_margin_two", 1.0)])
+@pytest.mark.parametrize("delay_ms", [20.0, 200.0, 400.0])
+def test_p_d_turns_stable_where_its_mode_stands(name: str, share: float, delay_ms: float) -> None:
+    scenario = load_scenario(name, {"link.delay_ms": delay_ms})
+    T = delay_ms / 1e3
+    line = share * 10.0 * T
+    found = find_linear_edge(scenario, "control.d", 0.3 * line, 1.5 * line, points=8)
+    assert found is not None
+    assert found.stable_above
+    assert found.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
+    assert found.value < line  # the line leaves the inertia out: it is on the safe side
+
+
+def heavy_pair(seed: int, ratio: Callable[[float, float, float, float], float]) -> tuple[Scenario, Array]:
+    """Two sites with random gains and delays whose arms are so heavy that K T^2 << M, and these.
+
+    These: K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2; `ratio` says how
+    much heavier the second arm is.
+    """
+    rng = np.random.default_rng(seed)
+    K1, K2 = (float(K) for K in rng.uniform(2.0, 10.0, 2))
+    T1_ms, T2_ms = (float(T) for T in rng.integers(2, 20, 2))
+    T = 1e-3 * (T1_ms + T2_ms)
+    d1 = float(rng.uniform(0.7, 1.4)) * T * math.sqrt(K1 * K2) / 2.0
+    d2 = T * T * K1 * K2 / (4.0 * d1)
+    arms = {}
+    for site, kg in (("m", 300.0), ("s", 300.0 * ratio(K1, K2, d1, d2))):
+        arms |= {f"sites.{site}.arm.{key}": kg for key in ("m1_kg", "m2_kg")}
+        arms |= {f"sites.{site}.arm.{key}": kg / 12.0 for key in ("I1_kg_m2", "I2_kg_m2")}
+    links = {"links.m->s.delay_ms": T1_ms, "links.s->m.delay_ms": T2_ms}
+    gains = {"sites.m.control.K": K1, "sites.s.control.K": K2, "sites.m.control.d": d1}
+    return load_scenario("p_d_margin_two", {**arms, **links, **gains}), np.array([K1, K2, T, d1, d2])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_sites_turn_stable_at_4_d_d_for_the_arms_that_need_most(seed: int) -> None:
+    """4 d1 d2 = (T1 + T2)^2 K1 K2, where M2/M1 is the ratio that needs the most damping."""
+
+    def worst(K1: float, K2: float, d1: float, d2: float) -> float:
+        both = math.sqrt(K1 * K2)
+        return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
+
+    scenario, (*_, d2) = heavy_pair(seed, worst)
+    found = find_linear_edge(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3)
+    assert found is not None
+    assert found.value == pytest.approx(d2, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_like_arms_turn_stable_where_d1_over_k2_and_d2_over_k1_make_the_round_trip(seed: int) -> None:
+    """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
+    scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_: 1.0)
+    exact = K1 * (T - d1 / K2)
+    found = find_linear_edge(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3)
+    assert found is not None
+    assert found.value == pytest.approx(exact, rel=1e-3)
+    assert found.value <= d2 * 1.001
+
+
+def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_none() -> None:
+    """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
+    scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
+    rest = find_equilibrium(scenario, (-0.1729, 0.0874))
+    found = find_linear_edge(scenario, "rate_hz", 60, 400, rest, points=6)
+    assert found is not None
+    assert 100 < found.value < 125
+    assert found.stable_above
+    assert find_linear_edge(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False) is None
+
+
+def test_nothing_is_found_where_nothing_changes_and_all_is_found_where_much_does() -> None:
+    scenario = load_scenario("p_d_margin")
+    assert find_linear_edge(scenario, "control.d", 1.2, 3.0, points=4) is None
+    found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
+    assert [one.stable_above for one in found] == [False, True, False, True][: len(found)]
+    assert all(isinstance(one, LinearEdge) for one in found)
+    assert 200 < found[0].value < 230
+
+
+@pytest.mark.parametrize(("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))])
+def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
+    with pytest.raises(UsageError, match=r"control\.d is scanned from a value to a larger one"):
+        find_linear_edge(load_scenario("p_d_margin"), "control.d", low, high)
+
+
+def test_a_key_that_is_none_is_refused_with_the_nearest() -> None:
+    with pytest.raises(ScenarioError, match="did you mean 'Kd'"):
+        find_linear_edge(load_scenario("p_d_margin"), "control.Kdd", 1, 2)

@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.theory.networks import Network, Wire, pair
+from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
+from trilat_net.theory.port_passivity import (
+    Passivity,
+    check_passivity,
+    find_least_eigenvalue,
+    weight_response,
+)
+from trilat_net.theory.port_response import build_admittance, find_longest_delay_s
+
+POSITIVE = st.floats(0.1, 10.0)
+OR_NONE = st.just(0.0) | POSITIVE
+
+
+def judged(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
+    Y = build_admittance(network.loop)
+    w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop)))
+    return check_passivity(Y, w, None if weights is None else np.array(weights))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    m=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+    d=st.tuples(OR_NONE, OR_NONE, OR_NONE),
+    k=st.tuples(OR_NONE, OR_NONE, OR_NONE),
+    links=st.lists(st.tuples(OR_NONE, OR_NONE), min_size=2, max_size=2),
+)
+def test_masses_springs_and_dampers_are_passive(
+    m: tuple[float, ...], d: tuple[float, ...], k: tuple[float, ...], links: list[tuple[float, float]]
+) -> None:
+    wires = [Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))]
+    found = judged(Network(m, d, k, tuple(wires)))
+    assert found.passive
+    assert found.lacking_nm_s_rad == 0.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(K=POSITIVE, delay_s=st.floats(0.05, 1.0))
+def test_a_delay_without_damping_is_not_passive(K: float, delay_s: float) -> None:
+    assert not judged(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
+
+
+@pytest.mark.parametrize("T", [(0.2, 0.2), (0.1, 0.5), (0.0, 0.3)])
+@pytest.mark.parametrize("K", [(10.0, 10.0), (20.0, 3.0)])
+@pytest.mark.parametrize("share", [0.3, 1.0, 4.0])
+def test_p_d_is_passive_from_the_damping_on_that_the_literature_states(
+    K: tuple[float, float], T: tuple[float, float], share: float
+) -> None:
+    """4 d1 d2 >= (T1 + T2)^2 K1 K2, the energies weighted by 1 / K: at 2 % on either side."""
+    product = 0.25 * sum(T) ** 2 * K[0] * K[1]
+    for factor, holds in ((0.98, False), (1.02, True)):
+        first = np.sqrt(product * factor) * share
+        network = pair(K, (first, product * factor / first), T)
+        # dampers of different size pass the damping on: their share of the weight cancels
+        assert judged(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
+
+
+@pytest.mark.parametrize("d", [0.0, 0.5, 1.5, 1.9])
+def test_what_p_d_lacks_is_k_t_less_its_damping(d: float) -> None:
+    """-1/2 lambda_min(Z + Z^H) = K abs(sin(w T)) / w - d, most at w = 0: K T - d."""
+    assert judged(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(K=POSITIVE, delay_s=st.floats(0.05, 0.5))
+def test_with_the_damping_that_is_lacking_it_is_passive_and_with_less_it_is_not(
+    K: float, delay_s: float
+) -> None:
+    lacking = judged(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
+    for factor, holds in ((0.98, False), (1.02, True)):
+        d = (0.1 + factor * lacking, 0.2 + factor * lacking)
+        if lacking > 0.0:
+            assert judged(pair((K, K), d, (delay_s, delay_s))).passive is holds
+
+
+def test_where_p_d_is_not_passive_ends_where_its_sine_says() -> None:
+    """d = K abs(sin(w T)) / w."""
+    (span,) = judged(pair(d=(1.0, 1.0))).dips.below
+    w = 2.0 * np.pi * span.to_hz
+    assert np.sin(0.2 * w) / w == pytest.approx(0.1, rel=1e-6)
+    assert span.from_hz == pytest.approx(1e-3)
+
+
+def test_a_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
+    """Z = m s + d + c / s^2: at low frequency a negative damping c / w^2."""
+    loop = Network((1.0, 1.0), (2.0, 1.0), (0.0, 0.0)).loop
+    A = loop.A.copy()
+    A[2] = [1.0, 0.0, -1.0, 0.0]  # b's angle is a filter of a's now: an integral that leaks slowly
+    A[2, 2] = 0.0
+    A[1, 2] = -0.1
+    wound = loop._replace(A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",))
+    Y = build_admittance(wound)
+    found = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert not found.passive
+    assert found.lacking_nm_s_rad == np.inf
+
+
+@given(
+    scale=st.floats(0.01, 100.0),
+    numbers=st.lists(st.complex_numbers(max_magnitude=10.0), min_size=9, max_size=9),
+    weights=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+)
+def test_weights_count_by_their_ratios_and_decide_the_sign_of_the_weighted_power(
+    scale: float, numbers: list[complex], weights: tuple[float, ...]
+) -> None:
+    Y = np.array(numbers).reshape(1, 3, 3)
+    D = np.array(weights)
+    least = find_least_eigenvalue(weight_response(Y, D))[0]
+    assert find_least_eigenvalue(weight_response(Y, scale * D))[0] == pytest.approx(least, rel=1e-9, abs=1e-9)
+    power = np.diag(D) @ Y[0]
+    plain = np.linalg.eigvalsh(power + power.conj().T)[0]
+    if abs(least) > 1e-6:
+        assert np.sign(plain) == np.sign(least)
+    assert least == pytest.approx(find_least_eigenvalue(weight_response(Y, np.tile(D, (1, 1))))[0])

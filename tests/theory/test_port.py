@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.theory.networks import Network, Wire, pair
+from trilat_net.errors import RuntimeFault
+from trilat_net.theory.port_response import (
+    LoopOutput,
+    build_admittance,
+    evaluate_transfer,
+    find_longest_delay_s,
+    find_pole_at_zero,
+    find_site_ports,
+    group_ports_by_joint,
+    invert_response,
+    list_port_sites,
+    select_ports,
+    to_imaginary_axis,
+)
+
+W = np.geomspace(1e-3, 1e3, 61)
+POSITIVE = st.floats(0.1, 10.0)
+DELAYS = st.sampled_from([0.0, 0.05, 0.2, 1.0])
+
+
+@given(m=POSITIVE)
+def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
+    Y = build_admittance(Network((m,), (0.0,), (0.0,)).loop)(W)
+    np.testing.assert_allclose(Y[:, 0, 0], 1.0 / (1j * W * m), rtol=1e-12)
+
+
+@given(
+    m=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+    d=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+    k=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+    wires=st.lists(
+        st.builds(
+            Wire, st.integers(0, 2), st.integers(0, 2), POSITIVE, POSITIVE, DELAYS, st.floats(0.0, 1.0)
+        ).filter(lambda wire: wire.at < wire.of),
+        max_size=4,
+    ),
+)
+def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
+    m: tuple[float, ...], d: tuple[float, ...], k: tuple[float, ...], wires: list[Wire]
+) -> None:
+    """Springs, dampers, delays and reflected torque of any size."""
+    network = Network(m, d, k, tuple(wires))
+    Y = build_admittance(network.loop)(W)
+    np.testing.assert_allclose(Y @ network.impedance(W), np.zeros_like(Y) + np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(invert_response(Y) @ Y, np.zeros_like(Y) + np.eye(3), atol=1e-9)
+
+
+@given(K=POSITIVE, B=POSITIVE)
+def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(K: float, B: float) -> None:
+    at_once = build_admittance(pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
+    np.testing.assert_allclose(at_once[:, 0, 1], at_once[:, 1, 0], rtol=1e-9)
+    late = build_admittance(pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
+    ratio = late[:, 0, 1] / late[:, 1, 0]
+    np.testing.assert_allclose(ratio, np.exp(1j * W * 0.2), rtol=1e-9)
+
+
+def test_what_is_read_may_be_past() -> None:
+    """Velocity minus what it was 0.3 s before."""
+    loop = Network((2.0,), (1.0,), (0.0,)).loop
+    Y = evaluate_transfer(loop, to_imaginary_axis(W), LoopOutput(loop.C, ((0.3, -loop.C),)))
+    np.testing.assert_allclose(Y[:, 0, 0], (1.0 - np.exp(-0.3j * W)) / (2j * W + 1.0), rtol=1e-12)
+
+
+def test_no_frequencies_no_answers() -> None:
+    assert build_admittance(pair().loop)(np.zeros(0)).shape == (0, 2, 2)
+
+
+def test_a_floating_network_has_a_passive_pole_at_zero_and_an_anchored_or_damped_one_has_none() -> None:
+    floating = Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 7.0)))
+    found = find_pole_at_zero(floating.loop)
+    assert found.order == 1
+    assert found.passive
+    np.testing.assert_allclose(found.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
+    for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), pair()):
+        none = find_pole_at_zero(tied.loop)
+        assert none.order == 0
+        assert none.passive
+        assert not none.residue.any()
+
+
+def test_floating_masses_that_push_each_other_unevenly_have_a_pole_that_is_not_passive() -> None:
+    """7 N m/rad one way and 3 the other: the residue is no longer symmetric."""
+    found = find_pole_at_zero(
+        Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
+    )
+    assert found.order == 1
+    np.testing.assert_allclose(found.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9)
+    assert not found.passive
+
+
+def test_a_mass_that_follows_the_angle_of_a_floating_one_has_a_pole_of_third_order() -> None:
+    """qdd_a = u_a + 5 q_b and qdd_b = u_b: Y_ab = 5 / s^3."""
+    loop = Network((1.0, 1.0), (0.0, 0.0), (0.0, 0.0)).loop
+    A = loop.A.copy()
+    A[1, 2] = 5.0
+    found = find_pole_at_zero(loop._replace(A=A))
+    assert found.order == 3
+    assert not found.passive
+
+
+def test_ports_by_site_and_by_joint() -> None:
+    loop = pair().loop._replace(inputs=("a.tau1", "a.tau2"), outputs=("a.qd1", "a.qd2"))
+    assert list_port_sites(loop) == ("a",)
+    assert find_site_ports(loop, "a") == [0, 1]
+    assert group_ports_by_joint(loop) == {1: [0], 2: [1]}
+    assert group_ports_by_joint(pair().loop) == {1: [0, 1]}
+    assert find_longest_delay_s(pair(T=(0.1, 0.4)).loop) == 0.4
+    assert find_longest_delay_s(Network((1.0,), (0.0,), (0.0,)).loop) == 0.0
+    Y = build_admittance(loop)
+    np.testing.assert_array_equal(select_ports(Y, [1])(W), Y(W)[:, 1:, 1:])
+
+
+def test_ports_need_a_velocity_for_each_torque() -> None:
+    loop = pair().loop
+    with pytest.raises(RuntimeFault, match="1 of 2"):
+        build_admittance(loop._replace(C=loop.C[:1]))

@@ -1,0 +1,111 @@
+"""Where loops rest: equilibria of the equations, found from runs that settle, swing, or diverge."""
+
+import numpy as np
+import pytest
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.theory.equilibrium import (
+    MAX_EQUILIBRIUM_RESIDUAL,
+    compute_equilibrium_residual,
+    find_equilibrium,
+    follow_equilibrium,
+    predict_equilibrium,
+)
+from trilat_net.theory.operating_point import derive_operating_conditions
+
+TRIO = {"rate_hz": 200}
+
+
+@pytest.mark.parametrize("name", ["free", "p_d_margin_two", "contact", "windup", "force_sharing"])
+def test_a_rest_is_an_equilibrium(name: str) -> None:
+    scenario = load_scenario(name, TRIO)
+    found = find_equilibrium(scenario)
+    assert np.abs(
+        compute_equilibrium_residual(derive_operating_conditions(scenario), found)
+    ).max() == pytest.approx(found.residual, abs=1e-14)
+    assert found.residual <= MAX_EQUILIBRIUM_RESIDUAL
+
+
+def test_a_run_that_settles_rests_where_it_ends() -> None:
+    """The gravity anchor of the paper's experiment."""
+    found = find_equilibrium(load_scenario("paper", TRIO))
+    assert found.q == pytest.approx(np.tile([-0.1729, 0.0874], (3, 1)), abs=2e-3)
+    assert found.theta_hat[:, 3:] == pytest.approx(np.tile([2.0, 1.0], (3, 1)), abs=1e-6)
+    assert "the run is at rest" in found.how
+
+
+def test_a_run_that_diverges_rests_where_its_linear_loop_would_take_it() -> None:
+    """Equal gains: what is kept is the mean of the start poses."""
+    scenario = load_scenario("p_d_margin", {**TRIO, "control.d": 0.1, "link.delay_ms": 400.0})
+    found = find_equilibrium(scenario)
+    starts = np.mean([site.q0_rad for site in scenario.sites.values()], axis=0)
+    assert "the run diverges at" in found.how
+    assert found.q == pytest.approx(np.tile(starts, (3, 1)), abs=1e-9)
+    assert found.q == pytest.approx(predict_equilibrium(scenario).q)
+
+
+def test_what_is_kept_weighs_the_sites_by_their_damping_and_delay() -> None:
+    """The pose that the linear loop foretells is that in which a run ends."""
+    scenario = load_scenario(
+        "p_d_margin_two", {**TRIO, "sites.m.control.d": 9.0, "sites.s.control.d": 4.0, "duration_s": 60.0}
+    )
+    assert predict_equilibrium(scenario).q == pytest.approx(find_equilibrium(scenario).q, abs=5e-3)
+
+
+def test_a_run_that_hammers_has_an_equilibrium_in_contact() -> None:
+    scenario = load_scenario("contact", {**TRIO, "rate_hz": 500})
+    found = find_equilibrium(scenario)
+    assert "still moves" in found.how
+    now = derive_operating_conditions(scenario)
+    calm = find_equilibrium(
+        load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
+    )  # settles at the same pose
+    assert "at rest" in calm.how
+    assert found.q == pytest.approx(calm.q, abs=1e-9)
+    assert np.abs(compute_equilibrium_residual(now, calm)).max() <= MAX_EQUILIBRIUM_RESIDUAL
+
+
+def test_a_pose_of_ones_own_is_taken_as_it_is() -> None:
+    scenario = load_scenario("free")
+    found = find_equilibrium(scenario, (0.1, 0.3))
+    assert found.q.tolist() == [[0.1, 0.3]] * 3
+    assert found.theta_hat == pytest.approx(np.tile([3.0, 1.0, 1.0, 2.0, 1.0], (3, 1)))
+    assert found.notes == ()
+
+
+def test_a_pose_that_is_no_rest_is_said_to_be_none() -> None:
+    (note,) = find_equilibrium(load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)).notes
+    assert "the pose is no rest" in note
+
+
+def test_a_torque_beyond_the_clamp_is_said() -> None:
+    notes = find_equilibrium(load_scenario("free", {"limits.tau_limit_nm": 5.0}), (0.1, 0.3)).notes
+    assert [note.split()[0] for note in notes] == ["m1", "m2", "s"]
+    assert all("its clamp is 5" in note for note in notes)
+
+
+def test_a_rest_moves_along_with_a_key_and_stays_where_the_key_does_not_move_it() -> None:
+    scenario = load_scenario("p_d_margin_two")
+    rest = find_equilibrium(scenario, (0.3, 0.0))
+    assert follow_equilibrium(load_scenario(scenario, {"control.d": 1.0}), rest).q.tolist() == rest.q.tolist()
+    hand = {"kind": "spring", "to_rad": [0.3, 0.0], "stiffness_nm_rad": 20.0}
+    sagged = follow_equilibrium(
+        load_scenario(scenario, {"sites.m.hands": [hand], "sites.s.control.gravity": 0.9}), rest
+    )
+    assert sagged.residual <= MAX_EQUILIBRIUM_RESIDUAL
+    assert sagged.q[1, 0] < sagged.q[0, 0] < 0.3  # s hangs on m, which a hand holds
+
+
+def test_a_loop_that_rests_nowhere_is_refused() -> None:
+    """A torque that the arms cannot bear anywhere."""
+    push = {"kind": "recorded", "points": [[0.0, 500.0, 0.0], [1000.0, 500.0, 0.0]]}
+    scenario = load_scenario("p_d_margin_two", {**TRIO, "sites.m.hands": [push], "duration_s": 2.0})
+    with pytest.raises(ScenarioError, match="rests nowhere"):
+        find_equilibrium(scenario)
+
+
+@pytest.mark.parametrize("pose", [(float("nan"), 0.0), (float("inf"), 0.0)])
+def test_a_pose_that_is_none_is_refused(pose: tuple[float, float]) -> None:
+    with pytest.raises(UsageError, match="--pose is two angles"):
+        find_equilibrium(load_scenario("free"), pose)

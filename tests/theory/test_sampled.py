@@ -1,0 +1,166 @@
+"""The loop as it is computed, against runs tick by tick, and against the continuous loop in the limit."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.theory.loops import Array
+from tests.virtual_runs import trajectories
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.theory import find_equilibrium
+from trilat_net.theory.characteristic_roots import Spectrum
+from trilat_net.theory.delay_roots import compute_delay_spectrum
+from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.theory.tick_map import build_companion_matrix, build_tick_pencil, compute_sampled_spectrum
+
+POSE = (-0.1729, 0.0874)
+NOTHING = np.zeros(0, dtype=np.complex128)
+
+
+def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
+    """Continuous and as computed, about one pose."""
+    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
+    near = np.array([root.s for root in continuous.roots])
+    found = compute_sampled_spectrum(now, rest, near, wanted)
+    assert found is not None
+    return continuous, found
+
+
+HANDS = [
+    {"kind": "spring", "from_rad": list(POSE), "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 2.0},
+    {
+        "kind": "spring",
+        "from_rad": list(POSE),
+        "stiffness_nm_rad": 9.0,
+        "damping_nm_s_rad": 1.0,
+        "sampled": True,
+    },
+]
+LAWS = {
+    "adaptive": {"law": "adaptive", "theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]},
+    "pd_d": {"law": "pd_d", "K": 10.0, "Kd": 2.0, "d": 1.0},
+    "p_f": {"law": "p_f", "K": 12.0, "d": 3.0, "k_f": 0.3},
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+@pytest.mark.parametrize("delay_ms", [0.0, 30.0])
+def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(law: str, scheme: str, delay_ms: float) -> None:
+    """The companion matrix carries it on; the run begins there, its peers' histories at their start poses."""
+    small = 1e-6
+    off = small * np.array([[1.0, -0.5], [-0.7, 0.3]])
+    scenario = load_scenario(
+        "two_sites",
+        {
+            "rate_hz": 100,
+            "duration_s": 1.0,
+            "scheme": scheme,
+            "control": LAWS[law],
+            "link.delay_ms": delay_ms,
+            # before the first sample a peer feels nothing: a spring off its rest would be felt
+            "sites.m.hands": [{**hand, "stiffness_nm_rad": 0.0} for hand in HANDS] if law == "p_f" else HANDS,
+            "sites.m.q0_rad": (POSE + off[0]).tolist(),
+            "sites.s.q0_rad": (POSE + off[1]).tolist(),
+        },
+    )
+    now = derive_operating_conditions(scenario)
+    rest = find_equilibrium(scenario, POSE)
+    assert rest.residual < 1e-10
+    pencil, names, _ = build_tick_pencil(now, rest)
+    whole = build_companion_matrix(pencil)
+    start = {f"{site}.q{j + 1}": off[i, j] for (i, site), j in itertools.product(enumerate("ms"), range(2))}
+    X = begun(whole, pencil.late, names, np.array([start.get(name, 0.0) for name in names]))
+    run = trajectories(scenario)
+    q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(POSE, 2)
+    places = [names.index(f"{site}.q{j + 1}") for site in "ms" for j in range(2)]
+    for k in range(1, 60):
+        X = whole @ X
+        assert np.abs(X[places] - q[k]).max() <= 2e-4 * small, k
+
+
+def begun(whole: Array, late: NDArray[np.intp], names: Sequence[str], start: Array) -> Array:
+    """The state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
+    X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))])
+    thetas = [place for place, name in enumerate(names) if ".theta" in name]
+    taus = [place for place, name in enumerate(names) if ".tau" in name]
+    if taus:  # theta_0 = eta_0 + h/2 f_0, and a tick adds h f to eta
+        X[thetas] -= 0.5 * ((whole @ X)[thetas] - X[thetas])
+        X[taus] = (whole @ X)[taus]
+    return X
+
+
+@pytest.mark.parametrize(("scheme", "order"), [("second_order", 2), ("digital", 1)])
+@pytest.mark.parametrize("delay_ms", [0.0, 100.0])
+def test_it_goes_to_the_continuous_loop_with_the_order_of_its_scheme(
+    scheme: str, order: int, delay_ms: float
+) -> None:
+    """Both with the same delay in use; the rightmost root, at rates that halve the period."""
+    apart = []
+    for rate_hz in (100, 200, 400):
+        scenario = load_scenario("paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz})
+        continuous, computed = spectra(scenario, 2)
+        apart.append(abs(continuous.roots[0].s - computed.roots[0].s))
+    for coarse, fine in itertools.pairwise(apart):
+        assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
+
+
+@pytest.mark.parametrize(("rate_hz", "stable"), [(80, False), (100, False), (125, True), (200, True)])
+def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
+    """About Gamma g^2 h > Kp it swings by itself; the extrapolated torque does not."""
+    given = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
+    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **given}))
+    assert (digital.verdict == "stable") == stable
+    _, second = spectra(load_scenario("paper", given))
+    assert second.verdict == "stable"
+
+
+def test_a_swing_that_grows_is_that_of_a_run() -> None:
+    """P+d just below its edge at 50 Hz: the run's swing grows as the sampled root says."""
+    scenario = load_scenario(
+        "p_d_margin_two",
+        {
+            "scheme": "digital",
+            "rate_hz": 50,
+            "control.d": 1.5,
+            "duration_s": 20.0,
+            "sites.m.q0_rad": [0.301, 0.0],
+            "sites.s.q0_rad": [0.3, 0.0],
+        },
+    )
+    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3005, 0.0))
+    found = compute_sampled_spectrum(now, rest, NOTHING, 2)
+    assert found is not None
+    root = found.roots[0].s
+    run = trajectories(scenario).sites["m"]
+    late = run.t_s > 8.0
+    apart = np.abs(run.q - run.q_des)[late, 0]
+    half = round(np.pi / root.imag * 50)
+    peaks = [apart[k : k + half].max() for k in range(0, len(apart) - half, half)]
+    slope, _ = np.polyfit(np.arange(len(peaks)) * half / 50, np.log(peaks), 1)
+    assert slope == pytest.approx(root.real, rel=0.03)
+
+
+def test_long_delays_give_the_roots_of_the_whole_companion_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("p_d_margin_two", {"rate_hz": 200, "link.delay_ms": 200.0})
+    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.0))
+    near = np.array([root.s for root in compute_delay_spectrum(linearise_loop(now, rest), 4).roots])
+    whole = compute_sampled_spectrum(now, rest, NOTHING, 4)
+    monkeypatch.setattr("trilat_net.theory.tick_map.MAX_COMPANION_SIZE", 50)
+    found = compute_sampled_spectrum(now, rest, near, 4)
+    assert whole is not None
+    assert found is not None
+    assert (found.zeros, len(found.roots)) == (whole.zeros, len(whole.roots))
+    for one, other in zip(found.roots, whole.roots, strict=True):
+        assert abs(one.s - other.s) < 1e-9
+
+
+def test_several_rates_have_no_one_period() -> None:
+    scenario = load_scenario("two_sites", {"sites.s.rate_hz": 500})
+    rest = Equilibrium(np.tile(POSE, (2, 1)), np.tile(scenario.sites["s"].arm.theta, (2, 1)), "", 0.0)
+    assert compute_sampled_spectrum(derive_operating_conditions(scenario), rest, NOTHING) is None

@@ -1,0 +1,130 @@
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.theory.equilibrium import find_equilibrium
+from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
+
+POSE = (-0.6, 1.8)
+
+
+@cache
+def section_of(name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None) -> PortAnalysis:
+    scenario = load_scenario(name, {key: [] if value == () else value for key, value in overrides})
+    return analyse_ports(scenario, find_equilibrium(scenario, POSE), of)
+
+
+@pytest.mark.parametrize("name", ["p_d_margin_two", "p_d_margin"])
+@pytest.mark.parametrize("K", [5.0, 20.0])
+def test_p_d_is_passive_from_the_line_of_its_stability_on(name: str, K: float) -> None:
+    """d = abs(lambda_min(alpha)) K T, whatever the masses, and with joints that are coupled."""
+    line = {"p_d_margin_two": 1.0, "p_d_margin": 0.5}[name] * K * 0.2
+    beyond = section_of(name, (("control.K", K), ("control.d", 1.02 * line)))
+    assert beyond.velocity.passive
+    assert beyond.pole.passive
+    assert not beyond.absolute.below
+    assert not any(one.dips.below for one in beyond.two_ports)
+    below = section_of(name, (("control.K", K), ("control.d", 0.98 * line)))
+    assert not below.velocity.passive
+    assert below.absolute.below
+    assert all(one.dips.below for one in below.two_ports if len(below.sites) == 2)
+
+
+def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
+    """What is passive is absolutely stable, and what is so at all joints is so at each."""
+    bare = (("timeline", ()), ("sites.m1.hands", ()), ("sites.m2.hands", ()))
+    for name, overrides in (("p_d_margin", ()), ("training", bare), ("two_sites", ())):
+        section = section_of(name, overrides)
+        assert section.verdict == "stable"
+        fails = [one for one in section.two_ports if one.dips.below and not one.clamped]
+        if not section.absolute.below:
+            assert not fails
+        if section.velocity.passive:
+            assert not section.absolute.below
+            assert all(one.passive for one in section.joints.values())
+        worst = max((span.to_hz for span in section.velocity.dips.below), default=0.0)
+        assert all(span.to_hz <= worst * 1.001 for span in section.absolute.below)
+
+
+def test_three_sites_have_every_pair_with_the_third_off_and_clamped_and_two_have_one() -> None:
+    three = section_of("p_d_margin")
+    assert [(one.sites, one.clamped) for one in three.two_ports[::2]] == [
+        (("m1", "m2"), ""),
+        (("m1", "m2"), "s"),
+        (("m1", "s"), ""),
+        (("m1", "s"), "m2"),
+        (("m2", "s"), ""),
+        (("m2", "s"), "m1"),
+    ]
+    assert {one.joint for one in three.two_ports} == {1, 2}
+    assert [(one.sites, one.clamped) for one in section_of("p_d_margin_two").two_ports] == 2 * [
+        (("m", "s"), "")
+    ]
+
+
+def test_hands_feel_the_slave_unless_another_site_is_named() -> None:
+    assert [(one.at, one.of, one.joint) for one in section_of("p_d_margin").felt] == [
+        ("m1", "s", 1),
+        ("m1", "s", 2),
+        ("m2", "s", 1),
+        ("m2", "s", 2),
+    ]
+    assert {(one.at, one.of) for one in section_of("p_d_margin", of="m1").felt} == {("m2", "m1"), ("s", "m1")}
+
+
+def test_equal_masters_feel_the_same() -> None:
+    first, second = section_of("p_d_margin").felt[::2]
+    np.testing.assert_allclose(first.free, second.free, rtol=1e-9)
+    np.testing.assert_allclose(first.clamped, second.clamped, rtol=1e-9)
+
+
+def test_only_the_paper_s_law_has_an_r() -> None:
+    section = section_of("two_sites")
+    assert section.proof is not None
+    assert section.proof.passive
+    assert section.true
+    assert section_of("p_d_margin").proof is None
+
+
+def test_estimates_that_are_not_the_truth_let_the_linear_loop_give_back_what_they_store() -> None:
+    """V counts the error of the estimates, which of inertia nothing excites to first order."""
+    scenario = load_scenario("free")
+    rest = find_equilibrium(scenario, POSE)
+    learnt = np.tile([0.5, 0.45, -0.29, 2.0, 1.0], (3, 1))  # as a run of it ends
+    section = analyse_ports(scenario, rest._replace(q=np.tile([-0.124, 0.337], (3, 1)), theta_hat=learnt))
+    assert not section.true
+    assert section.proof is not None
+    assert not section.proof.passive
+
+
+def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
+    """A master with k_f = 1 meets a slave that cannot move: K e^{-2 s T} about an arm with little damping."""
+    bare = (("sites.m.hands", ()), ("sites.s.environment", ()))
+    assert section_of("contact", bare).clamped_verdict == "unstable"
+    near = (*bare, ("link.delay_ms", 1.0), ("sites.m.control.d", 30.0))
+    section = section_of("contact", near)
+    assert section.clamped_verdict == "stable"
+    assert section.felt[0].width_db > 2.0
+
+
+def test_a_network_that_passes_one_way_only_has_no_damping_that_saves_all_weights() -> None:
+    section = section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ())))
+    assert not section.velocity.passive
+    assert 0.0 < section.velocity.lacking_nm_s_rad < math.inf
+
+
+def test_what_cannot_be_asked_is_refused() -> None:
+    scenario = load_scenario("p_d_margin_two")
+    rest = find_equilibrium(scenario, POSE)
+    with pytest.raises(UsageError, match="no site 'x' at the ports; there are m, s"):
+        analyse_ports(scenario, rest, "x")
+    with pytest.raises(UsageError, match="to a higher one"):
+        analyse_ports(scenario, rest, band_hz=(1.0, 1.0))
+    measured = load_scenario("p_d_margin_two", {"link": {"model": "measured"}})
+    with pytest.raises(ScenarioError, match="nobody knows"):
+        analyse_ports(measured, rest)

@@ -1,0 +1,49 @@
+import json
+
+from tests.theory.test_section import section_of
+from trilat_net.reporting.port_text import describe_ports
+from trilat_net.theory.port_analysis import ports_to_json
+
+
+def test_what_is_passive_is_said_in_a_word_each() -> None:
+    lines = describe_ports(section_of("p_d_margin_two"))
+    assert lines[0].startswith("Ports of m, s, hands and environments off, 0.001-100 Hz")
+    assert "evidence, no proof" in lines[0]
+    assert "  hands passive in qd: passive" in lines
+    assert "    Llewellyn, every pair and joint: holds (2 two-ports)" in lines
+    assert not any(" r = " in line for line in lines)
+    assert sum("Z-width" in line for line in lines) == 2
+
+
+def test_what_is_not_passive_says_where_and_by_how_much() -> None:
+    section = section_of("two_sites")
+    text = "\n".join(describe_ports(section))
+    (span,) = section.velocity.dips.below
+    assert f"not passive at 0.001-{span.to_hz:.3g} Hz" in text
+    assert f"least eigenvalue {section.velocity.dips.least:.3g} at" in text
+    assert "no damping at the joints would make it so" in text
+    assert "as the proof asks: passive; sites weighted 1, 1" in text
+    assert "some make it unstable at" in text
+
+
+def test_an_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
+    lines = describe_ports(section_of("p_d_margin_two", (("control.d", 1.8),)))
+    assert len(lines) == 2
+    assert "the loop without hands is unstable" in lines[1]
+
+
+def test_a_clamp_that_makes_it_unstable_leaves_nothing_to_feel() -> None:
+    lines = describe_ports(section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ()))))
+    assert lines[-1] == "  with s clamped the loop is unstable: nothing steady is felt of it"
+    assert any("ranges more" in line for line in lines)
+
+
+def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
+    for name in ("p_d_margin_two", "two_sites"):
+        section = section_of(name)
+        facts = json.loads(json.dumps(ports_to_json(section), allow_nan=False))
+        assert facts["passive_qd"]["holds"] is section.velocity.passive
+        assert facts["passive_qd"]["least"] == section.velocity.dips.least
+        assert facts["felt"][0]["width_db"] == section.felt[0].width_db
+        assert (facts["passive_r"] is None) is (section.proof is None)
+    assert facts["passive_qd"]["lacking_nm_s_rad"] is None

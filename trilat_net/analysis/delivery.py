@@ -1,0 +1,226 @@
+"""Delivery of every sample of a link: as its model predicts it, and as the receiver's records list it.
+
+Invariant (L4): the prediction is a function of seed, link and index; the log's scenario and the changes that
+its records name determine it, also for samples that never arrived.
+Invariant (L3): a record names its inputs. Samples that only a missing record could name stay unknown and
+count neither as arrived nor as missing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.channel import LOST, schedule_deliveries
+from ..core.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
+from ..core.link import AHEAD_LIMIT_NS, LINK_DTYPE, SAMPLE_DTYPE
+from ..core.site_setup import LinkSetup
+from ..core.ticks import NS_PER_S
+from ..core.vectors import Array, Row
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+
+_BLOCK = 8192
+
+Bools = NDArray[np.bool_]
+
+
+class PredictedDelivery(NamedTuple):
+    """What a link does to the samples 0 to M - 1 of its peer.
+
+    Attributes:
+        stamp_ns: when each was taken, ns since the epoch, shape (M,).
+        due_ns: when each is due, ns since the epoch, shape (M,); `LOST` where it is lost.
+        drawn_ns: the same by the model's own delay alone, without duplicates, order and play-out.
+        measured: where nothing is injected: a sample is due at once, shape (M,).
+        copies: duplicates that the link makes of them.
+    """
+
+    stamp_ns: Ints
+    due_ns: Ints
+    drawn_ns: Ints
+    measured: Bools
+    copies: int
+
+    @property
+    def lost(self) -> Bools:
+        """Where the link loses the sample, shape (M,)."""
+        lost: Bools = self.due_ns == LOST
+        return lost
+
+    @property
+    def drawn_ms(self) -> Array:
+        """The delays that the model gives to samples that it does not lose; none of a measured one, ms."""
+        kept = ~self.lost & ~self.measured
+        delays: Array = (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
+        return delays
+
+    def release(self, rate_hz: int) -> Ints:
+        """Returns the receiver's tick at which each comes into use if it is there, shape (M,); or LOST."""
+        ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
+        release: Ints = np.where(self.lost, LOST, ticks)
+        return release
+
+
+def first_ticks(due_ns: Ints, rate_hz: int) -> Ints:
+    """Returns the first ticks at or after some times; `core.grid.first_tick_at` for arrays.
+
+    Args:
+        due_ns: ns since the epoch, shape (M,).
+        rate_hz: the rate of the ticks, Hz.
+    """
+    ticks: Ints = -(-due_ns * rate_hz // NS_PER_S)
+    return ticks
+
+
+def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
+    """Returns what a link does to the first samples of its peer.
+
+    Args:
+        log: the log.
+        peer: who sends.
+        site: who receives.
+        count: how many samples.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    setup = next(link for link in log.scenario.setup(site).links if link.peer == peer)
+    index = log[site].peers.index(peer)
+    ordered = [
+        command.model
+        for commands in log.commands(site).values()
+        for command in commands
+        if command.peer == index and command.model is not None
+    ]
+    models, points = _models(setup, ordered)
+    due_ns, copies = _due(setup, models, points, count)
+    alone = models.copy()
+    alone["duplicate"], alone["in_order"], alone["playout_us"] = 0.0, 0, 0
+    drawn_ns = due_ns if np.array_equal(alone, models) else _due(setup, alone, points, count)[0]
+    stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
+    in_force = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
+    return PredictedDelivery(
+        stamp_ns, due_ns, drawn_ns, models["kind"][in_force] == DelayKind.MEASURED, copies
+    )
+
+
+def _due(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
+    """Returns when each sample is due, and how many copies were made: the link's row as a site has it."""
+    row: Row = np.zeros(1, LINK_DTYPE)[0]
+    row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(models)
+    row.used, row.foreseen = -1, -1
+    row.outage_first, row.outage_count = len(points) - len(setup.outages), len(setup.outages)
+    due_ns = np.empty(count, dtype=np.int64)
+    pages = np.zeros(_BLOCK, SAMPLE_DTYPE)
+    for start in range(0, count, _BLOCK):
+        end = min(start + _BLOCK, count)
+        schedule_deliveries(end - 1, row, models, pages, points)
+        due_ns[start:end] = pages["due_ns"][: end - start]
+    return due_ns, int(row.copies)
+
+
+def _models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void], Ints]:
+    """Returns a link's models in the order of their first stamps, and its points: traces, then outages.
+
+    Ordered changes hold from a time at which no sample had been decided, so all can stand there at once.
+    """
+    points: list[tuple[int, int]] = []
+    placed = []
+    for model, trace in zip(setup.models, setup.traces, strict=True):
+        if trace is not None:
+            model = model._replace(trace_first=len(points), trace_count=len(trace))
+            points += [(int(t_us), int(delay_us)) for t_us, delay_us in trace]
+        placed.append(model)
+    models = np.array(sorted([*placed, *ordered], key=lambda model: model.from_ns), LINK_MODEL_DTYPE)
+    return models, np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
+
+
+class Arrivals(NamedTuple):
+    """What came over a link, in the order taken in.
+
+    Attributes:
+        tick: the receiver's tick, shape (A,).
+        sample: the sample's own tick, shape (A,).
+        delay_us: the number beside it in the record, shape (A,), us.
+        refused: how many more came with a stamp out of range, or of a tick that their sender never makes.
+    """
+
+    tick: Ints
+    sample: Ints
+    delay_us: Ints
+    refused: int
+
+    @property
+    def first(self) -> "Arrivals":
+        """The same without what came again, by sample."""
+        sample, place = np.unique(self.sample, return_index=True)
+        return Arrivals(self.tick[place], sample, self.delay_us[place], self.refused)
+
+
+def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
+    """Returns what came to a site, per peer."""
+    part = log[site]
+    counts, entries = part.arrivals
+    tick = np.repeat(part.tick, counts)
+    found = {}
+    for index, peer in enumerate(part.peers):
+        here = entries[:, 0] == index
+        at, sample, delay_us = tick[here], entries[here, 1], entries[here, 2]
+        known = _in_range(at, sample, part.rate_hz, log.scenario.sites[peer].rate_hz)
+        known &= sample < log.scenario.ticks(peer)
+        refused = len(at) - int(np.count_nonzero(known))
+        found[peer] = Arrivals(at[known], sample[known], delay_us[known], refused)
+    return found
+
+
+def _in_range(tick: Ints, sample: Ints, rate_hz: int, peer_rate_hz: int) -> Bools:
+    """Returns which stamps a link takes: none before the epoch, none more than the limit ahead."""
+    latest_ns = tick * NS_PER_S // rate_hz + AHEAD_LIMIT_NS
+    limit = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S  # in ticks: a stamp itself might overflow
+    known: Bools = (sample >= 0) & (sample <= limit)
+    return known
+
+
+def count_sent(log: Log, peer: str, newest: int) -> int:
+    """Returns how many samples a peer has sent, as far as the log tells.
+
+    Args:
+        log: the log.
+        peer: who sends.
+        newest: the newest of its samples that came anywhere; -1: none.
+    """
+    part = log[peer]
+    said = [event.ticks for event in log.events if event.kind == "end" and event.member == peer]
+    recorded = int(part.tick[-1]) + 1 if len(part) else 0
+    return min(max(newest + 1, recorded, *said), log.scenario.ticks(peer))
+
+
+def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
+    """Returns for which samples it is known whether they came, shape (M,).
+
+    Known are those that came, those older than the newest that came, and those older than the slowest
+    took; except those that may have come in a tick whose record is missing.
+
+    Args:
+        log: the log.
+        site: who receives.
+        stamp_ns: the stamps of the samples 0 to M - 1, ns since the epoch.
+        came: what came of them, each once.
+    """
+    part, count = log[site], len(stamp_ns)
+    if not len(part):
+        return np.zeros(count, dtype=np.bool_)
+    prompt = first_ticks(stamp_ns + 1, part.rate_hz)
+    slowest = int((came.tick - prompt[came.sample]).max(initial=0))
+    newest = int(came.sample.max(initial=-1))
+    last = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
+    known: Bools = (np.arange(count) <= newest) | (prompt + slowest <= last)
+    absent = np.ones(last + 1, dtype=np.bool_)
+    absent[part.tick[part.tick <= last]] = False
+    lacking = np.flatnonzero(absent)
+    if len(lacking):
+        following = np.append(lacking, np.iinfo(np.int64).max)[np.searchsorted(lacking, prompt)]
+        known &= following - prompt > slowest
+    known[came.sample] = True
+    return known

@@ -1,0 +1,194 @@
+"""Overview of MCAP files: layout, channels, gaps and message rates; of a trilat-net log also its health.
+
+Invariant: the inventory decodes no message, so any MCAP file has one, also where its log cannot be opened;
+the overview then holds the reason. Gaps are counted only on channels with consecutive numbers.
+"""
+
+from array import array
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.ticks import NS_PER_S
+from ..errors import LogError
+from ..log.log_layout import SESSION
+from ..log.log_reader import open_log
+from ..log.mcap_reader import ChannelInfo, McapReader, Progress
+from ..log.record_columns import Ints
+from ..net import topics
+from ..net.loop_stats import ticks_per_stats
+from .health import describe_link_health, describe_session, describe_site_health
+
+JsonObject = dict[str, Any]
+
+_NOTHING = (array("Q"), array("Q"), array("Q"))
+MOST_LISTED_GAPS = 1000
+"""Gaps of a channel that are named."""
+
+
+class FileInventory:
+    """What is in a file, or in the files of one log.
+
+    Args:
+        paths: the files.
+        progress: told how many bytes are read, and how many there are in all.
+
+    Attributes:
+        files: facts of every file, keys ending in their units.
+        metadata: of all files, by name; where several have one name, of the last.
+
+    Raises:
+        LogError: a file cannot be read, or is no MCAP file.
+    """
+
+    def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
+        self.files: list[JsonObject] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._about: dict[str, ChannelInfo] = {}
+        self._came: dict[str, tuple[array[int], array[int], array[int]]] = {}  # log time, sequence, size
+        total = sum(path.stat().st_size for path in paths if path.is_file())
+        before = 0
+        for path in paths:
+            told = None if progress is None else _shifted(progress, before, total)
+            try:
+                with path.open("rb") as stream:
+                    self._read(path, McapReader(stream, str(path), told))
+            except OSError as error:
+                raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+            before += path.stat().st_size
+
+    def _read(self, path: Path, walk: McapReader) -> None:
+        for topic, payload, log_ns, _, sequence in walk.messages():
+            try:
+                times, sequences, sizes = self._came[topic]
+            except KeyError:
+                times, sequences, sizes = self._came[topic] = (array("Q"), array("Q"), array("Q"))
+            times.append(log_ns)
+            sequences.append(sequence)
+            sizes.append(len(payload))
+        self._about = {**walk.channels, **self._about}
+        self.metadata.update(walk.metadata)
+        self.files.append(
+            {
+                "path": str(path),
+                "size_bytes": walk.size,
+                "library": walk.library,
+                "finished": walk.complete,
+                "cut_off_at_byte": None if walk.torn is None else walk.torn.offset,
+                "damaged": [
+                    {"offset": part.offset, "length": part.length, "problem": part.problem}
+                    for part in walk.damaged
+                ],
+                "chunks": walk.chunks.total(),
+                "compression": {name or "none": count for name, count in walk.chunks.items()},
+                "packed_bytes": walk.packed_bytes,
+                "unpacked_bytes": walk.unpacked_bytes,
+                "attachments": {name: len(data) for name, data in walk.attachments.items()},
+                "metadata": sorted(walk.metadata),
+                "part": walk.metadata.get("trilat.part", {}),
+            }
+        )
+
+    def channels(self, session: str = "", rates_hz: Mapping[str, int] | None = None) -> dict[str, JsonObject]:
+        """Returns the facts of every channel by topic, keys ending in their units.
+
+        Args:
+            session: the session, if these are files of ours.
+            rates_hz: the tick rate of its sites.
+        """
+        names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
+        return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
+
+    def _channel(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> JsonObject:
+        about = self._about.get(topic, ChannelInfo(topic, "", "", "", {}))
+        log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came.get(topic, _NOTHING))
+        first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
+        span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
+        return {
+            "messages": len(log_ns),
+            "bytes": int(sizes.sum()),
+            "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
+            "first_log_time_ns": first_ns,
+            "last_log_time_ns": last_ns,
+            "between_ms": _between_ms(log_ns),
+            "encoding": about.encoding,
+            "schema": about.schema,
+            **_numbers(topic, sequence, session, rates_hz),
+        }
+
+
+def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int]) -> JsonObject:
+    """Returns what is missing of a channel whose messages are numbered; else nothing."""
+    where = topics.parse_key(topic.removeprefix("/"))
+    of_a_site = where is not None and where.session == session and where.member in rates_hz
+    if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
+        return {"missing": None, "gaps": None, "duplicates": None}
+    every = ticks_per_stats(rates_hz[where.member]) if where.channel == topics.LINK else 1
+    came = sequence.astype(np.int64) // every
+    there = np.unique(came)
+    steps = np.diff(there, prepend=-1)
+    before = np.flatnonzero(steps > 1)[:MOST_LISTED_GAPS]
+    gaps = [[int(there[n] - steps[n] + 1), int(there[n] - 1)] for n in before]
+    missing = int(there[-1]) + 1 - len(there) if len(there) else 0
+    return {"missing": missing, "gaps": gaps, "duplicates": len(came) - len(there)}
+
+
+def _between_ms(log_ns: Any) -> JsonObject | None:
+    """Returns how much time lay between messages as they came, ms; None where there are no two."""
+    if len(log_ns) < 2:
+        return None
+    passed: Ints = np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64))
+    p50, p99, largest = np.percentile(passed, (50.0, 99.0, 100.0)).tolist()
+    return {"p50": p50 / 1e6, "p99": p99 / 1e6, "max": largest / 1e6}
+
+
+def _shifted(progress: Progress, before: int, total: int) -> Progress:
+    return lambda done, _: progress(before + done, total)
+
+
+def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
+    """Returns what is in a file, or in the parts of one log, ready for JSON; keys end in their units.
+
+    Args:
+        paths: the files.
+        progress: told how much is read, and how much there is.
+
+    Returns:
+        files: facts of each.
+        kind: "trilat" for a log of ours that could be opened, else "mcap".
+        problem: why a log of ours could not be opened, or None.
+        session, sites, links: of a log of ours; else None, and empty.
+        channels: facts of each, by topic.
+
+    Raises:
+        LogError: a file cannot be read, or is no MCAP file.
+    """
+    inventory = FileInventory(paths, _half(progress, 0))
+    facts: JsonObject = {"files": inventory.files, "kind": "mcap", "problem": None, "session": None}
+    facts |= {"sites": {}, "links": {}}
+    name, rates_hz = "", {}
+    if SESSION in inventory.metadata:
+        try:
+            log = open_log(*paths, progress=_half(progress, 1))
+            sites = {site: describe_site_health(log, site) for site in log.sites}
+            links = {
+                f"{peer}->{site}": describe_link_health(log, peer, site)
+                for site in log.sites
+                for peer in log[site].peers
+            }
+            facts |= {"kind": "trilat", "session": describe_session(log), "sites": sites, "links": links}
+            name = log.session["session"]
+            rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
+        except LogError as error:
+            facts["problem"] = str(error)
+    facts["channels"] = inventory.channels(name, rates_hz)
+    return facts
+
+
+def _half(progress: Progress | None, which: int) -> Progress | None:
+    """Returns what tells of the first or the second half of the work."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(which * total + done, 2 * total)

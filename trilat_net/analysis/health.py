@@ -1,0 +1,165 @@
+"""Health of a session, its loops, links and clocks, in numbers that need no re-execution.
+
+Invariant: keys end in their unit; a quantity that the log does not determine is None, never NaN. Clock
+estimates are those in force while the session ran, without later improvement.
+"""
+
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.ticks import NS_PER_S
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns
+
+
+class ClockSummary(NamedTuple):
+    """The clock of a link's sender against the receiver's.
+
+    Attributes:
+        offset_us: the sender's clock minus the receiver's, by the last statistics, us.
+        offset_first_us: the same by the first ones.
+        drift_ppm: by how much it grows, us/s, by the last estimate; None where none was made.
+        drift_bound_ppm: how far that is from the truth at most.
+        bound_us: how far the offset in force was from the truth at most, by the last statistics, us.
+        bound_p50_us: the median of that.
+        bound_max_us: its largest.
+        rtt_min_us: smallest round trip; None where none was made.
+        faults: samples that came before they were sent by more than the bound: a clock has stepped.
+    """
+
+    offset_us: int
+    offset_first_us: int
+    drift_ppm: float | None
+    drift_bound_ppm: float | None
+    bound_us: int
+    bound_p50_us: float
+    bound_max_us: int
+    rtt_min_us: int | None
+    faults: int
+
+    @property
+    def shared(self) -> bool:
+        """True where both ends read one and the same clock."""
+        return self.bound_max_us == 0 and self.offset_us == 0
+
+
+def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
+    """Returns what a site knew of a peer's clock; None where nothing was measured, as in virtual time."""
+    stats = [stats for stats in log.link_stats(site) if peer in stats.offset_us]
+    if not stats:
+        return None
+    bounds = [each.bound_us.get(peer, 0) for each in stats]
+    trips = [trip for each in stats if (trip := each.rtt_us.get(peer, -1)) >= 0]
+    said = [e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)]
+    return ClockSummary(
+        offset_us=stats[-1].offset_us[peer],
+        offset_first_us=stats[0].offset_us[peer],
+        drift_ppm=said[-1].drift_ppb / 1e3 if said else None,
+        drift_bound_ppm=said[-1].drift_bound_ppb / 1e3 if said else None,
+        bound_us=bounds[-1],
+        bound_p50_us=float(np.median(bounds)),
+        bound_max_us=max(bounds),
+        rtt_min_us=min(trips, default=None),
+        faults=stats[-1].clock_faults.get(peer, 0),
+    )
+
+
+JsonObject = dict[str, Any]
+
+_PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")
+_LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
+
+
+def describe_session(log: Log) -> JsonObject:
+    """Returns what a log says of its session."""
+    said, scenario = log.session, log.scenario
+    epoch_ns = _number(said.get("epoch_unix_ns", ""))
+    seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
+    live = log.driver == "live" and epoch_ns is not None
+    return {
+        "session": said["session"],
+        "driver": log.driver,
+        "complete": log.complete,
+        "began_utc": _date(epoch_ns) if live and epoch_ns is not None else None,
+        "epoch_unix_ns": epoch_ns,
+        "recorded_s": max(seconds, default=0.0),
+        "ended": {event.member: event.ticks for event in log.events if event.kind == "end"},
+        "scenario": {
+            "name": scenario.name,
+            "title": scenario.title,
+            "sha256": log.scenario_sha256,
+            "as_named": log.scenario_sha256 == said.get("scenario_sha256"),
+            "duration_s": scenario.duration_s,
+            "seed": scenario.seed,
+            "sites": list(log.sites),
+        },
+        **{key: said.get(key) for key in _PROVENANCE},
+        "versions": {
+            key.removeprefix("version_"): value for key, value in said.items() if key.startswith("version_")
+        },
+        "accounts": log.accounts,
+    }
+
+
+def describe_site_health(log: Log, site: str) -> JsonObject:
+    """Returns what a log says of a site's records and of its loop."""
+    part, spec = log[site], log.scenario.sites[site]
+    made = next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
+    timed = log.driver == "live"
+    return {
+        "role": spec.role,
+        "rate_hz": spec.rate_hz,
+        "records": len(part),
+        "made_ticks": made,
+        "expected_ticks": log.scenario.ticks(site),
+        "missing": log.missing(site),
+        "late_us": _spread(part.late_us, 1.0) if timed else None,
+        "busy_us": _spread(part.busy_us, 1.0) if timed else None,
+        "overruns": int(np.count_nonzero(part.late_us >= 1e6 / spec.rate_hz)) if timed else None,
+    }
+
+
+def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
+    """Returns what a log says of a directed link, peer -> site."""
+    clock = summarise_clock(log, peer, site)
+    stats = log.link_stats(site)[-1:]
+    counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
+    return {
+        "stated": log.scenario.links[f"{peer}->{site}"].describe(),
+        "age_ms": _spread(sample_ages_ns(log, peer, site), 1e6),
+        "one_way_ms": _spread(_one_way_us(log, peer, site), 1e3),
+        "clock_offset_us": None if clock is None else clock.offset_us,
+        "clock_bound_us": None if clock is None else clock.bound_us,
+        **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
+    }
+
+
+def _one_way_us(log: Log, peer: str, site: str) -> Ints:
+    """Returns the measured one-way delay of everything that came over a link, us; none in virtual time."""
+    part = log[site]
+    version = _number(log.session.get("schema_version", "")) or 0
+    if log.driver != "live" or version < ONE_WAY_SCHEMA_VERSION:
+        return np.zeros(0, dtype=np.int64)
+    _, came = part.arrivals
+    delays: Ints = came[came[:, 0] == part.peers.index(peer), 2]
+    return delays
+
+
+def _spread(values: Ints, unit: float) -> JsonObject | None:
+    """Returns median, 99th percentile and largest, in units of so many; None where there is nothing."""
+    if not len(values):
+        return None
+    p50, p99, largest = (np.percentile(values, (50.0, 99.0, 100.0)) / unit).tolist()
+    return {"p50": p50, "p99": p99, "max": largest}
+
+
+def _number(text: str) -> int | None:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
+
+
+def _date(epoch_ns: int) -> str:
+    at_s = min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S
+    return datetime.fromtimestamp(at_s, UTC).strftime("%Y-%m-%d %H:%M:%S")

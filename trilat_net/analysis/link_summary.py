@@ -1,0 +1,278 @@
+"""Statistics of every directed link: stated and effective delay, loss, bursts and sample counts.
+
+The effective delay is the age of the sample in use at each tick: Delta(t_k) = t_k - u(t_k), where u is the
+stamp of that sample: the "age of information" of Kaul, Yates and Gruteser, "Real-time status: How often
+should one update?", IEEE INFOCOM 2012, at the ticks. docs/definitions.md defines every quantity.
+
+Invariant: a quantity that the log does not determine is None.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.delay import DelayKind
+from ..core.ticks import NS_PER_S
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
+from .delivery import (
+    Arrivals,
+    Bools,
+    PredictedDelivery,
+    count_sent,
+    mark_judged_samples,
+    predict_delivery,
+    read_arrivals,
+)
+from .timeline import StatedModel, list_changes, list_stated_models
+
+MOST_AGE_BINS = 50
+"""Most bins of a histogram of ages."""
+
+ONE_WAY_SCHEMA_VERSION = 2
+"""First schema version whose records name the one-way delay of an arrival."""
+
+
+class ValueStatistics(NamedTuple):
+    """How numbers are spread.
+
+    Attributes:
+        mean: their mean.
+        deviation: their standard deviation.
+        p50: half of them are at most this.
+        p95: 95 % of them are.
+        p99: 99 % of them are.
+        min: the smallest.
+        max: the largest.
+    """
+
+    mean: float
+    deviation: float
+    p50: float
+    p95: float
+    p99: float
+    min: float
+    max: float
+
+
+class AgeHistogram(NamedTuple):
+    """How many ticks had which age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`.
+
+    Attributes:
+        first_ms: where the first bin begins, ms.
+        width_ms: width of a bin, ms.
+        ticks: how many ticks each bin counts.
+    """
+
+    first_ms: float
+    width_ms: float
+    ticks: list[int]
+
+
+class SampleCounts(NamedTuple):
+    """What became of the samples of a link, as the receiver's records show it.
+
+    Attributes:
+        sent: samples that the peer has sent.
+        judged: of those, the ones of which it is known whether they came.
+        arrived: of the judged, the ones that came.
+        missing: of the judged, the ones that did not: lost on the way.
+        lost: of the arrived, the ones that the link's model lost.
+        late: of the arrived, the ones that came after they were due.
+        superseded: of the arrived, the ones never used: a newer one came into use before or with them.
+        duplicate: arrivals of what had arrived before.
+        copies: duplicates that the link's model made.
+        refused: arrivals whose stamp was out of range.
+    """
+
+    sent: int
+    judged: int
+    arrived: int
+    missing: int
+    lost: int
+    late: int
+    superseded: int
+    duplicate: int
+    copies: int
+    refused: int
+
+
+class LinkSummary(NamedTuple):
+    """One directed link in a run. What the log cannot tell is None.
+
+    Attributes:
+        peer: who sends.
+        site: who receives.
+        stated: what it was said to do, from the start and after every change.
+        drawn_ms: the delays that its model gave to the samples, before order and play-out.
+        age_ms: the effective delay, over the ticks from the first sample in use on.
+        ages: the same as a histogram.
+        first_use_s: when the first sample came into use, s.
+        ticks_without_new: share of ticks that had the same sample in use as the tick before.
+        silence_ms: the longest time that one sample stayed in use, ms.
+        counts: what became of the samples.
+        loss: share of the judged samples that could not come into use: missing or lost.
+        burst: mean number of those in a row.
+        one_way_us: measured one-way delay of the arrivals, us.
+    """
+
+    peer: str
+    site: str
+    stated: list[StatedModel]
+    drawn_ms: ValueStatistics | None
+    age_ms: ValueStatistics | None
+    ages: AgeHistogram | None
+    first_use_s: float | None
+    ticks_without_new: float | None
+    silence_ms: float | None
+    counts: SampleCounts | None
+    loss: float | None
+    burst: float | None
+    one_way_us: ValueStatistics | None
+
+    @property
+    def name(self) -> str:
+        """The link as scenarios call it, "j->i"."""
+        return f"{self.peer}->{self.site}"
+
+    @property
+    def plain(self) -> bool:
+        """True where one constant delay is all that there is to say of it."""
+        as_said = self.counts is None or not (self.counts.late or self.counts.missing)
+        return as_said and has_one_constant_delay(self.stated)
+
+
+def has_one_constant_delay(states: list[StatedModel]) -> bool:
+    """True where a link was said to give every sample one and the same delay, and to lose none."""
+    (_, link), *later = states
+    exact = link.delay().kind == DelayKind.CONSTANT and not (link.loss or link.duplicate or link.outages_s)
+    return exact and not later
+
+
+def summarise_links(log: Log) -> list[LinkSummary]:
+    """Returns what every link did, by receiver and then by peer, in scenario order.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    changed = list_changes(log)
+    came = {site: read_arrivals(log, site) for site in log.sites}
+    newest = {
+        peer: max(int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there)
+        for peer in log.sites
+    }
+    uses = []
+    for site in log.sites:
+        for peer, over_link in came[site].items():
+            states = list_stated_models(log, f"{peer}->{site}", changed)
+            uses.append(_use(log, peer, site, states, count_sent(log, peer, newest[peer]), over_link))
+    return uses
+
+
+def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
+    """Returns the effective delay at every tick from the first sample in use on, ns."""
+    part, used = log[site], log[site].used[peer]
+    known = used >= 0
+    stamp_ns = used[known] * NS_PER_S // log.scenario.sites[peer].rate_hz
+    age_ns: Ints = part.tick[known] * NS_PER_S // part.rate_hz - stamp_ns
+    return age_ns
+
+
+def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
+    """Returns how numbers are spread, or None where there are none."""
+    array = np.asarray(values, dtype=np.float64)
+    if not array.size:
+        return None
+    p50, p95, p99, low, high = np.percentile(array, (50.0, 95.0, 99.0, 0.0, 100.0)).tolist()
+    return ValueStatistics(float(array.mean()), float(array.std()), p50, p95, p99, low, high)
+
+
+def bin_ages(age_ns: Ints) -> AgeHistogram | None:
+    """Returns how many ages lie in each of at most `BINS` bins of 1, 2 or 5 times a power of ten ms.
+
+    Args:
+        age_ns: ages, ns.
+    """
+    if not len(age_ns):
+        return None
+    low, high = int(age_ns.min()), int(age_ns.max())
+    widths = (step * 10**power for power in range(4, 15) for step in (1, 2, 5))  # ns, from 10 us
+    width_ns = next(width for width in widths if high // width - low // width < MOST_AGE_BINS)
+    ticks = np.bincount(age_ns // width_ns - low // width_ns).tolist()
+    return AgeHistogram(low // width_ns * width_ns / 1e6, width_ns / 1e6, ticks)
+
+
+def _use(
+    log: Log, peer: str, site: str, states: list[StatedModel], count: int, came: Arrivals
+) -> LinkSummary:
+    part, used = log[site], log[site].used[peer]
+    fate = predict_delivery(log, peer, site, count)
+    age_ns = sample_ages_ns(log, peer, site)
+    first = came.first
+    known = mark_judged_samples(log, site, fate.stamp_ns, first)
+    loss, burst = _losses(fate, first, known)
+    stamped = log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION
+    in_use = np.flatnonzero(used >= 0)
+    return LinkSummary(
+        peer,
+        site,
+        states,
+        compute_statistics(fate.drawn_ms),
+        compute_statistics(age_ns / 1e6),
+        bin_ages(age_ns),
+        float(part.t_s[in_use[0]]) if len(in_use) else None,
+        _without_new(part, used),
+        _silence_ms(part, used),
+        _counts(part, used, fate, came, known) if len(part) else None,
+        loss,
+        burst,
+        compute_statistics(came.delay_us) if stamped else None,
+    )
+
+
+def _without_new(part: SiteLog, used: Ints) -> float | None:
+    pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
+    return float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None
+
+
+def _silence_ms(part: SiteLog, used: Ints) -> float | None:
+    if not (used >= 0).any():
+        return None
+    ticks = np.append(part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1)
+    return float(np.diff(ticks * NS_PER_S // part.rate_hz).max()) / 1e6
+
+
+def _losses(fate: PredictedDelivery, first: Arrivals, known: Bools) -> tuple[float | None, float | None]:
+    """Returns the share of the judged samples that could not come into use, and how many in a row."""
+    gone = np.ones(len(known), dtype=np.bool_)
+    gone[first.sample] = False
+    gone = (gone | fate.lost) & known
+    lost, total = int(np.count_nonzero(gone)), int(np.count_nonzero(known))
+    runs = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
+    return lost / total if total else None, lost / runs if runs else None
+
+
+def _counts(part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, known: Bools) -> SampleCounts:
+    first = came.first
+    release = fate.release(part.rate_hz)[first.sample]
+    lost = fate.lost[first.sample]
+    late = ~lost & ~fate.measured[first.sample] & (first.tick > release)
+    # the newest wins: at the tick that releases it a sample is in use, or a newer one is
+    at = np.maximum(release, first.tick)
+    place = np.minimum(np.searchsorted(part.tick, at), len(part) - 1)
+    superseded = ~lost & (part.tick[place] == at) & (used[place] != first.sample)
+    judged_count = int(np.count_nonzero(known))
+    return SampleCounts(
+        sent=len(known),
+        judged=judged_count,
+        arrived=len(first.sample),
+        missing=judged_count - len(first.sample),
+        lost=int(np.count_nonzero(lost)),
+        late=int(np.count_nonzero(late)),
+        superseded=int(np.count_nonzero(superseded)),
+        duplicate=len(came.sample) - len(first.sample),
+        copies=fate.copies,
+        refused=came.refused,
+    )

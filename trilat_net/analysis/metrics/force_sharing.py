@@ -1,0 +1,221 @@
+"""Force sharing: the part of a torque at one site that an operator at another site feels, at rest.
+
+Invariant: at rest sum_i pi_i e_i = 0, whatever the delays, pi being the left Perron vector of the
+dominance matrix. With known gravity and a stiffness K_i that holds e_i (Kp Lambda of the paper's law, K
+of P+d and PD+d), the torques tau_i ON the arms obey, per joint,
+
+    sum_i (pi_i / K_i) tau_i = 0,
+
+and with two loaded sites the operator at i feels tau_s (pi_s / K_s) / (pi_i / K_i) of a torque at s: for
+equal gains tau_s beta_s / beta_i. If gravity is adapted the estimates take up the load and no ratio is
+expected.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.exogenous import TorqueKind
+from ...core.site_setup import Law
+from ...core.two_link_arm import JOINTS
+from ...core.vectors import Array
+from ...scenario import Scenario, SiteSpec
+from ..lyapunov_weights import find_closed_groups, left_perron_vector
+from .metric_catalogue import Metric, MetricValues, metric
+from .parameter_error import has_known_theta
+from .static_windows import MIN_LOAD_NM, StaticWindow
+
+GRAVITY_THETA = (3, 4)
+"""The parameters of gravity, theta_4 and theta_5."""
+MIN_LOAD_SHARE = 0.02
+"""A site with less than this share of the largest torque is not loaded."""
+
+
+class SharingRatio(NamedTuple):
+    """Two loaded sites in a window at rest.
+
+    Attributes:
+        from_s: the window's first tick, s.
+        to_s: its last, s.
+        joint: which joint, from 1.
+        pushed: the site of the torque.
+        pushed_nm: that torque, ON its arm, N m.
+        by_wall: whether a wall makes most of it.
+        holds: the site whose hand feels it.
+        felt_nm: what that hand feels: the negative of what it does to its arm, N m.
+        expected_nm: what the shares say that it feels, N m; or why they say nothing.
+    """
+
+    from_s: float
+    to_s: float
+    joint: int
+    pushed: str
+    pushed_nm: float
+    by_wall: bool
+    holds: str
+    felt_nm: float
+    expected_nm: Metric
+
+    @property
+    def off(self) -> float | None:
+        """How far what is felt is from what is expected, as a share of that; None where nothing is."""
+        expected = self.expected_nm.value
+        return None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
+
+
+class JointLoad(NamedTuple):
+    """The torques of a joint in a window at rest, of all loaded sites.
+
+    Attributes:
+        from_s: the window's first tick, s.
+        to_s: its last, s.
+        joint: which joint, from 1.
+        torque_nm: per loaded site, ON its arm, N m.
+        weight: per loaded site pi_i / K_i, the largest of all sites 1; or why there are none.
+        imbalance: |sum of weight times torque| / largest |weight times torque|; or why it is not known.
+    """
+
+    from_s: float
+    to_s: float
+    joint: int
+    torque_nm: dict[str, float]
+    weight: dict[str, Metric]
+    imbalance: Metric
+
+
+def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[JointLoad]:
+    """Returns the loaded joints of every window at rest."""
+    found = []
+    for window in windows:
+        weights = _torque_weights(scenario, window.alpha)
+        for joint in range(JOINTS):
+            torque = {site: float(values[joint]) for site, values in window.torque.items()}
+            least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
+            loaded = {site: value for site, value in torque.items() if abs(value) >= least}
+            if loaded:
+                found.append(_joint_load(window, joint, loaded, weights))
+    return found
+
+
+def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metric:
+    """Returns how many windows at rest there are, or why there are none."""
+    if absent:
+        return Metric(None, f"no records of {', '.join(absent)}")
+    return metric(len(windows) or None, NO_STATIC_WINDOW_TEXT)
+
+
+def measure_force_sharing(
+    absent: list[str], windows: list[StaticWindow], pairs: list[SharingRatio]
+) -> MetricValues:
+    """Returns how far force sharing is from the shares, in the pair where it is furthest."""
+    offs = [pair.off for pair in pairs if pair.off is not None]
+    if offs:
+        return {"sharing_off": metric(max(offs))}
+    whys = dict.fromkeys(pair.expected_nm.why for pair in pairs)
+    none = count_static_windows(absent, windows)
+    unloaded = "no two sites are loaded in a window at rest"
+    return {"sharing_off": Metric(None, none.why or "; ".join(whys) or unloaded, applies=bool(absent))}
+
+
+NO_STATIC_WINDOW_TEXT = "no second in which all sites rest under torques that stand"
+
+
+def _joint_load(
+    window: StaticWindow, joint: int, torque: dict[str, float], weights: Array | str
+) -> JointLoad:
+    if isinstance(weights, str):
+        why = Metric(None, weights)
+        return JointLoad(window.from_s, window.to_s, joint + 1, torque, dict.fromkeys(torque, why), why)
+    column = weights[:, joint] / weights[:, joint].max()
+    weight = dict(zip(window.torque, column.tolist(), strict=True))
+    moments = [weight[site] * value for site, value in torque.items()]
+    largest = max(map(abs, moments))
+    imbalance = metric(
+        abs(sum(moments)) / largest if largest > 0.0 else None, "nobody who is followed is loaded"
+    )
+    shown = {site: metric(weight[site]) for site in torque}
+    return JointLoad(window.from_s, window.to_s, joint + 1, torque, shown, imbalance)
+
+
+def find_sharing_ratios(
+    scenario: Scenario, windows: list[StaticWindow], found: list[JointLoad]
+) -> list[SharingRatio]:
+    """Returns who felt what, of every joint in a window at rest at which two sites are loaded.
+
+    The hand that feels is one that is a spring; where both are or none, the slave is the one that is pushed.
+    """
+    at = {window.from_s: window for window in windows}
+    pairs = []
+    for lever in found:
+        if len(lever.torque_nm) == 2:
+            pushed, holds = sorted(
+                lever.torque_nm, key=lambda site: _holding_rank(scenario, site, lever.to_s)
+            )
+            wall = float(at[lever.from_s].walls[pushed][lever.joint - 1])
+            torque = lever.torque_nm[pushed]
+            pairs.append(
+                SharingRatio(
+                    lever.from_s,
+                    lever.to_s,
+                    lever.joint,
+                    pushed,
+                    torque,
+                    abs(wall) > 0.5 * abs(torque),
+                    holds,
+                    -lever.torque_nm[holds],
+                    _expected_torque(lever, pushed, holds),
+                )
+            )
+    return pairs
+
+
+def _expected_torque(lever: JointLoad, pushed: str, holds: str) -> Metric:
+    one, other = lever.weight[pushed], lever.weight[holds]
+    if one.value is None or other.value is None:
+        return Metric(None, one.why)
+    if other.value == 0.0:
+        return Metric(None, f"nobody ends up following {holds}")
+    return metric(lever.torque_nm[pushed] * one.value / other.value)
+
+
+def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
+    """Returns how much a site is one that holds: a spring's hand is there, and no wall; it is a master."""
+    spec = scenario.sites[site]
+    springs = any(
+        hand.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND)
+        and hand.actor.start_s <= at_s < hand.actor.end_s
+        for hand in spec.hands
+    )
+    return springs and not spec.environment, spec.role == "master"
+
+
+def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
+    """Returns pi_i / K_i per joint, shape (N, 2); or why that says nothing of torques."""
+    if len(find_closed_groups(alpha)) > 1:
+        return "two groups of sites follow nobody else: who feels whom is not unique"
+    stiffness = []
+    for site, spec in scenario.sites.items():
+        K, why = _holding_stiffness(spec)
+        if why:
+            return f"{site}: {why}"
+        stiffness.append(K)
+    return left_perron_vector(alpha)[:, np.newaxis] / np.array(stiffness)
+
+
+def _holding_stiffness(spec: SiteSpec) -> tuple[Array, str]:
+    """Returns what holds e at rest, shape (2,), N m/rad, and why that is not all that acts."""
+    gains = spec.control.gains(spec.arm.theta)
+    if gains.law is Law.OWN:
+        return np.zeros(JOINTS), "a law of somebody's own"
+    if not has_known_theta(spec):
+        return np.zeros(JOINTS), "theta of the arm is not known"
+    if any(gains.k_f):
+        return np.zeros(JOINTS), "it reflects force: e is not all that its law goes by"
+    adaptive = gains.law is Law.ADAPTIVE
+    estimate, truth = gains.theta_hat0 if adaptive else gains.known, spec.arm.theta
+    if adaptive and any(gains.Gamma[n] > 0.0 for n in GRAVITY_THETA):
+        return np.zeros(JOINTS), "gravity is learnt: the estimates take up the load"
+    if any(estimate[n] != truth[n] for n in GRAVITY_THETA) and spec.arm.g_m_s2 > 0.0:
+        return np.zeros(JOINTS), "gravity is not known exactly"
+    K = np.array(gains.Kp) * np.array(gains.Lambda) if adaptive else np.array(gains.K)
+    return K, "" if (K > 0.0).all() else "nothing holds its e"

@@ -1,0 +1,103 @@
+"""Signals of a site as columns over its records, and its settling time; empty logs give empty columns.
+
+Invariant: one definition of each signal, for figures, page, summary and metrics. Torques of operators and
+environment are those ON the arm, the negative of the record's tau_x of Eq. (8).
+"""
+
+import numpy as np
+
+from ..core.two_link_arm import JOINTS, PARAMETERS
+from ..core.vectors import Array
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
+
+SETTLED_ERROR_RAD = 1e-2
+"""A site has settled once no joint's error exceeds this any more, rad."""
+
+
+def joint_angles(part: SiteLog) -> Array:
+    """Returns q, shape (K, 2), rad."""
+    return part.q.reshape(-1, JOINTS)
+
+
+def reference_angles(part: SiteLog) -> Array:
+    """Returns q_des, Eq. (6), shape (K, 2), rad."""
+    return part.q_des.reshape(-1, JOINTS)
+
+
+def joint_errors(part: SiteLog) -> Array:
+    """Returns e = q - q_des, Eq. (9), shape (K, 2), rad."""
+    return part.e.reshape(-1, JOINTS)
+
+
+def joint_error_rates(part: SiteLog) -> Array:
+    """Returns qd - qd_des, Eq. (18), shape (K, 2), rad/s."""
+    return (part.qd - part.qd_des).reshape(-1, JOINTS)
+
+
+def controller_torques(part: SiteLog) -> Array:
+    """Returns tau, Eq. (13), shape (K, 2), N m."""
+    return part.tau.reshape(-1, JOINTS)
+
+
+def external_torques(part: SiteLog) -> Array:
+    """Returns the torque of the hands ON the arm, shape (K, 2), N m: the negative of tau_x."""
+    return 0.0 - part.tau_x.reshape(-1, JOINTS)  # 0 - 0 is 0, where -0 would print as such
+
+
+def parameter_estimates(part: SiteLog) -> Array:
+    """Returns the estimates of theta, Eq. (15), shape (K, 5), kg m^2 and kg m."""
+    return part.theta_hat.reshape(-1, PARAMETERS)
+
+
+def sample_ages_ms(log: Log, site: str) -> Array:
+    """Returns the age of the sample in use per peer, shape (K, N - 1), ms; NaN before the first."""
+    part = log[site]
+    columns = [part.age_s(peer, log.scenario.sites[peer].rate_hz) * 1e3 for peer in part.peers]
+    return np.array(columns).reshape(len(part.peers), len(part)).T
+
+
+def sites_with_operator(log: Log) -> list[str]:
+    """Returns the sites that somebody pushes, by the scenario or by the records."""
+    return [name for name in log.sites if log.scenario.sites[name].hands or np.any(log[name].tau_x)]
+
+
+def largest_remaining_error(part: SiteLog) -> Array:
+    """Returns the largest error of any joint from each record to the last, shape (K,), rad."""
+    largest = np.abs(joint_errors(part)).max(axis=1, initial=0.0)
+    remaining: Array = np.maximum.accumulate(largest[::-1])[::-1]
+    return remaining
+
+
+def settling_time_s(part: SiteLog) -> float | None:
+    """Returns when an error last exceeded `SETTLED_RAD`, s; 0 if none did, None if one still does."""
+    if not len(part):
+        return None
+    above = np.flatnonzero(largest_remaining_error(part) > SETTLED_ERROR_RAD)
+    if not len(above):
+        return 0.0
+    return None if above[-1] == len(part) - 1 else float(part.t_s[above[-1]])
+
+
+def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
+    """Returns how far hands moved a site: the ticks that both logs have, their time, and the difference.
+
+    Args:
+        log: the log.
+        twin: the same experiment with nobody at the arms.
+        site: which site.
+
+    Returns:
+        tick: shape (K,).
+        t_s: shape (K,), s.
+        moved: q of the log minus q of the twin, shape (K, 2), rad.
+    """
+    part, other = log[site], twin[site]
+    tick, ours, theirs = np.intersect1d(part.tick, other.tick, assume_unique=True, return_indices=True)
+    return tick, part.t_s[ours], joint_angles(part)[ours] - joint_angles(other)[theirs]
+
+
+def true_parameters(log: Log, site: str) -> Array:
+    """Returns theta of Eq. (24) for the arm of a site, shape (5,)."""
+    return log.scenario.sites[site].arm.theta

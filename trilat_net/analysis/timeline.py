@@ -1,0 +1,141 @@
+"""Timeline of a run: applied changes, link models in force, intervals of hold, brake and return, divergence.
+
+Invariant: every entry comes from the scenario or from a record; none is inferred from a trajectory.
+"""
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from ..errors import LogError
+from ..log.log_reader import Log
+from ..log.site_log import SiteLog
+from ..scenario import find_owner
+from ..scenario.delay_models import LinkBase
+from ..scenario.scenario_types import Change
+
+FOLLOWING_MODES = ("run", "diverged")
+"""Modes in which a site is not away from its peers because of a stale one."""
+
+
+class AppliedChange(NamedTuple):
+    """A change of a link or of a site's shares.
+
+    Attributes:
+        change: what it is, complete.
+        site: who carried it out.
+        taken_at_tick: the tick whose record names it; None where the scenario itself has it.
+    """
+
+    change: Change
+    site: str
+    taken_at_tick: int | None
+
+    @property
+    def about(self) -> str:
+        """What it changes: a link "j->i", or the shares of a site."""
+        return self.change.link or f"shares of {self.change.dominance}"
+
+    @property
+    def text(self) -> str:
+        """What that becomes."""
+        if self.change.link:
+            return self.change.after.describe()
+        shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.shares.items() if share)
+        return f"{shares} within {self.change.ramp_s:g} s" if self.change.ramp_s else shares
+
+
+class ModeInterval(NamedTuple):
+    """A time in which a site held, braked or returned.
+
+    Attributes:
+        mode: "hold", "brake" or "return".
+        from_s: its first tick, s after the epoch.
+        to_s: the first tick after it, or the end of the last record's period, s.
+    """
+
+    mode: str
+    from_s: float
+    to_s: float
+
+
+class StatedModel(NamedTuple):
+    """What a link was said to do from some time on.
+
+    Attributes:
+        from_s: the first stamp for which it holds, s after the epoch.
+        link: the model.
+    """
+
+    from_s: float
+    link: LinkBase
+
+
+def list_changes(log: Log) -> list[AppliedChange]:
+    """Returns what was changed before the run ended, in the order of the times from which it held.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    found = [AppliedChange(change, find_owner(change), None) for change in log.scenario.timeline]
+    for site in log.sites:
+        log.commands(site)  # refuses what is no change of that site's
+        for tick, texts in log.changes(site).items():
+            found += [AppliedChange(_read(log, text), site, tick) for text in texts]
+    before_s = recorded_end_s(log)
+    return sorted((c for c in found if c.change.at_s < before_s), key=lambda changed: changed.change.at_s)
+
+
+def _read(log: Log, text: str) -> Change:
+    try:
+        return msgspec.json.decode(text, type=Change)
+    except msgspec.MsgspecError as error:
+        raise LogError(f"{log.source}: a record names a change that is none: {error}") from None
+
+
+def list_stated_models(
+    log: Log, link: str, changed: Sequence[AppliedChange] | None = None
+) -> list[StatedModel]:
+    """Returns what a link was said to do, from the start and after every change of it.
+
+    Args:
+        log: the log.
+        link: its name, "j->i".
+        changed: as from `changes`; None looks them up.
+    """
+    later = list_changes(log) if changed is None else changed
+    return [
+        StatedModel(0.0, log.scenario.links[link]),
+        *(StatedModel(c.change.at_s, c.change.after) for c in later if c.change.link == link),
+    ]
+
+
+def recorded_end_s(log: Log) -> float:
+    """Returns when the run ended, s: the end of the last record's period; without records, its plan."""
+    parts = [log[name] for name in log.sites]
+    ends = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in parts if len(part)]
+    return max(ends, default=log.scenario.duration_s)
+
+
+def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
+    """Returns when a site held, braked or returned, in order."""
+    modes: list[str] = part.mode.tolist()
+    if all(mode in FOLLOWING_MODES for mode in modes):
+        return []
+    found = []
+    times = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
+    first = 0
+    for mode, group in groupby(modes):
+        last = first + len(list(group))
+        if mode not in FOLLOWING_MODES:
+            found.append(ModeInterval(mode, times[first], times[last]))
+        first = last
+    return found
+
+
+def diverged_at_s(part: SiteLog) -> float | None:
+    """Returns when a site left its limits, s; None where it never did."""
+    return float(part.t_s[-1]) if len(part) and part.mode[-1] == "diverged" else None

@@ -1,0 +1,32 @@
+"""The Python interface: everything that `import trilat_net` offers.
+
+Invariant: no logic here but joining rooms: scenario, virtual time, log, execution, analysis, studies.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .execution import virtual
+from .log.log_reader import Log, open_log
+from .scenario import Scenario, load_scenario
+
+
+def simulate(
+    scenario: str | Path | Scenario,
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+) -> Log:
+    """Runs a scenario in virtual time and returns its log.
+
+    Args:
+        scenario: the name of a shipped scenario, a path, or a scenario.
+        set: overrides, as in `{"control.Kd": 5}`.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid.
+    """
+    stream = io.BytesIO()
+    virtual.write_virtual_log(load_scenario(scenario, set), stream)
+    stream.seek(0)
+    return open_log(stream)

@@ -1,0 +1,68 @@
+"""`trilat certify`: the Lyapunov certificate of a run: V, its energy balance, premises, growth."""
+
+import json
+from typing import TYPE_CHECKING
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..reporting.terminal_output import open_with_progress, out
+from .options import JsonOption, LogsArgument
+
+if TYPE_CHECKING:
+    from ..analysis.certificate.stability_certificate import Certificate
+
+
+app = typer.Typer()
+
+_HOLDS = {True: "[green]holds[/green]", False: "[yellow]fails[/yellow]", None: "not told"}
+_MARKS = {
+    "ok": "[green]ok  [/green]",
+    "FAIL": "[red]FAIL[/red]",
+    "open": "[yellow]open[/yellow]",
+    "note": "note",
+}
+
+
+@app.command("certify", epilog="Example: trilat certify run.mcap")
+def certify_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+    """Says whether a run was stable, and why: V and its energy balance, the theorem's premises, growth.
+
+    Nothing is executed; docs/certificate.md defines every word and every key of the JSON.
+
+    Exit code 0: V bounds the run, whether the theorem covers it or not, or e and qd show that nothing grows.
+    1: it diverged or grows; the energy balance is broken; or neither V nor growth decides (record longer).
+    2: no log.
+    """
+    from ..analysis.certificate.stability_certificate import certificate_to_json
+    from ..analysis.certificate.stability_certificate import certify as certified
+
+    found = certified(open_with_progress(*files))
+    if as_json:
+        typer.echo(json.dumps(certificate_to_json(found), indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        _show(found)
+    if not found.passed:
+        raise typer.Exit(1)
+
+
+def _show(found: "Certificate") -> None:
+    """Prints a certificate: what it comes to, then premises and energies."""
+    from ..reporting.certificate_text import describe_certificate, list_energies
+
+    for line in describe_certificate(found):
+        out.print(f"{_MARKS[line.mark]} {escape(line.text)}", soft_wrap=True)
+    premises = Table("premise", "", "found", box=None, pad_edge=False)
+    for premise in found.premises:
+        premises.add_row(premise.name, _HOLDS[premise.holds], escape(premise.text))
+    out.print()
+    out.print(premises)
+    if found.balance is None:
+        return
+    table = Table("energy", "J", box=None, pad_edge=False)
+    table.columns[1].justify = "right"
+    for name, amount in list_energies(found.balance):
+        table.add_row(escape(name), f"{amount:.4g}")
+    out.print()
+    out.print(table)

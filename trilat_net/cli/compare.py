@@ -1,0 +1,373 @@
+"""`trilat compare`: logs side by side, or control laws that one procedure tunes.
+
+Invariant: numbers are printed and nothing is ranked.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..errors import UsageError
+from ..reporting.terminal_output import (
+    open_with_progress,
+    out,
+    print_line,
+    print_table,
+    progress_bar,
+    sanitize,
+)
+from .options import DurationOption, ForceOption, JsonOption, SetOption
+
+if TYPE_CHECKING:
+    from ..analysis.metrics.log_metrics import MetricComparison
+    from ..log.log_reader import Log
+    from ..scenario.describe import ScenarioDifference
+    from ..studies.tuning import TuningPlan, TuningResult
+    from ..studies.tuning.tuning_tables import TuningTable as Cells
+
+_MOST_REASONS = 6
+
+
+def print_log_comparison(
+    logs: Sequence["Log"],
+    different: Sequence["ScenarioDifference"],
+    found: "MetricComparison",
+    remarks: Mapping[str, Sequence[str]],
+) -> None:
+    """Prints a comparison of logs.
+
+    Args:
+        logs: the logs.
+        different: in what their experiments differ.
+        found: their quantities.
+        remarks: per log what its figures do not tell.
+    """
+    names = {log.scenario.name for log in logs}
+    if len(names) > 1:
+        out.print(escape(f"logs of different scenarios: {', '.join(sorted(map(sanitize, names)))}"))
+    if different:
+        print_table(_differences(different, found.columns))
+    else:
+        out.print("one and the same experiment")
+    print_table(_quantities(found))
+    out.print()
+    for name, lines in remarks.items():
+        for line in lines:
+            out.print(f"[bold]note[/bold] {escape(sanitize(f'{name}: {line}'))}", soft_wrap=True)
+    _print_reasons(found)
+
+
+def _differences(different: Sequence["ScenarioDifference"], columns: Sequence[str]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("differs", overflow="fold")
+    for name in columns:
+        table.add_column(escape(sanitize(name)), overflow="fold")
+    for one in different:
+        table.add_row(escape(sanitize(str(one))), *(escape(sanitize(value)) for value in one.values))
+    return table
+
+
+def _quantities(found: "MetricComparison") -> Table:
+    """Returns a row per quantity, with its unit, under the heads of its group."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("")
+    table.add_column("unit")
+    for name in found.columns:
+        table.add_column(escape(sanitize(name)), justify="right")
+    group = ""
+    for row in found.rows:
+        if row.quantity.group != group:
+            group = row.quantity.group
+            table.add_row(f"[bold]{escape(group)}[/bold]")
+        values = ["-" if value is None else f"{value:.4g}" for value in row.values]
+        table.add_row(f"  {escape(row.quantity.name)}", escape(row.quantity.unit or "-"), *values)
+    return table
+
+
+def _print_reasons(found: "MetricComparison") -> None:
+    """Says why numbers are missing, of very many the first."""
+    reasons = [
+        f"{name}: no {row.quantity.name}: {entry.why}"
+        for row in found.rows
+        for name, entry in zip(found.columns, row.entries, strict=True)
+        if entry.value is None and entry.applies
+    ]
+    for line in reasons[:_MOST_REASONS]:
+        out.print(escape(sanitize(line)), soft_wrap=True)
+    if len(reasons) > _MOST_REASONS:
+        out.print(f"and {len(reasons) - _MOST_REASONS} more, which --json names")
+
+
+_MAX_FRONT_ROWS = 8
+"""So many points of a front are printed; all stand in the files."""
+
+
+def run_tuning(
+    asked: "TuningPlan", folder: Path | None, jobs: int | None, *, force: bool, as_json: bool
+) -> None:
+    """Runs a comparison, writes it into a folder, and prints it.
+
+    Args:
+        asked: the comparison.
+        folder: where it goes; None for the next free one below runs.
+        jobs: in how many processes; None for one per core.
+        force: whether a folder that holds something may be used.
+        as_json: whether to print it as JSON.
+    """
+    from ..files import make_results_folder
+    from ..studies.tuning.tuning_figure import write_tuning
+    from ..studies.tuning.tuning_tables import tuning_to_json
+
+    chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
+    if not as_json:
+        _print_procedure(asked, jobs)
+    with progress_bar("searching") as progress:
+        found = asked.run(jobs, progress)
+    paths = write_tuning(found, chosen)
+    if as_json:
+        print_line(json.dumps(tuning_to_json(found), indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        _print_tuned(found)
+        for path in paths:
+            out.print(f"  {escape(str(path))}", soft_wrap=True)
+
+
+def _print_procedure(asked: "TuningPlan", jobs: int | None) -> None:
+    """Prints what is the same for all laws, and how long the search will take."""
+    from ..process import count_cores
+    from ..studies.tuning.tuning_tables import describe_procedure
+
+    laws = ", ".join(space.law for space in asked.spaces)
+    out.print(escape(f"{asked.base.scenario.name}, laws {laws}; the same for all:"), soft_wrap=True)
+    for line in describe_procedure(asked):
+        out.print(escape(f"  {line}"), soft_wrap=True)
+    used = jobs or count_cores()
+    time = _format_duration(asked.estimate_s(jobs))
+    on = "1 core" if used == 1 else f"{used} cores"
+    out.print(
+        f"{asked.runs} runs on {on}: about {time} at the speed that this machine has now", soft_wrap=True
+    )
+
+
+def _format_duration(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{max(1, round(seconds))} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def _print_tuned(found: "TuningResult") -> None:
+    """Prints the laws, every front, the gains as printed, and the commands of the best points."""
+    from ..studies.tuning.tuning_tables import (
+        list_class_meanings,
+        tabulate_front,
+        tabulate_laws,
+        tabulate_paper_gains,
+    )
+
+    print_cells(tabulate_laws(found))
+    for line in list_class_meanings():
+        out.print(escape(f"  {line}"), soft_wrap=True)
+    for law in found.found:
+        if law.front:
+            print_cells(tabulate_front(found, law, _MAX_FRONT_ROWS))
+    out.print(
+        f"  * no candidate of any law is better in both; of long fronts {_MAX_FRONT_ROWS} points are shown"
+    )
+    print_cells(tabulate_paper_gains(found))
+    for law in found.found:
+        for gain in found.at_edge(law):
+            out.print(
+                f"note: {law.space.law} has its least at the edge of what is searched of {gain}; "
+                "it may lie beyond",
+                soft_wrap=True,
+            )
+    if not any(law.front for law in found.found):
+        out.print("\nno candidate of any law settled: a longer --duration or a larger --budget may show more")
+        return
+    out.print("\nthe last of each front, to run; the others stand in front.md:")
+    for law in found.found:
+        for place in law.front[-1:]:
+            out.print(f"  {escape(found.candidate(law, place).command)}", soft_wrap=True)
+
+
+def print_cells(cells: "Cells") -> None:
+    """Prints a table of texts: words to the left, numbers to the right."""
+    from ..studies.tuning.tuning_tables import TEXT_COLUMNS
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for head in cells.heads:
+        table.add_column(escape(head), justify="left" if head in TEXT_COLUMNS else "right", no_wrap=True)
+    for row in cells.rows:
+        table.add_row(*map(escape, row))
+    print_table(table)
+
+
+app = typer.Typer()
+
+_TUNING = "Tune laws"
+
+
+@app.command(
+    "compare",
+    epilog="Example: trilat compare a.mcap b.mcap\n\nExample: trilat compare --tune free --law adaptive,p_d",
+)
+def compare_command(
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Two or more MCAP logs.", metavar="FILE FILE...")
+    ] = None,
+    tune: Annotated[
+        str | None,
+        typer.Option(
+            "--tune",
+            metavar="SCENARIO",
+            help="Compare laws instead, each tuned alike in this scenario.",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    law: Annotated[
+        str | None,
+        typer.Option(
+            "--law",
+            metavar="LAW,LAW...",
+            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: p_f, known.",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option(
+            "--budget", metavar="N", help="Candidates per law; default: 64.", rich_help_panel=_TUNING
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", metavar="S", help="Of the search; default: 1.", rich_help_panel=_TUNING),
+    ] = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            "--objective",
+            metavar="error|settling",
+            help="What is weighed against effort; default: error.",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    gravity: Annotated[
+        float | None,
+        typer.Option(
+            "--gravity",
+            metavar="PERCENT",
+            help="What all laws are told of gravity, in % of the truth; default: 100.",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    duration: DurationOption = None,
+    overrides: SetOption = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            metavar="N",
+            min=1,
+            help="Processes; default: one per core.",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Where the front goes; default: the next free runs/tune-...",
+            rich_help_panel=_TUNING,
+        ),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compares logs side by side, with what differs in their experiments; or laws, each tuned alike.
+
+    Nothing is ranked: arms that hang, or were never pushed, have small errors too.
+    """
+    if tune is None:
+        of_tuning = {
+            "--law": law,
+            "--budget": budget,
+            "--seed": seed,
+            "--objective": objective,
+            "--gravity": gravity,
+            "--duration": duration,
+            "--set": overrides,
+            "--jobs": jobs,
+            "--out": output,
+            "--force": force or None,
+        }
+        _refuse_tuning_options(of_tuning)
+        _compare_logs(files or [], as_json=as_json)
+        return
+    if files:
+        raise UsageError("--tune makes its own runs: leave the logs out, or --tune")
+    from ..studies.tuning import plan_tuning
+    from ..studies.tuning.tuning_plan import DEFAULT_BUDGET
+
+    asked = plan_tuning(
+        tune,
+        [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])],
+        laws=[name.strip() for name in law.split(",")] if law is not None else (),
+        budget=DEFAULT_BUDGET if budget is None else budget,
+        seed=1 if seed is None else seed,
+        objective="error" if objective is None else objective,
+        gravity_percent=100.0 if gravity is None else gravity,
+    )
+    run_tuning(asked, output, jobs, force=force, as_json=as_json)
+
+
+def _refuse_tuning_options(options: Mapping[str, object]) -> None:
+    """Refuses options of a search where none was asked for."""
+    for name, value in options.items():
+        if value is not None:
+            raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
+
+
+def _compare_logs(files: list[Path], *, as_json: bool) -> None:
+    """Compares logs, side by side."""
+    if len(files) < 2:
+        raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
+    from ..analysis.metrics.log_metrics import compare_metrics as compared
+    from ..analysis.metrics.log_metrics import comparison_to_json
+    from ..scenario.describe import compare_scenarios
+    from ..studies.tuning.final_posture import check_final_posture
+
+    logs = [open_with_progress(file) for file in files]
+    names = name_columns(files)
+    different = compare_scenarios([log.scenario for log in logs])
+    remarks = {name: check_final_posture(log) for name, log in zip(names, logs, strict=True)}
+    found = compared(logs, names)
+    if not as_json:
+        print_log_comparison(logs, different, found, remarks)
+        return
+    entries = [
+        {"name": name, "file": str(file), "scenario": log.scenario.name, "sha256": log.scenario.sha256}
+        for name, file, log in zip(names, files, logs, strict=True)
+    ]
+    facts = {
+        "logs": entries,
+        "differences": [one._asdict() for one in different],
+        "remarks": remarks,
+        **comparison_to_json(found),
+    }
+    print_line(json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def name_columns(files: list[Path]) -> list[str]:
+    """Returns what logs are called: the file's name, or as much of its path as tells them apart."""
+    for depth in range(1, max(len(file.parts) for file in files) + 1):
+        names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{n}: {file}" for n, file in enumerate(files, 1)]

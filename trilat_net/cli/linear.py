@@ -1,0 +1,195 @@
+"""`trilat linear`: roots, margins and haptic ports of the loop linearised about its equilibrium."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..errors import UsageError
+from ..reporting.terminal_output import out, print_table
+from .options import ForceOption, ScenarioArgument, SetOption
+
+if TYPE_CHECKING:
+    from ..scenario import Scenario
+    from ..theory import LinearAnalysis, LinearEdge
+    from ..theory.port_analysis import PortAnalysis
+
+
+app = typer.Typer()
+
+
+class LinearFigure(StrEnum):
+    """What `--draw` draws."""
+
+    ROOTS = "roots"
+    IMPEDANCE = "impedance"
+    PASSIVITY = "passivity"
+
+
+_COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
+_MODE_COLUMN = "what moves"
+
+
+@app.command("linear", epilog="Example: trilat linear p_d_margin --set control.d=0.9 --over control.d=0.1:3")
+def linear_command(
+    scenario: ScenarioArgument,
+    overrides: SetOption = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(
+            "--pose", metavar="Q1,Q2", help="All sites here, rad, estimates true; default: a run's end."
+        ),
+    ] = None,
+    roots: Annotated[int, typer.Option("--roots", metavar="N", help="How many roots are shown.")] = 6,
+    over: Annotated[
+        list[str] | None,
+        typer.Option("--over", metavar="KEY=LOW:HIGH", help="Say where stability changes; repeatable."),
+    ] = None,
+    ports: Annotated[
+        bool, typer.Option("--ports/--no-ports", help="What hands feel, and whether it is passive there.")
+    ] = True,
+    picture: Annotated[
+        Path | None, typer.Option("--figure", metavar="FILE", help="Draw it: .png, .svg or .pdf.")
+    ] = None,
+    what: Annotated[
+        LinearFigure, typer.Option("--draw", help="What is drawn: roots, what hands feel, or passivity.")
+    ] = LinearFigure.ROOTS,
+    force: ForceOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")] = False,
+) -> None:
+    """Says how small motions about the resting pose grow or die, and what hands feel of each other.
+
+    The loop is linearised with its delays: roots, delay margin, edges of stability (docs/linear.md); then,
+    with hands and environments off, passivity, Llewellyn's criterion, impedance and Z-width (docs/ports.md).
+    Exit code 0 whatever the verdict.
+    """
+    if picture is not None:
+        _check_picture(picture, force=force)
+    spans = [_range(text) for text in over or []]
+    from ..theory import analyse_linear_loop, iterate_linear_edges
+    from ..theory.port_analysis import analyse_ports
+
+    found = analyse_linear_loop(scenario, overrides or [], pose=_pose(pose), roots=roots)
+    lines = {
+        key: list(iterate_linear_edges(found.scenario, key, low, high, found.rest))
+        for key, low, high in spans
+    }
+    wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
+    section = analyse_ports(found.scenario, found.rest) if wanted else None
+    if picture is not None:
+        _draw(found, section, what, picture)
+    if as_json:
+        _print_json(found, lines, section)
+        return
+    _show(found)
+    if ports and section is not None:
+        _show_ports(section)
+    for (key, low, high), line in zip(spans, lines.values(), strict=True):
+        out.print(escape(_edge_words(key, low, high, line, found.scenario)), soft_wrap=True)
+    if picture is not None:
+        out.print(f"  {escape(str(picture))}", soft_wrap=True)
+
+
+def _pose(text: str | None) -> tuple[float, float] | None:
+    """Returns the pose that a text such as 0.1,0.3 names."""
+    if text is None:
+        return None
+    try:
+        q1_rad, q2_rad = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--pose is two angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
+    return q1_rad, q2_rad
+
+
+def _range(text: str) -> tuple[str, float, float]:
+    """Returns key and ends of a text such as control.d=0.1:3."""
+    key, _, ends = text.partition("=")
+    low, colon, high = ends.partition(":")
+    try:
+        if not key.strip() or not colon:
+            raise ValueError
+        return key.strip(), float(low), float(high)
+    except ValueError:
+        raise UsageError(f"--over reads KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}") from None
+
+
+def _check_picture(path: Path, *, force: bool) -> None:
+    from ..reporting.style import FIGURE_FORMATS
+
+    if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
+        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FIGURE_FORMATS)}")
+    if path.exists() and not force:
+        raise UsageError(f"{path}: exists; choose another name, or use --force")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: there is no folder {path.parent}")
+
+
+def _draw(found: "LinearAnalysis", section: "PortAnalysis | None", what: LinearFigure, path: Path) -> None:
+    """Writes a figure."""
+    from ..reporting import style
+    from ..reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
+    from ..reporting.figures.root_map import draw_root_map
+    from ..reporting.style import write_figure
+
+    if section is None or what is LinearFigure.ROOTS:
+        write_figure(draw_root_map(found), path, style.REPORT_DPI)
+        return
+    drawn = draw_port_impedance if what is LinearFigure.IMPEDANCE else draw_port_passivity
+    write_figure(drawn(section), path, style.REPORT_DPI)
+
+
+def _print_json(
+    found: "LinearAnalysis", lines: "dict[str, list[LinearEdge]]", section: "PortAnalysis | None"
+) -> None:
+    from ..theory.linear_analysis import linear_to_json
+    from ..theory.port_analysis import ports_to_json
+
+    told = linear_to_json(found)
+    told["ports"] = None if section is None else ports_to_json(section)
+    told["edges"] = {key: [one._asdict() for one in line] for key, line in lines.items()}
+    typer.echo(json.dumps(told, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def _show(found: "LinearAnalysis") -> None:
+    """Prints an analysis: the rest, the roots, the verdict, the margin, the notes."""
+    from ..reporting import linear_text
+
+    for line in (*linear_text.describe_equilibrium(found), *linear_text.describe_effective_delays(found)):
+        out.print(escape(line), soft_wrap=True)
+    cells = linear_text.tabulate_roots(found)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for head in cells.heads:
+        table.add_column(head, justify="left" if head == _MODE_COLUMN else "right", no_wrap=True)
+    for row in cells.rows:
+        table.add_row(*map(escape, row))
+    print_table(table)
+    out.print(linear_text.describe_zero_roots(found), soft_wrap=True)
+    verdict, _, rest = linear_text.describe_linear_verdict(found).partition(":")
+    out.print(f"[{_COLOURS[verdict]}]{verdict}[/]:{escape(rest)}", soft_wrap=True)
+    out.print(escape(linear_text.describe_delay_margin(found)), soft_wrap=True)
+    for note in found.notes:
+        out.print(f"note: {escape(note)}", soft_wrap=True)
+
+
+def _show_ports(section: "PortAnalysis") -> None:
+    """Prints what there is to say of the ports."""
+    from ..reporting.port_text import describe_ports
+
+    for line in describe_ports(section):
+        out.print(escape(line), soft_wrap=True)
+
+
+def _edge_words(key: str, low: float, high: float, line: "list[LinearEdge]", scenario: "Scenario") -> str:
+    """Returns where stability changes over a key, in words."""
+    if not line:
+        return f"{key} from {low:g} to {high:g}: stability of {scenario.name} does not change"
+    told = [
+        f"{'stable' if one.stable_above else 'unstable'} from {one.value:.6g} on "
+        f"({one.omega_rad_s:.4g} rad/s)"
+        for one in line
+    ]
+    return f"{key} from {low:g} to {high:g}: {', '.join(told)}"

@@ -1,0 +1,165 @@
+"""`trilat metrics`: the metrics of a run, by group, with statics and rendered impedance."""
+
+import json
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from ..reporting.terminal_output import open_with_progress, out, sanitize
+from .options import JsonOption, LogArgument
+
+if TYPE_CHECKING:
+    from ..analysis.metrics.log_metrics import LogMetrics
+    from ..analysis.metrics.metric_catalogue import Metric, Quantity
+
+
+app = typer.Typer()
+
+_WIDE = 160
+"""Columns that a pipe has at least."""
+_NO_NUMBER = "–"
+
+
+@app.command("metrics", epilog="Example: trilat metrics run.mcap")
+def metrics_command(file: LogArgument, as_json: JsonOption = False) -> None:
+    """Measures a run: tracking, effort, energies, force sharing, what hands feel, walls, learning, network.
+
+    Sites, links and walls are columns. A dash is a number that there is none of; where there could be one,
+    the reason stands below. Every formula is in docs/metrics.md.
+    """
+    from ..analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+
+    log = open_with_progress(file)
+    found = compute_log_metrics(log)
+    if as_json:
+        typer.echo(json.dumps(metrics_to_json(log, found), indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        _show(found)
+
+
+def _show(found: "LogMetrics") -> None:
+    """Prints a table per group and kind of place, then statics, what is felt, and what is missing."""
+    from ..analysis.metrics.metric_catalogue import QUANTITIES
+
+    reasons: dict[str, list[str]] = {}
+    for (group, _), quantities in groupby(QUANTITIES, key=lambda one: (one.group, one.of)):
+        _print_group(group, list(quantities), found, reasons)
+    _print_statics(found)
+    _print_impedance(found)
+    for why, where in reasons.items():
+        out.print(f"[bold]{_NO_NUMBER}[/bold] {escape(sanitize(', '.join(where)))}: {escape(sanitize(why))}")
+
+
+def _print_group(
+    group: str, quantities: "Sequence[Quantity]", found: "LogMetrics", reasons: dict[str, list[str]]
+) -> None:
+    """Prints a row per quantity and a column per place, of what could be; notes why numbers are missing."""
+    rows = {quantity: found.places(quantity) for quantity in quantities}
+    could = {q: places for q, places in rows.items() if any(one.applies for one in places.values())}
+    names = [
+        name for name in next(iter(rows.values())) if any(places[name].applies for places in could.values())
+    ]
+    if not names:
+        return
+    _print(
+        [group, "", *names],
+        (
+            [quantity.name, quantity.unit, *(_cell(places[name]) for name in names)]
+            for quantity, places in could.items()
+        ),
+        words=2,
+    )
+    for quantity, places in could.items():
+        for name in names:
+            if places[name].value is None and places[name].applies:
+                where = f"{quantity.name} of {name}" if name else quantity.name
+                reasons.setdefault(places[name].why, []).append(where)
+
+
+def _print_statics(found: "LogMetrics") -> None:
+    """Prints who felt what in the windows at rest, and the stiffness between them."""
+    if found.shared:
+        _print(
+            ["at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off"],
+            (
+                [
+                    f"{pair.from_s:.1f} - {pair.to_s:.1f} s",
+                    str(pair.joint),
+                    f"{pair.pushed}{' (wall)' if pair.by_wall else ''}",
+                    _number(pair.pushed_nm),
+                    pair.holds,
+                    _number(pair.felt_nm),
+                    _cell(pair.expected_nm),
+                    _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %",
+                ]
+                for pair in found.shared
+            ),
+            words=1,
+        )
+        for why in dict.fromkeys(pair.expected_nm.why for pair in found.shared):
+            if why:
+                out.print(f"[bold]{_NO_NUMBER}[/bold] nothing is expected: {escape(sanitize(why))}")
+    if found.stiffness:
+        _print(
+            ["stiffness felt", "joint", "by", "N m more", "rad further", "N m/rad"],
+            (
+                [
+                    f"{one.from_s:.1f} to {one.to_s:.1f} s",
+                    str(one.joint),
+                    one.site,
+                    _number(one.torque_nm),
+                    _number(one.angle_rad),
+                    _NO_NUMBER if one.stiffness_nm_rad is None else _number(one.stiffness_nm_rad),
+                ]
+                for one in found.stiffness
+            ),
+            words=1,
+        )
+
+
+def _print_impedance(found: "LogMetrics") -> None:
+    """Prints what hands feel over frequency, decided or not."""
+    if not found.felt:
+        return
+    rows = []
+    for one in found.felt:
+        told = one.ratio
+        what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, joint {one.joint}"
+        if told.gain is None:
+            rows.append([what, one.unit, "", "", "", "", told.why])
+            continue
+        numbers = (told.frequency_hz, told.gain, told.phase_rad, told.coherence)
+        rows.append(
+            [what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {_percent(told.error)}"]
+        )
+    _print(["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2)
+
+
+def _percent(share: float | None) -> str:
+    return _NO_NUMBER if share is None else f"{100.0 * share:.1g} %"
+
+
+def _cell(one: "Metric") -> str:
+    return _NO_NUMBER if one.value is None else _number(one.value)
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.4g}"
+
+
+def _print(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> None:
+    """Prints a table; its first columns hold words, the others numbers."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for n, head in enumerate(heads):
+        last = n == len(heads) - 1 and head == ""
+        table.add_column(escape(sanitize(head)), justify="left" if n < words or last else "right")
+    for row in rows:
+        table.add_row(*(escape(sanitize(cell)) for cell in row))
+    console = out if out.is_terminal else Console(file=out.file, width=max(out.width, _WIDE), highlight=False)
+    console.print(table)
+    console.print()

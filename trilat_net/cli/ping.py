@@ -1,0 +1,223 @@
+"""`trilat ping` and `trilat router`: round trips, clock offsets, links of a session; a router."""
+
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..errors import UsageError
+from ..reporting.terminal_output import out, print_line
+from .options import (
+    ClockDriftOption,
+    ClockOffsetOption,
+    ConnectOption,
+    RouterOption,
+    ZenohConfigOption,
+    check_seconds,
+    check_session_name,
+    resolve_connection,
+)
+
+if TYPE_CHECKING:
+    from sites.session_ping import PingResult, SessionPing
+
+
+app = typer.Typer()
+
+ANY_ADDRESS = "tcp/0.0.0.0:7447"
+
+
+@app.command("router", epilog=f"Example: trilat router --listen {ANY_ADDRESS}")
+def router_command(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--listen", metavar="EP", help=f"Endpoint to listen at; repeatable; default: {ANY_ADDRESS}."
+        ),
+    ] = None,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    until_idle: Annotated[
+        float | None,
+        typer.Option(
+            "--until-idle",
+            metavar="S",
+            help="End once all members have left for so long, s; default: stay.",
+            callback=check_seconds,
+        ),
+    ] = None,
+) -> None:
+    """Lets sites meet that cannot reach each other directly, as behind NAT.
+
+    Sites and recorder name it with --router, in any order of starts. It runs until Ctrl-C; a session goes on
+    when it is started again. Several routers that --connect to each other are one.
+    """
+    from ..net.clock import SystemClock
+    from ..net.connection import open_bus, resolve_router_connection, run_router
+    from ..net.zenoh_bus import read_zenoh_file
+    from ..process import Interrupt
+
+    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
+    connection = resolve_router_connection(listen, connect, file, [ANY_ADDRESS])
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        bus = open_bus(connection, clock, interrupt.requested, None, print_line)
+        if bus is None:
+            raise typer.Exit(interrupt.exit_code)
+        try:
+            print_line(f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            run_router(
+                bus, clock, interrupt.requested, lambda text: print_line(f"router: {text}"), until_idle
+            )
+        finally:
+            bus.close()
+        raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
+
+
+def _check_count(value: int) -> int:
+    """Refuses what is no number of round trips."""
+    if not 5 <= value <= 10_000:
+        raise UsageError(f"--count is a number from 5 to 10000, not {value}")
+    return value
+
+
+@app.command("ping", epilog="Example: trilat ping --session paper")
+def ping_command(
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session.")] = "paper",
+    connect: ConnectOption = None,
+    router: RouterOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    count: Annotated[
+        int, typer.Option("--count", metavar="N", help="Round trips to each member.", callback=_check_count)
+    ] = 50,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            help="How long to wait for the first answer, s.",
+            callback=check_seconds,
+        ),
+    ] = 3.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    clock_offset: ClockOffsetOption = 0.0,
+    clock_drift: ClockDriftOption = 0.0,
+) -> None:
+    """Shows round trip, clock offset and jitter between here and every member of a session.
+
+    The session may wait for its members or run; of one that runs it also shows what its sites say of their
+    links to each other. Without endpoints it asks the first site, at its loopback port, who the others are.
+    """
+    from sites.session_ping import ping_session
+
+    from ..net.clock import make_system_clock
+    from ..process import Interrupt
+
+    connection = resolve_connection(None, connect, router, zenoh_config, [], None)
+    clock = make_system_clock(clock_offset, clock_drift)
+    with Interrupt() as interrupt:
+        probe = ping_session(
+            connection, clock, check_session_name(session), count, timeout, interrupt.requested
+        )
+        if probe is None:
+            raise typer.Exit(interrupt.exit_code)
+    members, links = [_member(reach) for reach in probe.reached()], _links(probe)
+    if as_json:
+        print_line(json.dumps({"session": session, "members": members, "links": links}, indent=2))
+    else:
+        _show(session, members, links)
+    if not any(member["answers"] for member in members):
+        raise typer.Exit(1)
+
+
+def _member(reach: "PingResult") -> dict[str, Any]:
+    """Returns what a table and JSON say of a member; times in us."""
+    info, rtts = reach.info, sorted(reach.rtts_ns)
+    facts: dict[str, Any] = {
+        "member": info.member,
+        "host": info.host,
+        "running": info.running,
+        "ticks": info.ticks,
+        "answers": len(rtts),
+        "same_clock": reach.shared,
+    }
+    if rtts:
+        steps = [abs(b - a) for a, b in zip(reach.rtts_ns, reach.rtts_ns[1:], strict=False)]
+        facts["rtt_us"] = {
+            "min": rtts[0] / 1000,
+            "p50": rtts[len(rtts) // 2] / 1000,
+            "p99": rtts[min(len(rtts) - 1, len(rtts) * 99 // 100)] / 1000,
+        }
+        facts["jitter_us"] = sum(steps) / max(1, len(steps)) / 1000
+    if reach.estimate is not None:
+        estimate = reach.estimate
+        facts["offset_ns"] = estimate.offset_ns
+        facts["bound_us"] = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
+    return facts
+
+
+def _links(probe: "SessionPing") -> list[dict[str, Any]]:
+    """Returns what the sites that run say of their links; times in us."""
+    return [
+        {
+            "from": peer,
+            "to": site,
+            "delay_us": stats.delay_us[peer],
+            "delay_max_us": stats.delay_max_us.get(peer, -1),
+            "rtt_us": stats.rtt_us.get(peer, -1),
+            "offset_us": stats.offset_us.get(peer, 0),
+            "bound_us": stats.bound_us.get(peer, 0),
+        }
+        for site, stats in sorted(probe.links.items())
+        for peer in stats.delay_us
+    ]
+
+
+def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any]]) -> None:
+    state = "runs" if any(member["running"] for member in members) else "waits for its members"
+    out.print(
+        f"session {escape(session)} {state}; times in us; a clock is the one there minus the one here",
+        soft_wrap=True,
+    )
+    table = _table("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
+    for member in members:
+        rtt = member.get("rtt_us", {})
+        numbers = [*(rtt.get(name) for name in ("min", "p50", "p99")), member.get("jitter_us")]
+        table.add_row(
+            member["member"],
+            escape(member["host"]),
+            str(member["answers"]),
+            *("" if number is None else f"{number:.0f}" for number in numbers),
+            _clock(member),
+        )
+    out.print(table)
+    if links:
+        table = _table("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
+        for link in links:
+            times = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
+            table.add_row(
+                link["from"],
+                link["to"],
+                *("none" if time < 0 else str(time) for time in times),
+                f"{link['offset_us'] / 1e6:.6f}",
+                str(link["bound_us"]),
+            )
+        out.print("between the sites, in the last tenth of a second of each:")
+        out.print(table)
+
+
+def _clock(member: dict[str, Any]) -> str:
+    if member["same_clock"]:
+        return "the same clock"
+    if "offset_ns" not in member:
+        return "another clock"
+    return f"{member['offset_ns'] / 1e9:.6f} s +- {member['bound_us']:.0f}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for n, column in enumerate(columns):
+        table.add_column(column, justify="left" if n < 2 or column == columns[-1] else "right")
+    return table

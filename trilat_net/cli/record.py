@@ -1,0 +1,128 @@
+"""`trilat record`: records one session into an MCAP log, in one file or in parts."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import RunFailed, UsageError
+from ..reporting.terminal_output import open_with_progress, out, print_conclusion, print_line, progress_bar
+from .options import (
+    ClockDriftOption,
+    ClockOffsetOption,
+    ConnectOption,
+    ForceOption,
+    ListenOption,
+    RouterOption,
+    ViewsOption,
+    ZenohConfigOption,
+    check_seconds,
+    check_session_name,
+    resolve_connection,
+)
+
+app = typer.Typer()
+
+
+@app.command("record", epilog="Example: trilat record --session paper -o run.mcap --split-duration 600")
+def record_command(
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session to record.")],
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    router: RouterOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
+    ] = None,
+    join_timeout: Annotated[
+        float | None,
+        typer.Option(
+            "--join-timeout",
+            metavar="S",
+            help="How long to wait for it to begin, s; default: for ever.",
+            callback=check_seconds,
+        ),
+    ] = None,
+    clock_offset: ClockOffsetOption = 0.0,
+    clock_drift: ClockDriftOption = 0.0,
+    concluded: Annotated[
+        bool, typer.Option("--conclude", help="Verify and report it afterwards, in the folder of the log.")
+    ] = False,
+    include: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--include", metavar="KEYS", help="Record these channels alone, as '**/m1/**'; repeatable."
+        ),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option("--exclude", metavar="KEYS", help="Leave these channels out, as '**/link'; repeatable."),
+    ] = None,
+    split_size: Annotated[
+        float | None, typer.Option("--split-size", metavar="MIB", help="Parts of at most this size, MiB.")
+    ] = None,
+    split_duration: Annotated[
+        float | None, typer.Option("--split-duration", metavar="S", help="Parts of this duration, s.")
+    ] = None,
+    carry_on: Annotated[
+        bool, typer.Option("--continue", help="Where the log exists, write the part that follows it.")
+    ] = False,
+    durable: Annotated[
+        bool, typer.Option("--durable", help="Put every 100 ms onto the disk, not every second.")
+    ] = False,
+    views: ViewsOption = "100",
+    force: ForceOption = False,
+) -> None:
+    """Records one session, from its epoch to its end or to Ctrl-C.
+
+    Without endpoints it asks the first site, at its loopback port, who the others are. Parts are called
+    FILE-001.mcap and so on. A file bears .active at its end until it is finished.
+    """
+    from recorder.record_process import record_session
+
+    from ..log.log_layout import find_parts, parse_channel_filter
+    from ..log.log_writer import make_log_storage
+    from ..log.ros2.viz_channels import parse_viz_rate
+    from ..net.clock import make_system_clock
+
+    connection = resolve_connection(listen, connect, router, zenoh_config, [], None)
+    path = output if output is not None else Path(f"{check_session_name(session)}.mcap")
+    place = make_log_storage(
+        path,
+        split_mib=split_size,
+        split_s=split_duration,
+        choice=parse_channel_filter(include or [], exclude or []),
+        force=force,
+        carry_on=carry_on,
+        durable=durable,
+        views_hz=parse_viz_rate(views),
+    )
+    place.first()  # a name that is taken is refused before anybody waits
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
+    page = path.parent / "report.html"
+    if concluded and page.exists() and not force:
+        raise UsageError(f"{page}: exists; give the log a folder of its own, or use --force")
+    clock = make_system_clock(clock_offset, clock_drift)
+    then = (lambda: _conclude(list(find_parts(path).values()))) if concluded else lambda: None
+    code = record_session(
+        check_session_name(session), place, connection, join_timeout, clock, print_line, then
+    )
+    raise typer.Exit(code)
+
+
+def _conclude(parts: list[Path]) -> None:
+    """Verifies and reports a log, into its own folder."""
+    from ..reporting.conclude import conclude
+
+    out.print("checking the log and drawing ...")
+    path = parts[0]
+    log = open_with_progress(*parts)
+    with progress_bar("executing and drawing") as progress:
+        conclusion = conclude(log, path.parent, progress)
+    print_conclusion(conclusion)
+    if not conclusion.passed:
+        raise RunFailed(f"{path}: failed a check")
+    if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
+        raise RunFailed(f"{path}: {ended.text}")

@@ -1,0 +1,146 @@
+"""`trilat rerun`: executes sites of a log again with changed settings and prints the effect."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..errors import UsageError
+from ..reporting.terminal_output import (
+    open_with_progress,
+    out,
+    print_line,
+    progress_bar,
+    sanitize,
+    warn_user_laws,
+)
+from .options import ForceOption, JsonOption, LogsArgument, SetOption
+
+if TYPE_CHECKING:
+    from ..execution.rerun import LinkEffect, LogAndRerun, Rerun
+
+
+app = typer.Typer()
+
+
+@app.command("rerun", epilog="Example: trilat rerun run.mcap --replace s --set control.Kd=5 -o kd5.mcap")
+def rerun_command(
+    files: LogsArgument,
+    replace: Annotated[
+        list[str] | None,
+        typer.Option("--replace", metavar="SITE", help="Execute this site afresh; repeatable."),
+    ] = None,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="Execute all of them, over the network of the log.")
+    ] = False,
+    overrides: SetOption = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the outcome as a log.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Asks a log what if: executes sites afresh, with something changed, and compares them with it.
+
+    Without --closed-loop the other sites stand as recorded and do not react.
+    """
+    from ..execution.rerun import rerun as executed
+
+    if output is not None:
+        _check_output(output, files, force=force)
+    log = open_with_progress(*files)
+    warn_user_laws(log, needed=False)  # another law may take its place
+    with progress_bar("executing") as progress:
+        again = executed(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
+    if output is not None:
+        again.save(output, force=force)
+    if as_json:
+        print_line(json.dumps({**again.facts(), "file": str(output) if output else None}, indent=2))
+    else:
+        _show(again, output)
+    if again.diverged or again.broken:
+        raise typer.Exit(1)
+
+
+def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
+    """Refuses a file that may not be written, before anything is executed."""
+    from ..files import refuse_existing_log
+    from ..log.log_layout import active_path
+
+    if any(output.exists() and file.exists() and output.samefile(file) for file in files):
+        raise UsageError(f"{output}: is the log itself; choose another name")
+    refuse_existing_log(output, active_path(output), force=force)
+
+
+def _show(again: "Rerun", output: Path | None) -> None:
+    """Prints what was asked, what became of it, and what limits the answer."""
+    from ..execution.rerun_request import describe_rerun_changes as wording
+
+    asked = again.premise
+    others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
+    out.print(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}", soft_wrap=True)
+    for line in wording(asked) or ["nothing is changed: this is the experiment of the log"]:
+        out.print(f"  {escape(sanitize(line))}", soft_wrap=True)
+    out.print(_table(again))
+    for line in _lines(again):
+        out.print(escape(sanitize(line)), soft_wrap=True)
+    for note in again.notes:
+        out.print(f"note: {escape(sanitize(note))}", soft_wrap=True)
+    if output is not None:
+        out.print(f"  {escape(str(output))}", soft_wrap=True)
+
+
+def _table(again: "Rerun") -> Table:
+    """Returns a row per site that was executed, each figure in the log and here."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("site")
+    for head in ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here"):
+        table.add_column(head, justify="right")
+    for effect in again.sites.values():
+        figures = (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm)
+        cells = [cell for pair in figures for cell in _cells(pair)]
+        table.add_row(effect.site, str(effect.executed), str(effect.identical), *cells)
+    return table
+
+
+def _cells(pair: "LogAndRerun | None") -> list[str]:
+    return ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
+
+
+def _lines(again: "Rerun") -> list[str]:
+    """Returns what else became of sites and links, a sentence each."""
+    lines = []
+    for effect in again.sites.values():
+        if effect.q_max_rad:
+            most, at_s, rms = effect.q_max_rad, effect.q_max_at_s, effect.q_rms_rad
+            lines.append(
+                f"{effect.site}: q is up to {most:.3g} rad off the log, at {at_s:.3f} s; {rms:.3g} rad rms"
+            )
+        if effect.first is not None:
+            first = effect.first
+            at_s = first.tick / again.premise.scenario.sites[effect.site].rate_hz
+            was, now = _values(first.logged, first.computed)
+            where = f"tick {first.tick} ({at_s:.3f} s)"
+            lines.append(
+                f"{effect.site}: the first difference is at {where}: {first.field} was {was}, is {now}"
+            )
+        if effect.diverged_at_s is not None:
+            lines.append(f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there")
+    return lines + [_link_line(link) for link in again.links.values() if link.differs]
+
+
+def _values(before: object, after: object) -> tuple[str, str]:
+    """Returns two values, with as many digits as tell them apart."""
+    short = tuple(f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after))
+    return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
+
+
+def _link_line(link: "LinkEffect") -> str:
+    mean, largest = link.age_mean_ms, link.age_max_ms
+    before, after = (
+        f"{a:.4g} ms old on average, {b:.4g} ms at most" for a, b in zip(mean, largest, strict=True)
+    )
+    return f"link {link.link}: samples in use were {before}; are {after}"

@@ -1,0 +1,71 @@
+"""`trilat scenario`: list, show, check, new."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ..reporting.terminal_output import out
+from .options import (
+    DurationOption,
+    ForceOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    load_chosen_scenario,
+)
+
+app = typer.Typer(no_args_is_help=True, help="The shipped scenarios and your own.")
+
+
+@app.command("list", epilog="Example: trilat scenario list")
+def scenario_list_command() -> None:
+    """Lists the shipped scenarios."""
+    from ..scenario import list_shipped, load_scenario
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("name", "sites", "time", "what it is"):
+        table.add_column(column, justify="right" if column in ("sites", "time") else "left")
+    for name in list_shipped():
+        chosen = load_scenario(name)
+        table.add_row(name, str(len(chosen.names)), f"{chosen.duration_s:g} s", escape(chosen.title))
+    out.print(table)
+
+
+@app.command("show", epilog="Example: trilat scenario show paper --set control.Kd=5")
+def scenario_show_command(
+    name: ScenarioArgument,
+    duration: DurationOption = None,
+    seed: SeedOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Prints the resolved text of a scenario: every value of every site and link."""
+    sys.stdout.write(load_chosen_scenario(name, overrides, duration, seed).text)
+
+
+@app.command("check", epilog="Example: trilat scenario check mine.toml")
+def scenario_check_command(
+    file: ScenarioArgument,
+    overrides: SetOption = None,
+) -> None:
+    """Says whether a scenario is valid, and what follows from it."""
+    from ..scenario.describe import describe_scenario
+
+    for line in describe_scenario(load_chosen_scenario(file, overrides, None, None)):
+        out.print(escape(line), soft_wrap=True)
+
+
+@app.command("new", epilog="Example: trilat scenario new mine.toml")
+def scenario_new_command(
+    file: Annotated[Path, typer.Argument(help="The file to make.")], force: ForceOption = False
+) -> None:
+    """Writes a commented template, with the unit of every key."""
+    from ..files import open_new_file
+    from ..scenario import read_template
+
+    with open_new_file(file, force=force) as stream:
+        stream.write(read_template().encode())
+    out.print(f"{escape(str(file))}: a template; check it with: trilat scenario check {escape(str(file))}")

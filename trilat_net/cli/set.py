@@ -1,0 +1,130 @@
+"""`trilat set`: changes a link or a row of the dominance matrix while a session runs."""
+
+import re
+import tomllib
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from ..errors import UsageError
+from ..reporting.terminal_output import out
+from .options import ConnectOption, RouterOption, ZenohConfigOption, resolve_connection
+
+app = typer.Typer(no_args_is_help=True)
+
+_UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
+
+
+def parse_milliseconds(text: str) -> float:
+    """Returns a time with its unit, as in 350ms or 0.35s, in ms."""
+    match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
+    try:
+        if match:
+            return float(match[1]) * _UNITS[match[2]]
+    except ValueError:
+        pass
+    raise UsageError(f"a time is a number and its unit, as in 350ms or 0.35s, not {text!r}")
+
+
+def parse_share(text: str) -> float:
+    """Returns a share, as in 5% or 0.05."""
+    number = text.strip().removesuffix("%")
+    try:
+        return float(number) / (100.0 if number != text.strip() else 1.0)
+    except ValueError:
+        raise UsageError(f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}") from None
+
+
+def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
+    """Returns KEY=VALUE texts as a table; a value is TOML or a bare word."""
+    table: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
+        try:
+            table[key.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            table[key.strip()] = value.strip()
+    return table
+
+
+@app.callback()
+def set_command(
+    context: typer.Context,
+    session: Annotated[
+        str | None, typer.Option("--session", metavar="ID", help="Which session; required.")
+    ] = None,
+    connect: ConnectOption = None,
+    router: RouterOption = None,
+    zenoh_config: ZenohConfigOption = None,
+) -> None:
+    """Changes a link, or a site's shares in its peers, while a session runs.
+
+    Without endpoints it asks the first site, at its loopback port, who the others are.
+    """
+    context.obj = session, resolve_connection(None, connect, router, zenoh_config, [], None)
+
+
+@app.command("link", epilog="Example: trilat set --session paper link 'm1->s' --delay 350ms --loss 5%")
+def set_link_command(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
+    delay: Annotated[str | None, typer.Option("--delay", help="Its delay, as in 350ms.")] = None,
+    loss: Annotated[str | None, typer.Option("--loss", help="Its loss, as in 5%.")] = None,
+    preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
+    to: Annotated[
+        list[str] | None,
+        typer.Option("--to", metavar="KEY=VALUE", help="Any key of a link, as in model=gamma; repeatable."),
+    ] = None,
+) -> None:
+    """Changes one directed link; what is not named stays, and a model or preset replaces all."""
+    table = parse_pairs(to or [], "deviation_ms=20")
+    if preset is not None:
+        table["preset"] = preset
+    if delay is not None:
+        table["delay_ms"] = parse_milliseconds(delay)
+    if loss is not None:
+        table["loss"] = parse_share(loss)
+    if not table:
+        raise UsageError("what is to change? give --delay, --loss, --preset or --to KEY=VALUE")
+    _, arrow, receiver = name.partition("->")
+    if not arrow:
+        raise UsageError(f"a link is FROM->TO in quotes, as in 'm1->s', not {name!r}")
+    _send_change(context, receiver, {"link": name, "to": table})
+
+
+@app.command("dominance", epilog="Example: trilat set --session paper dominance s m1=0.9 m2=0.1")
+def set_dominance_command(
+    context: typer.Context,
+    site: Annotated[str, typer.Argument(help="Whose shares.")],
+    shares: Annotated[list[str], typer.Argument(metavar="PEER=SHARE...", help="They sum to 1.")],
+    ramp: Annotated[str, typer.Option("--ramp", help="How long the change takes, as in 2s.")] = "1s",
+) -> None:
+    """Changes one row of the dominance matrix, linearly over a time, so that it sums to 1 all the while."""
+    table = {peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()}
+    _send_change(context, site, {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3})
+
+
+def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
+    """Asks the site and prints its answer."""
+    from ..net.clock import SystemClock
+    from ..net.discovery import request_change
+    from ..net.requests import ChangeRequest
+    from ..scenario import parse_embedded
+
+    session, connection = context.obj
+    if session is None:
+        raise UsageError("which session? say trilat set --session ID ...")
+    reply = request_change(
+        connection,
+        SystemClock(),
+        session,
+        site,
+        ChangeRequest(**order),
+        lambda text: parse_embedded(text, session).names,
+    )
+    if not reply.accepted:
+        raise UsageError(f"refused: {reply.text}")
+    out.print(escape(reply.text), soft_wrap=True)

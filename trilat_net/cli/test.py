@@ -1,0 +1,152 @@
+"""`trilat test`: runs scenarios and evaluates their [expect] tables."""
+
+import os
+import platform
+import re
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from ..errors import UsageError
+from ..reporting.terminal_output import err, out
+from .options import SetOption
+
+if TYPE_CHECKING:
+    from ..studies.trials.trial import Trial, TrialResult
+    from ..studies.trials.trial_report import TrialReport
+
+
+app = typer.Typer()
+
+MAX_SEEDS = 100_000
+
+
+@app.command("test", epilog="Example: trilat test jitter --seeds 1..20 --junit out.xml")
+def test_command(
+    scenarios: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO]...", help="Names or paths; none: all that are shipped with \\[expect]."
+        ),
+    ] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live/--virtual", help="Over a network, one after the other, or in virtual time."),
+    ] = False,
+    seeds: Annotated[
+        str | None,
+        typer.Option("--seeds", metavar="LIST", help="As in 1..20 or 1,5,9; default: the scenario's."),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option("--junit", metavar="FILE", help="Write the results as JUnit XML as well.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
+    ] = None,
+    overrides: SetOption = None,
+) -> None:
+    r"""Runs scenarios and says which of their \[expect] held, by how much, and how to repeat what did not."""
+    from ..net.clock import SystemClock
+    from ..studies.trials.trial_report import encode_junit_xml
+
+    if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
+        raise UsageError(f"{junit}: cannot be written")
+    batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
+    began_unix_ns = SystemClock().unix_ns()
+    report = _run_live(batch) if live else _run_virtual(batch, jobs)
+    _show(report)
+    if junit is not None:
+        junit.write_bytes(encode_junit_xml(report, began_unix_ns, platform.node()))
+    if not report.held:
+        raise typer.Exit(1)
+
+
+def parse_seeds(text: str | None) -> list[int]:
+    """Returns the seeds that a text such as 1..20 or 1,5,9 or 1..3,8 names; none for None.
+
+    Raises:
+        UsageError: it names none, or too many.
+    """
+    seeds: list[int] = []
+    for part in [] if text is None else text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first:
+            raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
+        if len(seeds) + last - first >= MAX_SEEDS:
+            raise UsageError(f"--seeds {text} are more than {MAX_SEEDS}")
+        seeds += range(first, last + 1)
+    return seeds
+
+
+def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: bool) -> "list[Trial]":
+    """Returns all trials; without sources, of every shipped scenario that expects something."""
+    from ..scenario import list_shipped, load_scenario
+    from ..studies.trials.trial import trials
+
+    chosen = sources or [name for name in list_shipped() if load_scenario(name).expect.asks]
+    return [
+        trial for source in dict.fromkeys(chosen) for trial in trials(source, seeds, overrides, live=live)
+    ]
+
+
+def _run_virtual(batch: "list[Trial]", jobs: int | None) -> "TrialReport":
+    """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
+    from rich.progress import Progress
+
+    from ..studies.trials.trial_runner import run_trials
+
+    to_do = Counter(trial.source for trial in batch)
+    with Progress(console=out, transient=True, disable=not out.is_terminal) as progress:
+        task = progress.add_task("runs", total=len(batch))
+
+        def done(result: "TrialResult") -> None:
+            progress.advance(task)
+            source = result.trial.source
+            to_do[source] -= 1
+            if not to_do[source] and not out.is_terminal:
+                out.print(escape(f"{source}: ran"), soft_wrap=True)
+
+        return run_trials(batch, jobs, done)
+
+
+def _run_live(batch: "list[Trial]") -> "TrialReport":
+    """Runs trials over a network, one after the other."""
+    from sites.demo_session import run_demo
+    from sites.monitor import SessionDisplay
+
+    from ..files import make_results_folder
+    from ..net.clock import SystemClock
+    from ..studies.trials.trial import evaluate_live_log
+    from ..studies.trials.trial_report import TrialReport
+
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    results = []
+    for trial in batch:
+        folder = make_results_folder(None, f"test-{trial}", force=False)
+        out.print(escape(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}"), soft_wrap=True)
+        began_ns = clock.monotonic_ns()
+        with SessionDisplay(trial.scenario, out) as display:
+            outcome = run_demo(trial.scenario, folder, display)
+        if outcome.interrupted:
+            err.print("interrupted")
+            raise typer.Exit(128 + outcome.interrupted)
+        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
+    return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _show(report: "TrialReport") -> None:
+    """Prints the table, what failed and how to repeat it, and how fast it went."""
+    heads, *rows = report.table()
+    out.print(heads, soft_wrap=True)
+    for line in rows:
+        mark, space, rest = line.partition(" ")
+        color = "green" if mark == "ok" else "red"
+        out.print(f"[{color}]{mark}[/{color}]{space}{escape(rest)}", soft_wrap=True)
+    for line in [*report.failures(), *report.remarks()]:
+        out.print(escape(line), soft_wrap=True)

@@ -1,1 +1,0 @@
-"""Figures of a log for a paper: which there are, one by one, and as files."""

@@ -1,0 +1,118 @@
+"""The first difference between a record and an execution: site, tick, field, both values.
+
+Two criteria: equal bits on the platform that made the log, else |a - b| <= 1e-9 (1 + |a|).
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from ..core.ticks import TickRecord
+from ..errors import LawFailed
+from ..net.messages import STATE_VECTORS, State
+
+TOLERANCE = 1e-9
+"""Where platforms differ, values a and b count as equal when |a - b| <= TOLERANCE (1 + |a|)."""
+
+NumberEquality = Callable[[float, float], bool]
+
+
+class RecordDifference(NamedTuple):
+    """One field of one record that is not as it should be.
+
+    Attributes:
+        site: whose record.
+        tick: which record.
+        field: which field, with the index of the number in it.
+        logged: what the log says.
+        computed: what the execution gave.
+    """
+
+    site: str
+    tick: int
+    field: str
+    logged: Any
+    computed: Any
+
+    def __str__(self) -> str:
+        return (
+            f"{self.site}, tick {self.tick}, {self.field}: "
+            f"logged {_shown(self.logged)}, computed {_shown(self.computed)}"
+        )
+
+
+def _shown(value: Any) -> str:
+    return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
+
+
+def equal_bits(a: float, b: float) -> bool:
+    """True where two numbers have the same bits (-0.0 is not 0.0)."""
+    return a.hex() == b.hex()
+
+
+def equal_to_tolerance(a: float, b: float) -> bool:
+    """True where two numbers agree as well as two platforms can be expected to."""
+    return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
+
+
+def describe_law_failure(failed: LawFailed) -> RecordDifference:
+    """Returns the difference where a law from outside fails that did not when the log was made."""
+    return RecordDifference(failed.site, failed.tick or 0, "record", "is there", failed.problem)
+
+
+def _equal_lists(a: Sequence[float], b: Sequence[float], same: NumberEquality) -> bool:
+    """True where two lists of numbers are as long as each other and agree."""
+    return len(a) == len(b) and all(same(float(x), float(y)) for x, y in zip(a, b, strict=True))
+
+
+_NUMBERS = struct.Struct(f"<{sum(STATE_VECTORS.values())}d").pack
+
+
+def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
+    """True where every computed field of a record has the same bits: the common case, looked at at once."""
+    a, b = logged, computed
+    return (
+        _NUMBERS(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat)
+        == _NUMBERS(*b.q, *b.qd, *b.q_des, *b.qd_des, *b.tau, *b.tau_x, *b.theta_hat)
+        and a.used == dict(zip(peers, b.used, strict=True))
+        and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
+        and a.mode == b.mode.name.lower()
+        and a.cmd == b.cmd
+        and (a.mem == b.mem == [] or _equal_lists(a.mem, b.mem, equal_bits))
+    )
+
+
+def find_first_difference(
+    logged: State, computed: TickRecord, peers: tuple[str, ...], same: NumberEquality
+) -> RecordDifference | None:
+    """Returns the first field in which a record differs from an execution, or None.
+
+    Args:
+        logged: the record.
+        computed: what `Site.step` returned.
+        peers: the site's peers in scenario order.
+        same: when two numbers are the same.
+    """
+
+    def differs(field: str, a: Any, b: Any) -> RecordDifference:
+        return RecordDifference(logged.site, logged.tick, field, a, b)
+
+    plain = (("tick", computed.tick), ("t_ns", computed.t_ns), ("mode", computed.mode.name.lower()))
+    for field, value in plain:
+        if getattr(logged, field) != value:
+            return differs(field, getattr(logged, field), value)
+    for field in STATE_VECTORS:
+        for n, (a, b) in enumerate(zip(getattr(logged, field), getattr(computed, field), strict=True)):
+            if not same(float(a), b):
+                return differs(f"{field}[{n}]", float(a), b)
+    used = dict(zip(peers, computed.used, strict=True))
+    for peer in sorted({*logged.used, *used}):
+        if logged.used.get(peer) != used.get(peer):
+            return differs(f"used[{peer}]", logged.used.get(peer), used.get(peer))
+    if logged.rx_crc != computed.rx_crc:
+        return differs("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
+    if logged.cmd != computed.cmd:
+        return differs("cmd", logged.cmd, computed.cmd)
+    if not _equal_lists(logged.mem, computed.mem, same):
+        return differs("mem", logged.mem, computed.mem)
+    return None

@@ -1,0 +1,253 @@
+"""Networks of an execution: the receiver's tick at which each sample arrives, prompt or as a log recorded it.
+
+Invariant (L2): delay belongs to the link. A network only decides at which tick a sample arrives; as long as
+that precedes the tick at which the sample is due, the numbers do not depend on it. A rerun delivers a sample
+where the log says that it arrived, never where the log excludes it; in ticks without a record an arrival is
+assumed, and counted as such.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import median_low
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ..core.ticks import NS_PER_S, Arrival, TickRecord
+from ..errors import LogError
+from ..log.site_log import SiteLog
+
+
+class Network(Protocol):
+    """Joins the sites of a virtual run."""
+
+    def send(self, sender: str, output: TickRecord) -> None:
+        """Takes the record of one tick from its sender."""
+
+    def ready(self, receiver: str, k: int) -> bool:
+        """True where everything that arrives for tick k of a receiver has been sent."""
+
+    def deliver(self, receiver: str, k: int) -> list[Arrival]:
+        """Returns what arrives for tick k of a receiver, in order."""
+
+
+class PromptNetwork:
+    """Every sample is there at the first tick of the receiver after its stamp.
+
+    Args:
+        rates: tick rate of every site, Hz, in scenario order.
+    """
+
+    def __init__(self, rates: Mapping[str, int]) -> None:
+        self._rates = rates
+        self._under_way: dict[str, list[deque[TickRecord]]] = {
+            i: [deque() for j in rates if j != i] for i in rates
+        }
+        self._outgoing = {
+            j: [self._under_way[i][[p for p in rates if p != i].index(j)] for i in rates if i != j]
+            for j in rates
+        }
+
+    def send(self, sender: str, output: TickRecord) -> None:
+        """See `Network`."""
+        for queue in self._outgoing[sender]:
+            queue.append(output)
+
+    def ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
+        """See `Network`. In order of time, always."""
+        return True
+
+    def deliver(self, receiver: str, k: int) -> list[Arrival]:
+        """See `Network`."""
+        now_ns = k * NS_PER_S // self._rates[receiver]
+        arrivals = []
+        for index, queue in enumerate(self._under_way[receiver]):
+            while queue and queue[0].t_ns < now_ns:
+                sample = queue.popleft()
+                latency_us = (now_ns - sample.t_ns) // 1000
+                arrivals.append(Arrival(index, sample.tick, sample.q, sample.qd, latency_us, sample.tau_x))
+        return arrivals
+
+
+class RecordedNetwork:
+    """Samples arrive when a log says that they did; what they carry comes from the running sites.
+
+    Args:
+        schedule: per receiver and tick the arrivals: (index of the peer, tick, latency us), in order.
+        peers: per receiver its peers in scenario order.
+    """
+
+    def __init__(
+        self,
+        schedule: Mapping[str, Mapping[int, Sequence[Sequence[int]]]],
+        peers: Mapping[str, Sequence[str]],
+    ) -> None:
+        self._schedule = schedule
+        self._peers = peers
+        self._sent: dict[tuple[str, int], TickRecord] = {}
+
+    def send(self, sender: str, output: TickRecord) -> None:
+        """See `Network`."""
+        self._sent[sender, output.tick] = output
+
+    def ready(self, receiver: str, k: int) -> bool:
+        """See `Network`. A loop that was late took in samples of ticks that lie ahead of its own."""
+        peers = self._peers[receiver]
+        return all((peers[index], tick) in self._sent for index, tick, _ in self._listed(receiver, k))
+
+    def _listed(self, receiver: str, k: int) -> Sequence[Sequence[int]]:
+        return self._schedule[receiver].get(k, ())
+
+    def deliver(self, receiver: str, k: int) -> list[Arrival]:
+        """See `Network`. A sample that was never sent (the log names none of its sender's) stays away."""
+        arrivals = []
+        for index, tick, latency_us in self._listed(receiver, k):
+            sample = self._sent.get((self._peers[receiver][index], tick))
+            if sample is not None:
+                arrivals.append(Arrival(index, tick, sample.q, sample.qd, latency_us, sample.tau_x))
+        return arrivals
+
+
+ArrivalEntry = Sequence[int]
+"""As in a record's `rx`: index of the peer, tick of its sample, us."""
+
+
+class Deliveries(NamedTuple):
+    """What comes to one site.
+
+    Attributes:
+        at: per tick what arrives, in order.
+        unrecorded: ticks between the first record and the last without one: what arrives then is assumed.
+        first: the first tick that has a record.
+        last: the last one, -1 where there is none.
+    """
+
+    at: dict[int, Sequence[ArrivalEntry]]
+    unrecorded: frozenset[int]
+    first: int
+    last: int
+
+
+class PeerTicks(NamedTuple):
+    """What there is to know of a peer: its tick rate, Hz, and the last tick that it made."""
+
+    rate_hz: int
+    last: int
+
+
+def recorded_deliveries(part: SiteLog) -> Deliveries:
+    """Returns what came to a site, by its records alone."""
+    counts, rows = part.arrivals
+    entries = rows.tolist()
+    stops = np.cumsum(counts).tolist()
+    at: dict[int, Sequence[ArrivalEntry]] = {}
+    start = 0
+    for tick, stop in zip(part.tick.tolist(), stops, strict=True):
+        at[tick] = [entry for entry in entries[start:stop] if 0 <= entry[0] < len(part.peers)]
+        start = stop
+    return Deliveries(at, frozenset(), min(at, default=0), max(at, default=-1))
+
+
+def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveries:
+    """Returns what came to a site at every tick from its first record to its last.
+
+    At ticks without a record come those samples that no record lists and that can have come there: after
+    they were sent, behind the last one before them that a record lists, before the first one after them, as
+    near as can be to when they would have come by the median of their link.
+
+    Args:
+        part: the site's records.
+        senders: its peers, in scenario order.
+
+    Raises:
+        LogError: fewer than half of those ticks have a record.
+    """
+    known = recorded_deliveries(part)
+    at, ticks = known.at, known.last + 1 - known.first
+    if len(at) == ticks:
+        return known
+    if 2 * len(at) < ticks:
+        raise LogError(
+            f"{part.name} has records of {len(at)} of {ticks} ticks: too few to execute what lies between"
+        )
+    missing = [tick for tick in range(known.first, known.last) if tick not in at]
+    assumed: dict[int, list[list[int]]] = {}
+    for peer, sender in enumerate(senders):
+        for tick, entry in _assumed(known, missing, part.rate_hz, peer, sender):
+            assumed.setdefault(tick, []).append(entry)
+    filled = at | {tick: sorted(came) for tick, came in assumed.items()}
+    return known._replace(at=filled, unrecorded=frozenset(missing))
+
+
+def _first_ticks(came: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
+    """Returns of every sample of a peer that came when it first did: the tick, and the us of its entry."""
+    first: dict[int, tuple[int, int]] = {}
+    for k in sorted(came.at):
+        for j, tick, us in came.at[k]:
+            if j == peer and tick >= 0:
+                first.setdefault(tick, (k, us))
+    return first
+
+
+def _assumed(
+    known: Deliveries, missing: list[int], rate_hz: int, peer: int, sender: PeerTicks
+) -> Iterator[tuple[int, list[int]]]:
+    """Yields at which missing tick each sample of a peer came that no record lists."""
+    first = _first_ticks(known, peer)
+    listed = sorted(first)
+    lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // sender.rate_hz for m in listed]
+    lag_ns = median_low(lags_ns) if lags_ns else NS_PER_S // rate_hz
+    delay_us = median_low(us for _, us in first.values()) if first else 0
+    newest = min(sender.last, known.last * sender.rate_hz // rate_hz)
+    for m in range(newest + 1):
+        due = -(-(m * NS_PER_S // sender.rate_hz + lag_ns) * rate_hz // NS_PER_S)
+        if m in first or due < known.first:
+            continue
+        place = bisect_left(listed, m)
+        before = first[listed[place - 1]][0] if place else known.first
+        behind = first[listed[place]][0] if place < len(listed) else known.last
+        sent = m * rate_hz // sender.rate_hz + 1  # nothing comes before it was sent
+        tick = _nearest(missing, due, max(min(before, behind), sent), max(before, behind))
+        if tick is not None:
+            yield tick, [peer, m, delay_us]
+
+
+def _nearest(missing: list[int], due: int, low: int, high: int) -> int | None:
+    """Returns the missing tick from `low` to `high` that is nearest to `due`, or None."""
+    start, stop = bisect_left(missing, low), bisect_left(missing, high + 1)
+    if start >= stop:
+        return None
+    place = min(max(bisect_left(missing, due), start), stop - 1)
+    before = max(place - 1, start)
+    return min(missing[place], missing[before], key=lambda tick: abs(tick - due))
+
+
+def retime_deliveries(
+    came: Deliveries, rate_hz: int, new_rate_hz: int, rates_hz: Sequence[int], new_rates_hz: Sequence[int]
+) -> Deliveries:
+    """Returns the same network for sites that tick at other rates.
+
+    A sample is under way for as long as the last sample of the log that was not stamped later, from its
+    stamp to the tick that took it in; where that one never came, it does not come either.
+
+    Args:
+        came: what came to a site by the log.
+        rate_hz: its rate in the log.
+        new_rate_hz: its rate in the rerun.
+        rates_hz: per peer the rate in the log.
+        new_rates_hz: per peer the rate in the rerun.
+    """
+    end_ns = came.last * NS_PER_S // rate_hz
+    at: dict[int, list[ArrivalEntry]] = {}
+    for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
+        first = _first_ticks(came, peer)
+        for m in range(end_ns * new_hz // NS_PER_S + 1):
+            stamp_ns = m * NS_PER_S // new_hz
+            model = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
+            if model in first:
+                k, us = first[model]
+                lag_ns = k * NS_PER_S // rate_hz - model * NS_PER_S // old_hz
+                tick = -(-(stamp_ns + lag_ns) * new_rate_hz // NS_PER_S)
+                at.setdefault(tick, []).append((peer, m, us))
+    return Deliveries(dict(at), frozenset(), 0, end_ns * new_rate_hz // NS_PER_S)

@@ -1,0 +1,391 @@
+"""The file of a log while it is written: `run.mcap.active` first, `run.mcap` once it is complete.
+
+Invariant: flushed data survives the death of the process, synced data a loss of power. Only a finished
+log bears the final name, and nothing is replaced without `force`. Disk space for the end of the file is
+reserved, so that a full disk ends the file in order, with all data given to it. Syncing runs in a thread
+unless `durable` is set.
+"""
+
+import errno
+import os
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+from ..errors import LogRefused, UsageError
+from ..files import refuse_existing_log, sync_folder
+from ..net import topics
+from ..net.clock import SystemClock
+from .log_layout import active_path
+from .mcap_writer import MAGIC
+
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""What a disk says that takes no more."""
+RESERVE_STEP_BYTES = 1 << 19
+"""It grows by this."""
+
+
+class DiskReserve:
+    """A file without a name.
+
+    Args:
+        folder: where it lies, on the disk that it keeps room on.
+
+    Attributes:
+        size: how much room it keeps, bytes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.size = 0
+        self._folder = folder
+        self._file: BinaryIO | None = None
+        self._possible = True
+
+    def grow(self, size: int) -> None:
+        """Keeps room for `size` bytes at least.
+
+        Raises:
+            OSError: the disk has no room for it.
+        """
+        if not self._possible or size <= self.size:
+            return
+        wanted = -(-size // RESERVE_STEP_BYTES) * RESERVE_STEP_BYTES
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+            _allocate(self._file.fileno(), self.size, wanted)
+        except OSError as error:
+            if error.errno in DISK_FULL_ERRNOS:
+                raise
+            self.release()  # no such thing on this disk
+        else:
+            self.size = wanted
+
+    def release(self) -> None:
+        """Gives the room back, for good."""
+        self._possible = False
+        self.size = 0
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _allocate(descriptor: int, begin: int, end: int) -> None:
+    """Makes a file that long, with every block of it on the disk."""
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(descriptor, begin, end - begin)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
+                raise
+    os.lseek(descriptor, begin, os.SEEK_SET)
+    written = 0
+    while written < end - begin:
+        written += os.write(descriptor, bytes(end - begin - written))
+
+
+SYNC_PERIOD_NS = 1_000_000_000
+"""How often, where it is not at once."""
+
+
+class FileSync:
+    """The syncing of one file.
+
+    Args:
+        descriptor: the file's.
+        durable: at once, each time; else once a second, in a thread beside.
+        now_ns: the time.
+    """
+
+    def __init__(self, descriptor: int, durable: bool, now_ns: Callable[[], int]) -> None:
+        self._descriptor, self._durable, self._now_ns = descriptor, durable, now_ns
+        self._done_ns = now_ns()
+        self._beside: threading.Thread | None = None
+        self._trouble: OSError | None = None
+
+    def due(self) -> None:
+        """Is called when there is something new; puts it onto the disk, or sees to it.
+
+        Raises:
+            OSError: the disk refuses now, or refused what was there before.
+        """
+        if self._durable:
+            _datasync(self._descriptor)
+            return
+        if self._trouble is not None:
+            raise self._trouble
+        now_ns = self._now_ns()
+        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (self._beside and self._beside.is_alive()):
+            self._done_ns = now_ns
+            self._beside = threading.Thread(target=self._run, name="sync", daemon=True)
+            self._beside.start()
+
+    def _run(self) -> None:
+        try:
+            _datasync(self._descriptor)
+        except OSError as error:
+            self._trouble = error
+
+    def wait(self) -> None:
+        """Returns once nothing is under way beside; after it the file may be closed."""
+        if self._beside is not None:
+            self._beside.join()
+
+
+def _datasync(descriptor: int) -> None:
+    """Puts a file's content onto the disk, and as much of what is known of it as reading it back needs."""
+    getattr(os, "fdatasync", os.fsync)(descriptor)
+
+
+RESERVE_MARGIN_BYTES = 1 << 16
+"""Room that is kept for the accounts."""
+_ELSEWHERE = "take another disk with -o"
+_ADVICE = {
+    errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
+    errno.EDQUOT: ("your quota of the disk is used up", f"make room, or {_ELSEWHERE}"),
+    errno.EFBIG: ("the file system takes no longer file", "split the log, as in --split-size 1000"),
+    errno.EIO: ("the disk fails", _ELSEWHERE),
+    errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
+}
+
+
+class ReservedSpace(Protocol):
+    """What keeps room on the disk, see `Ballast`."""
+
+    def grow(self, size: int) -> None:
+        """Keeps room for so many bytes."""
+
+    def release(self) -> None:
+        """Gives it back."""
+
+
+class LogFile:
+    """A file that is written in order and survives whatever ends that.
+
+    What is written stays in memory until `flush`, so that the file always ends where a flush ended.
+
+    Args:
+        path: its name once it is whole.
+        force: whether it may replace what exists.
+        durable: whether every flush puts it onto the disk; else that happens once a second, beside.
+        working: its name until then; by default `active(path)`.
+        room: what keeps room for its end; by default a `Ballast` beside it.
+        opened: opens a file without a buffer, by name and mode.
+        now_ns: the time.
+
+    Attributes:
+        path: its name once it is whole.
+        working: its name until then.
+        size: how many bytes it has; all of them were flushed.
+        trouble: what the disk refused first, or None.
+
+    Raises:
+        UsageError: it exists, or cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        force: bool = False,
+        durable: bool = False,
+        working: Path | None = None,
+        room: ReservedSpace | None = None,
+        opened: Callable[[Path, str], Any] | None = None,
+        now_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self.path, self.working = path, working or active_path(path)
+        self.size = 0
+        self.trouble: OSError | None = None
+        self._force = force
+        try:
+            refuse_existing_log(path, self.working, force=force)
+            self._raw = (opened or _opened)(self.working, "wb" if force else "xb")
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+        sync_folder(path.parent)
+        self._room = room or DiskReserve(path.parent)
+        self._syncing = FileSync(self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns)
+        self._pending, self._done = bytearray(), 0
+        self._owed = 0
+        self._tail = b""
+        self._broken = self._closed = self._published = False
+
+    def write(self, data: bytes, /) -> int:
+        """Takes bytes, to be written by the next `flush`."""
+        self._pending += data
+        return len(data)
+
+    def reserve(self, size: int) -> None:
+        """Is told how many bytes the end of the file will take."""
+        self._owed = size
+
+    def flush(self) -> None:
+        """Hands everything to the operating system, in one piece where it takes that.
+
+        Raises:
+            OSError: the disk refuses. The first time, what was pending has been written all the same if the
+                room that was kept for it sufficed. The end of the file may follow, and nothing else.
+        """
+        if self._broken and self.trouble:
+            raise self.trouble
+        try:
+            if self._pending and not self.trouble:
+                self._room.grow(len(self._pending) + self._owed + RESERVE_MARGIN_BYTES)
+            self._put()
+            if not self.trouble:
+                self._syncing.due()
+        except OSError as error:
+            self.trouble = self.trouble or error
+            self._room.release()
+            try:
+                self._put()
+            except OSError:
+                self._cut()
+            raise
+
+    def _put(self) -> None:
+        """Writes what is pending, or the rest of it."""
+        while self._done < len(self._pending):
+            taken = self._raw.write(memoryview(self._pending)[self._done :])
+            if not taken:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            self._done += taken
+        self._tail = bytes((self._tail + self._pending[-len(MAGIC) :])[-len(MAGIC) :])
+        self.size += self._done
+        self._pending, self._done = bytearray(), 0
+
+    def _cut(self) -> None:
+        """Takes back what could not be written whole: the file ends where the last flush ended."""
+        self._broken = True
+        self._pending, self._done = bytearray(), 0
+        with suppress(OSError):
+            self._raw.truncate(self.size)
+
+    @property
+    def whole(self) -> bool:
+        """True once the file ends with its end mark."""
+        return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
+
+    def close(self) -> None:
+        """Closes the file, and gives it its name if it is whole; what is empty is removed.
+
+        Raises:
+            UsageError: its name is taken by now.
+            OSError: the disk refuses.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        self._syncing.wait()
+        try:
+            if self.whole:
+                os.fsync(self._raw.fileno())
+        except OSError as error:
+            self.trouble = self.trouble or error
+            raise
+        finally:
+            self._raw.close()
+            self._room.release()
+        if self.whole:
+            self._publish()
+            self._published = True
+        elif not self.size:
+            self.working.unlink(missing_ok=True)
+        sync_folder(self.path.parent)
+
+    def discard(self) -> None:
+        """Closes the file and removes it, whatever is in it."""
+        with suppress(OSError):
+            self.close()
+        self.working.unlink(missing_ok=True)
+        self.size = 0
+
+    def _publish(self) -> None:
+        if self._force:
+            self.working.replace(self.path)
+            return
+        try:
+            os.link(self.working, self.path)  # unlike a renaming it never replaces
+            self.working.unlink()
+        except FileExistsError:
+            raise UsageError(
+                f"{self.path}: exists by now; the finished log is {self.working}: give it a name"
+            ) from None
+        except OSError:  # a file system without links
+            refuse_existing_log(self.path, self.path, force=False)
+            self.working.rename(self.path)
+
+    def refused(self, error: OSError) -> LogRefused:
+        """Returns what to say of a file that the disk refused, once it is closed."""
+        what, advice = _ADVICE.get(error.errno or 0, (error.strerror or str(error), _ELSEWHERE))
+        if self._published:
+            return LogRefused(
+                f"{self.path}: {what}; the log ends there, finished, with {_content(self.path)}; {advice}"
+            )
+        if not self.size:
+            return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
+        return LogRefused(
+            f"{self.working}: {what}, even for the end of the log; its {self.size / 1e6:.1f} MB up to the "
+            f"last whole chunk are kept; {advice}; make it whole with: trilat log recover {self.working}"
+        )
+
+
+def _opened(path: Path, mode: str) -> Any:
+    return path.open(mode, buffering=0)
+
+
+def _content(path: Path) -> str:
+    """Returns what is in a finished file, in words."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = summary.statistics.channel_message_counts
+    topic = {number: channel.topic for number, channel in summary.channels.items()}
+    records = sum(count for n, count in counts.items() if topic[n].endswith(f"/{topics.STATE}"))
+    return f"{records} records and {summary.statistics.message_count - records} other messages"
+
+
+@contextmanager
+def open_new_log(path: Path, *, force: bool = False, durable: bool = False) -> Iterator[LogFile]:
+    """Opens a log for writing; at the end closes it, and gives it its name if it was finished.
+
+    Args:
+        path: its name.
+        force: whether it may replace what exists.
+        durable: whether every flush puts it onto the disk.
+
+    Raises:
+        UsageError: it exists, or cannot be made.
+        LogRefused: the disk refused something; says what is kept, and where.
+    """
+    with close_log_file(LogFile(path, force=force, durable=durable)) as file:
+        yield file
+
+
+@contextmanager
+def close_log_file(file: LogFile) -> Iterator[LogFile]:
+    """Closes a log's file at the end, whatever ends it, and says what is kept where the disk refused.
+
+    Raises:
+        LogRefused: the disk refused something.
+    """
+    refused: LogRefused | None = None
+    try:
+        yield file
+    except LogRefused as error:
+        refused = error
+    finally:
+        try:
+            file.close()
+        except OSError as error:
+            raise file.refused(file.trouble or error) from None
+    if refused is not None:
+        raise (refused if file.trouble is None else file.refused(file.trouble)) from None

@@ -1,0 +1,164 @@
+"""Layout of a log: names of files, metadata and channels, the channel filter, and provenance.
+
+Invariant: a channel that the filter excludes is neither in the file nor in its accounts, and the file
+states the filter. Provenance holds versions, commit and platform, but no path, time or host name.
+"""
+
+import platform
+import re
+import subprocess
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+
+from ..core.fingerprint import compute_fingerprint
+from ..errors import UsageError
+from ..net import topics
+from ..net.bus import matches_key
+from ..net.messages import Event, LinkStats, RecorderStats, State
+
+ACTIVE_SUFFIX = ".active"
+"""What a file's name ends with until it is whole."""
+_NUMBER = re.compile(r"(.+)-(\d{3,})")
+
+
+def active_path(path: Path) -> Path:
+    """Returns where a log is while it is written."""
+    return (
+        path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
+    )  # "." is a folder, and refused as one
+
+
+def describe_unfinished(path: Path) -> str:
+    """Returns what to say besides where a log is not there, but one that was not finished is; else ""."""
+    if path.exists() or not active_path(path).exists():
+        return ""
+    torn = active_path(path)
+    return f"; {torn} is there, which was not finished; make it whole with: trilat log recover {torn}"
+
+
+def part_path(path: Path, number: int) -> Path:
+    """Returns the name of a part: that of the log with a number, or the log's own for part 0."""
+    return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
+
+
+def find_parts(path: Path) -> dict[int, Path]:
+    """Returns the files of a log that are there, finished or not, by number; one without number is part 1."""
+    found: dict[int, Path] = {}
+    for name in (path, active_path(path)):
+        if name.exists():
+            found.setdefault(1, name)
+    for name in sorted(path.parent.glob(f"{_literal(path.stem)}-*")):
+        bare = name.with_name(name.name.removesuffix(ACTIVE_SUFFIX))
+        number = _NUMBER.fullmatch(bare.stem)
+        if number and number[1] == path.stem and bare.suffix == path.suffix:
+            found.setdefault(int(number[2]), name)
+    return found
+
+
+def _literal(text: str) -> str:
+    """Returns a text as a glob that matches nothing else."""
+    return re.sub(r"([*?\[])", r"[\1]", text)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFilter:
+    """What is taken.
+
+    Attributes:
+        include: key expressions of the only channels that are; none: all.
+        exclude: key expressions of channels that are not.
+    """
+
+    include: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+
+    def takes(self, key: str) -> bool:
+        """Says whether a channel is taken."""
+        if any(matches_key(expression, key) for expression in self.exclude):
+            return False
+        return not self.include or any(matches_key(expression, key) for expression in self.include)
+
+    def facts(self) -> Mapping[str, str]:
+        """Returns what the file says of it; nothing where all is taken."""
+        told = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
+        return {name: text for name, text in told.items() if text}
+
+
+ALL_CHANNELS = ChannelFilter()
+
+
+def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
+    """Returns what a person asks for; a leading slash, as topics have it, is fine.
+
+    Raises:
+        UsageError: a text is no key expression: it would match nothing, and say nothing.
+    """
+    for option, texts in (("--include", include), ("--exclude", exclude)):
+        for text in texts:
+            if not all(_is_chunk(chunk) for chunk in text.strip("/").split("/")):
+                raise UsageError(
+                    f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, * for one of "
+                    f"them, ** for any number, $* for a part of one; not {text!r}"
+                )
+    return ChannelFilter(
+        tuple(text.strip("/") for text in include), tuple(text.strip("/") for text in exclude)
+    )
+
+
+def _is_chunk(chunk: str) -> bool:
+    rest = chunk.replace("$*", "")
+    return chunk in ("*", "**") or bool(chunk and not set(rest) & set("*$#?"))
+
+
+_PACKAGES = ("trilat-net", "numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
+
+
+def _git(*arguments: str) -> str | None:
+    """Returns what git prints about this source tree, or None where it is no checkout."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+@cache
+def collect_provenance() -> dict[str, str]:
+    """Returns what a log must say of the program that made it."""
+    commit = _git("rev-parse", "HEAD")
+    changed = _git("status", "--porcelain", "--untracked-files=no")
+    facts = {
+        "commit": commit or "unknown",
+        "commit_dirty": "unknown" if changed is None else str(bool(changed)).lower(),
+        "fingerprint": compute_fingerprint(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "python": f"{platform.python_implementation()} {platform.python_version()}",
+    }
+    for package in _PACKAGES:
+        try:
+            facts[f"version_{package}"] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            facts[f"version_{package}"] = "unknown"
+    return facts
+
+
+SESSION, PART, ACCOUNTS, SCENARIO = "trilat.session", "trilat.part", "trilat.accounts", "scenario.toml"
+CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
+    topics.STATE: State,
+    topics.LINK: LinkStats,
+    topics.EVENT: Event,
+    topics.STATS: RecorderStats,
+}
+SITE_CHANNELS = (topics.STATE, topics.LINK, topics.EVENT)
+"""Channels of a site, each with a number per message that tells what is missing."""
+RECORDER_CHANNELS = (topics.EVENT, topics.STATS)

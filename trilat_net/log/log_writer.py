@@ -1,0 +1,472 @@
+"""Writer of a session's log into one MCAP file or into parts: `run-001.mcap`, `run-002.mcap`, ...
+
+Invariant (L5): a file explains itself from its first bytes on: session, scenario and schemas precede the
+first message, payloads are stored byte for byte as published, and the accounts stand at the end. Each
+part repeats session, scenario and schemas and names the part before it; a message is in exactly one part.
+The file changes between two messages, on the writing thread.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from ..core.ticks import TickRecord
+from ..errors import LogRefused, UsageError
+from ..files import make_log_refused, refuse_existing_log
+from ..net import topics
+from ..net.messages import VERSION, Event, LinkStats, State, json_schema
+from ..scenario import Scenario
+from .log_file import LogFile
+from .log_layout import (
+    ACCOUNTS,
+    ACTIVE_SUFFIX,
+    ALL_CHANNELS,
+    CHANNEL_TYPES,
+    PART,
+    RECORDER_CHANNELS,
+    SCENARIO,
+    SESSION,
+    SITE_CHANNELS,
+    ChannelFilter,
+    active_path,
+    collect_provenance,
+    find_parts,
+    part_path,
+)
+from .mcap_writer import McapWriter, Sink
+from .ros2 import cdr
+from .ros2.viz_channels import MAX_PENDING_BYTES, TakeMessage, VizChannels
+
+_LAST_NS = (1 << 64) - 1  # of the file's time stamps; a stranger's may be anything
+
+
+class LogWriter:
+    """One log, from its header to its last account.
+
+    Args:
+        stream: where the bytes go, opened for writing.
+        scenario: the resolved scenario.
+        session: the session's name.
+        driver: "live" or "virtual".
+        epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
+        facts: what else to say of the session.
+        part: which part of a log this is, where it has several.
+        choice: which channels it takes.
+        views_hz: messages a second of the standard channels beside its own, see `views`; 0 for none.
+
+    Raises:
+        LogRefused: the disk refused.
+    """
+
+    def __init__(
+        self,
+        stream: Sink,
+        scenario: Scenario,
+        session: str,
+        driver: str,
+        epoch_unix_ns: int,
+        facts: Mapping[str, str] | None = None,
+        *,
+        part: Mapping[str, str] | None = None,
+        choice: ChannelFilter = ALL_CHANNELS,
+        views_hz: float = 0.0,
+    ) -> None:
+        self._epoch_unix_ns = epoch_unix_ns
+        self._over = ""  # why nothing more can be added
+        self._views = (
+            VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view) if views_hz else None
+        )
+        self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
+        self._last_log_ns = 0
+        self._standard: dict[str, int] = {}  # what there is of standard schemas and channels
+        self._file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}")
+        about = {
+            "schema_version": str(VERSION),
+            "session": session,
+            "driver": driver,
+            "scenario": scenario.name,
+            "scenario_sha256": scenario.sha256,
+            "seed": str(scenario.seed),
+            "sites": " ".join(scenario.names),
+            "epoch_unix_ns": str(epoch_unix_ns),
+        }
+        with self._refusing():
+            self._file.add_metadata(
+                SESSION, {**about, **collect_provenance(), **choice.facts(), **(facts or {})}
+            )
+            if part:
+                self._file.add_metadata(PART, part)
+            self._file.add_attachment(0, 0, SCENARIO, "application/toml", scenario.text.encode())
+            self._channels = self._register(scenario, session, choice)
+            self._file.flush()
+
+    def _register(self, scenario: Scenario, session: str, choice: ChannelFilter) -> dict[str, int | None]:
+        """Returns the channel of every key of the session; None where it is not to be taken."""
+        schemas = {
+            name: self._file.register_schema(
+                f"trilat.{kind.__name__}.v{VERSION}", "jsonschema", json.dumps(json_schema(kind)).encode()
+            )
+            for name, kind in CHANNEL_TYPES.items()
+        }
+        channels: dict[str, int | None] = {}
+        for member in (*scenario.names, topics.RECORDER):
+            for name in SITE_CHANNELS if member != topics.RECORDER else RECORDER_CHANNELS:
+                key = topics.key(session, member, name)
+                rate = {"rate_hz": str(scenario.sites[member].rate_hz)} if name == topics.STATE else {}
+                channels[key] = None
+                if choice.takes(key):
+                    channels[key] = self._file.register_channel(
+                        f"/{key}", "msgpack", schemas[name], {"member": member, **rate}
+                    )
+        return channels
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the messages that have a channel in the file."""
+        return tuple(key for key, channel in self._channels.items() if channel is not None)
+
+    @property
+    def ended(self) -> bool:
+        """True once nothing more can be added: it is finished, or the disk has refused."""
+        return bool(self._over)
+
+    @property
+    def messages(self) -> int:
+        """How many messages it has."""
+        return self._file.messages
+
+    @property
+    def written_bytes(self) -> int:
+        """How many bytes were written so far."""
+        return self._file.position
+
+    @property
+    def most_bytes(self) -> int:
+        """How long the file would be at most, its accounts aside, if it were finished now."""
+        views = MAX_PENDING_BYTES * len(self._views.lanes) if self._views is not None else 0
+        return self._file.position + self._file.pending + self._file.owed + views
+
+    def add(
+        self,
+        key: str,
+        payload: bytes,
+        t_ns: int,
+        log_time_ns: int,
+        number: int,
+        message: State | TickRecord | LinkStats | Event | None = None,
+    ) -> None:
+        """Writes one message, if the log takes its channel.
+
+        Args:
+            key: its key: a channel of the session.
+            payload: its bytes.
+            t_ns: when it was sent, ns since the epoch.
+            log_time_ns: when it arrived, Unix ns.
+            number: its sequence number.
+            message: what it says, for those who cannot read its bytes.
+
+        Raises:
+            LogRefused: the disk refused, now (then this message is the last one) or before.
+        """
+        if self._over:
+            raise LogRefused(self._over)
+        channel = self._channels[key]
+        if channel is None:
+            return
+        self._last_log_ns = log_time_ns
+        sent_ns = self._epoch_unix_ns + t_ns
+        with_number = number & 0xFFFFFFFF if number >= 0 else 0
+        try:
+            self._file.add_message(channel, log_time_ns, payload, min(max(0, sent_ns), _LAST_NS), with_number)
+            if message is not None and (take := self._takers.get(key)) is not None:
+                take(message, log_time_ns)
+        except OSError as error:
+            raise self._refused(error) from None
+
+    def _put_view(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
+        """Writes a message of a standard channel, which is made when its first one comes."""
+        channel = self._standard.get(topic)
+        if channel is None and self._views is not None:
+            kind, about = self._views.channels[topic]
+            if kind not in self._standard:
+                schema = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind])
+                self._standard[kind] = schema
+            channel = self._file.register_channel(topic, cdr.ENCODING, self._standard[kind], about)
+            self._standard[topic] = channel
+        if channel is not None:
+            self._file.add_message(channel, log_ns, data, min(publish_ns, _LAST_NS))
+
+    def flush(self) -> None:
+        """Closes the open chunk and hands it to the operating system: a crash loses nothing before it.
+
+        Raises:
+            LogRefused: the disk refused.
+        """
+        with self._refusing():
+            self._file.flush()
+
+    def finish(self, accounts: Mapping[str, str]) -> None:
+        """Writes the accounts, the index and the end mark, once; the stream stays open.
+
+        Args:
+            accounts: per topic what arrived and what is missing; and what else was counted, by name. Those
+                of channels that the log does not take are left out.
+
+        Raises:
+            LogRefused: the disk refused.
+        """
+        if self._over == _FINISHED:
+            return
+        whole, self._over = not self._over, _FINISHED
+        left_out = {f"/{key}" for key, channel in self._channels.items() if channel is None}
+        with self._refusing():
+            try:
+                if self._views is not None and whole:
+                    self._views.finish(self._last_log_ns)
+            finally:
+                self._file.add_metadata(
+                    ACCOUNTS, {name: text for name, text in accounts.items() if name not in left_out}
+                )
+                self._file.finish()
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise self._refused(error) from None
+
+    def _refused(self, error: OSError) -> LogRefused:
+        refused = make_log_refused(error)
+        self._over = self._over or str(refused)
+        return refused
+
+
+_FINISHED = "the log is finished"
+
+ACCOUNTS_BYTES = 16 << 10
+"""Room that the accounts of a part may take, and the views that go with one message."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogStorage:
+    """Where a log goes, and how.
+
+    Attributes:
+        path: its name; parts add their number to it.
+        force: whether it may replace what exists.
+        durable: whether every flush puts it onto the disk.
+        split_bytes: no part is longer than this.
+        split_ns: nor does one take messages over a longer time.
+        carry_on: where there is a log of that name, finished or not, write the part after it.
+        choice: which channels it takes.
+        views_hz: messages a second of the standard channels beside its own, see `views`; 0 for none.
+    """
+
+    path: Path
+    force: bool = False
+    durable: bool = False
+    split_bytes: int | None = None
+    split_ns: int | None = None
+    carry_on: bool = False
+    choice: ChannelFilter = ALL_CHANNELS
+    views_hz: float = 0.0
+
+    @property
+    def splits(self) -> bool:
+        """Whether it is to have parts from the start."""
+        return self.split_bytes is not None or self.split_ns is not None
+
+    def first(self) -> tuple[int, str]:
+        """Returns the number of the part to begin with, 0 for a log without parts; and which is before it.
+
+        Raises:
+            UsageError: the name is taken, and not just one of `force` and `carry_on` is given.
+        """
+        if self.carry_on and self.force:
+            raise UsageError("--continue keeps what exists, --force replaces it; give one of them")
+        there = find_parts(self.path)
+        if self.carry_on and there:
+            last = max(there)
+            return last + 1, there[last].name.removesuffix(ACTIVE_SUFFIX)
+        refuse_existing_log(self.path, active_path(self.path), force=self.force)
+        if self.splits and there and not self.force:
+            raise UsageError(
+                f"{there[max(there)]}: exists; choose another name, carry on behind it with --continue, or "
+                "replace it with --force"
+            )
+        return int(self.splits), ""
+
+
+def make_log_storage(
+    path: Path,
+    *,
+    split_mib: float | None,
+    split_s: float | None,
+    choice: ChannelFilter,
+    force: bool,
+    carry_on: bool,
+    durable: bool,
+    views_hz: float = 0.0,
+) -> LogStorage:
+    """Returns what a person asks for; see `Storage`.
+
+    Raises:
+        UsageError: a part cannot be that small or that large.
+    """
+    if split_mib is not None and not 1.0 <= split_mib <= 1e6:
+        raise UsageError(f"--split-size is a number of MiB from 1 to 1e6, not {split_mib:g}")
+    if split_s is not None and not 1.0 <= split_s <= 1e6:
+        raise UsageError(f"--split-duration is a number of seconds from 1 to 1e6, not {split_s:g}")
+    return LogStorage(
+        path,
+        force=force,
+        durable=durable,
+        split_bytes=None if split_mib is None else int(split_mib * (1 << 20)),
+        split_ns=None if split_s is None else int(split_s * 1e9),
+        carry_on=carry_on,
+        choice=choice,
+        views_hz=views_hz,
+    )
+
+
+class LogParts:
+    """A `LogWriter` over as many files as it takes; to be used in a `with` statement.
+
+    Args:
+        storage: where it goes.
+        begin: begins the log in a file; told what to say of the part, nothing of a log without parts.
+        opened: opens a file by name; else `LogFile`.
+
+    Attributes:
+        so_far: the accounts, to stand in a part that is full.
+
+    Raises:
+        UsageError: the name is taken, or the file cannot be made.
+        LogRefused: the disk refused.
+    """
+
+    def __init__(
+        self,
+        storage: LogStorage,
+        begin: Callable[[Sink, Mapping[str, str]], LogWriter],
+        opened: Callable[[Path], LogFile] | None = None,
+    ) -> None:
+        self.so_far: Callable[[], Mapping[str, str]] = dict
+        self._storage, self._begin_log = storage, begin
+        self._opened = opened or self._open_file
+        self._number, self._previous = storage.first()
+        if storage.force and storage.splits:
+            _remove(storage.path)
+        self._since_ns: int | None = None
+        self._before_bytes = 0
+        self._begin()
+
+    def _open_file(self, path: Path) -> LogFile:
+        return LogFile(path, force=self._storage.force, durable=self._storage.durable)
+
+    def _begin(self) -> None:
+        """Begins a part."""
+        path = part_path(self._storage.path, self._number)
+        part = {"index": str(self._number), "previous": self._previous} if self._number else {}
+        self._file = file = self._opened(path)
+        try:
+            self._writer = self._begin_log(file, part)
+        except LogRefused as error:
+            file.discard()
+            raise (error if file.trouble is None else file.refused(file.trouble)) from None
+        self._since_ns = None
+        self._previous = path.name
+
+    def _roll(self) -> None:
+        """Ends a part and begins the next one."""
+        self._writer.finish(self.so_far())
+        self._before_bytes += self._writer.written_bytes
+        self._close()
+        self._number += 1
+        try:
+            self._begin()
+        except UsageError as error:  # the caller's no more: the disk took the parts before
+            raise LogRefused(f"{error}; the log ends with {self._previous}") from None
+
+    def _full(self, payload: bytes, log_time_ns: int) -> bool:
+        """True where a message belongs into the next part."""
+        limit, writer = self._storage, self._writer
+        if limit.split_ns is not None:
+            if self._since_ns is None:
+                self._since_ns = log_time_ns
+            elif log_time_ns - self._since_ns >= limit.split_ns:
+                return True
+        return (
+            limit.split_bytes is not None
+            and writer.messages > 0
+            and writer.most_bytes + len(payload) + ACCOUNTS_BYTES > limit.split_bytes
+        )
+
+    @property
+    def path(self) -> Path:
+        """Name of the file that is being written, once it is whole."""
+        return self._file.path
+
+    @property
+    def written_bytes(self) -> int:
+        """How many bytes all parts have so far."""
+        return self._before_bytes + self._writer.written_bytes
+
+    @property
+    def ended(self) -> bool:
+        """True once nothing more can be added: it is finished, or the disk has refused."""
+        return self._writer.ended
+
+    def add(
+        self,
+        key: str,
+        payload: bytes,
+        t_ns: int,
+        log_time_ns: int,
+        number: int,
+        message: State | TickRecord | LinkStats | Event | None = None,
+    ) -> None:
+        """Writes one message; see `LogWriter.add`."""
+        if self._storage.splits and not self._writer.ended and self._full(payload, log_time_ns):
+            self._roll()
+            self._since_ns = log_time_ns
+        self._writer.add(key, payload, t_ns, log_time_ns, number, message)
+
+    def flush(self) -> None:
+        """Hands everything so far to the operating system; see `LogWriter.flush`."""
+        self._writer.flush()
+
+    def finish(self, accounts: Mapping[str, str]) -> None:
+        """Ends the last part; see `LogWriter.finish`."""
+        self._writer.finish(accounts)
+
+    def _close(self) -> None:
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._file.refused(self._file.trouble or error) from None
+
+    def __enter__(self) -> "LogParts":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Closes the last part, and says what is kept where the disk refused."""
+        self._close()
+        if isinstance(error, LogRefused) and self._file.trouble is not None:
+            raise self._file.refused(self._file.trouble) from None
+
+
+def _remove(path: Path) -> None:
+    """Removes a log that is replaced, and all its parts: what was left of them would seem to belong to it."""
+    for name in (path, *(part_path(path, number) for number in find_parts(path))):
+        name.unlink(missing_ok=True)
+        active_path(name).unlink(missing_ok=True)

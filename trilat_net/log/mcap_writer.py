@@ -1,0 +1,287 @@
+"""Writer of an MCAP file: records into chunks, chunks into a stream, an index at the end.
+
+Invariant: the same calls give the same bytes; memory grows only by the packed index of the chunks; the
+length of the end of the file is known at any time, so that disk space for it can be reserved.
+
+Not `mcap.writer.Writer`: it keeps a dictionary per chunk, 46 MiB an hour at ten chunks a second of twelve
+channels, and takes three times as long. The tests read this writer's files with that package.
+"""
+
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+import zstandard
+from mcap.opcode import Opcode
+
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a file."""
+CHUNK_BYTES = 1 << 20
+
+_OP_MESSAGE = int(Opcode.MESSAGE)  # a member of an enumeration packs slowly
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
+_CHUNK = struct.Struct("<QQQI")
+_FOOTER = struct.Struct("<BQQQI")
+_STATISTICS = struct.Struct("<QHIIIIQQ")
+_COMPRESSION = "zstd"
+_OWED_ALWAYS = 512  # statistics without its counts, offsets of six groups, data end, footer, end mark
+
+
+class Sink(Protocol):
+    """Where bytes go: any file, or what keeps them until `flush`."""
+
+    def write(self, data: bytes, /) -> int:
+        """Takes bytes and returns how many."""
+
+    def flush(self) -> None:
+        """Hands them on."""
+
+
+@runtime_checkable
+class ReservingSink(Protocol):
+    """A `Sink` that can keep room for what is still to come."""
+
+    def reserve(self, size: int) -> None:
+        """Is told how many bytes the end of the file will take."""
+
+
+def pack_text(text: str) -> bytes:
+    """Returns a text as a record holds it: its length before it."""
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def pack_text_map(texts: Mapping[str, str]) -> bytes:
+    """Returns a map of texts as a record holds it."""
+    data = b"".join(pack_text(key) + pack_text(value) for key, value in texts.items())
+    return struct.pack("<I", len(data)) + data
+
+
+def pack_record(opcode: int, body: bytes) -> bytes:
+    """Returns a record: its kind and its length before it."""
+    return _RECORD.pack(opcode, len(body)) + body
+
+
+class McapWriter:
+    """One file, from its first byte to its end mark.
+
+    Args:
+        stream: where the bytes go. It is flushed whenever a chunk is whole.
+        library: what made it.
+        profile: the MCAP profile.
+        chunk_bytes: a chunk is closed when its records are longer than this.
+
+    Attributes:
+        position: how many bytes were written.
+        messages: how many messages were added.
+    """
+
+    def __init__(self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = CHUNK_BYTES) -> None:
+        self.position = 0
+        self.messages = 0
+        self._stream = stream
+        self._reserve = stream.reserve if isinstance(stream, ReservingSink) else None
+        self._chunk_bytes = chunk_bytes
+        self._compressor = zstandard.ZstdCompressor()
+        self._open = bytearray()
+        self._entries: dict[int, list[int]] = {}  # of the open chunk: per channel log time, offset, ...
+        self._closed = 0  # messages in chunks that are closed
+        self._counts: dict[int, int] = {}
+        self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
+        self._schemas, self._channels = bytearray(), bytearray()
+        self._schema_count = 0
+        self._chunk_index, self._chunk_count = bytearray(), 0
+        self._attachment_index, self._attachment_count = bytearray(), 0
+        self._metadata_index, self._metadata_count = bytearray(), 0
+        self._put(MAGIC + pack_record(Opcode.HEADER, pack_text(profile) + pack_text(library)))
+
+    def _put(self, data: bytes) -> int:
+        """Writes bytes and returns where they are."""
+        self._stream.write(data)
+        offset = self.position
+        self.position += len(data)
+        return offset
+
+    @property
+    def owed(self) -> int:
+        """How many bytes `finish` will still write, at most, the open chunk aside."""
+        kept = (
+            self._schemas,
+            self._channels,
+            self._chunk_index,
+            self._attachment_index,
+            self._metadata_index,
+        )
+        return sum(map(len, kept)) + 10 * len(self._counts) + _OWED_ALWAYS
+
+    @property
+    def pending(self) -> int:
+        """How many bytes the open chunk will take, at most."""
+        if not self._open:
+            return 0
+        index = 16 * (self.messages - self._closed) + 25 * len(self._entries) + 200
+        return len(self._open) + len(self._open) // 128 + index
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message in chunks that are closed, by their log times, s."""
+        first_ns, last_ns = self._span_ns or (0, 0)
+        return (last_ns - first_ns) * 1e-9
+
+    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Writes a schema and returns its number."""
+        self._schema_count += 1
+        body = struct.pack("<H", self._schema_count) + pack_text(name) + pack_text(encoding)
+        record = pack_record(Opcode.SCHEMA, body + struct.pack("<I", len(data)) + data)
+        self._schemas += record
+        self._put(record)
+        return self._schema_count
+
+    def register_channel(
+        self, topic: str, message_encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
+    ) -> int:
+        """Writes a channel and returns its number. It stands before the open chunk, and in the index.
+
+        Args:
+            topic: its topic.
+            message_encoding: how its messages are encoded.
+            schema_id: number of their schema, 0 for none.
+            metadata: what else to say of it.
+        """
+        number = len(self._counts) + 1
+        body = struct.pack("<HH", number, schema_id) + pack_text(topic) + pack_text(message_encoding)
+        record = pack_record(Opcode.CHANNEL, body + pack_text_map(metadata or {}))
+        self._channels += record
+        self._put(record)
+        self._counts[number] = 0
+        self._entries[number] = []
+        return number
+
+    def add_message(
+        self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
+    ) -> None:
+        """Adds a message to the open chunk.
+
+        Args:
+            channel_id: number of its channel.
+            log_time: when it was logged, ns.
+            data: its bytes.
+            publish_time: when it was published, ns.
+            sequence: its number.
+        """
+        opened = self._open
+        self._entries[channel_id] += (log_time, len(opened))
+        opened += _MESSAGE.pack(_OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time)
+        opened += data
+        self._counts[channel_id] += 1
+        self.messages += 1
+        if len(opened) > self._chunk_bytes:
+            self.flush()
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Writes a metadata record, before the open chunk."""
+        record = pack_record(Opcode.METADATA, pack_text(name) + pack_text_map(data))
+        index = struct.pack("<QQ", self._put(record), len(record)) + pack_text(name)
+        self._metadata_index += pack_record(Opcode.METADATA_INDEX, index)
+        self._metadata_count += 1
+
+    def add_attachment(
+        self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
+    ) -> None:
+        """Writes an attachment, before the open chunk.
+
+        Args:
+            create_time: when it was made, ns; 0 where that is unknown.
+            log_time: when it was attached, ns.
+            name: its name.
+            media_type: its media type.
+            data: its bytes.
+        """
+        times = struct.pack("<QQ", log_time, create_time)
+        names = pack_text(name) + pack_text(media_type)
+        body = times + names + struct.pack("<Q", len(data)) + data
+        record = pack_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
+        place = struct.pack("<QQ", self._put(record), len(record))
+        index = place + times + struct.pack("<Q", len(data)) + names
+        self._attachment_index += pack_record(Opcode.ATTACHMENT_INDEX, index)
+        self._attachment_count += 1
+
+    def flush(self) -> None:
+        """Closes the open chunk, if it has messages, and flushes the stream."""
+        if self._open:
+            self._close_chunk()
+        if self._reserve is not None:
+            self._reserve(self.owed)
+        self._stream.flush()
+
+    def _close_chunk(self) -> None:
+        data = self._compressor.compress(self._open)
+        used = {channel: entries for channel, entries in self._entries.items() if entries}
+        start_ns = min(min(entries[::2]) for entries in used.values())
+        end_ns = max(max(entries[::2]) for entries in used.values())
+        raw = len(self._open)
+        head = _CHUNK.pack(start_ns, end_ns, raw, zlib.crc32(self._open)) + pack_text(_COMPRESSION)
+        record = pack_record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
+        offset = self._put(record)
+        begin, places = self.position, b""
+        for channel, entries in used.items():
+            place = self._put(_index_of(channel, entries))
+            places += struct.pack("<HQ", channel, place)
+            self._entries[channel] = []
+        times = struct.pack("<QQQQ", start_ns, end_ns, offset, len(record))
+        sizes = struct.pack("<QQ", len(data), raw)
+        index = times + struct.pack("<I", len(places)) + places
+        index += struct.pack("<Q", self.position - begin) + pack_text(_COMPRESSION) + sizes
+        self._chunk_index += pack_record(Opcode.CHUNK_INDEX, index)
+        self._chunk_count += 1
+        first_ns, last_ns = self._span_ns or (start_ns, end_ns)
+        self._span_ns = min(first_ns, start_ns), max(last_ns, end_ns)
+        self._closed = self.messages
+        self._open.clear()
+
+    def _statistics(self) -> bytes:
+        head = _STATISTICS.pack(
+            self.messages,
+            self._schema_count,
+            len(self._counts),
+            self._attachment_count,
+            self._metadata_count,
+            self._chunk_count,
+            *(self._span_ns or (0, 0)),
+        )
+        counts = b"".join(struct.pack("<HQ", n, count) for n, count in self._counts.items() if count)
+        return pack_record(Opcode.STATISTICS, head + struct.pack("<I", len(counts)) + counts)
+
+    def finish(self) -> None:
+        """Closes the open chunk, writes the index and the end mark, and flushes the stream."""
+        if self._open:
+            self._close_chunk()
+        self._put(pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
+        summary = {
+            Opcode.SCHEMA: self._schemas,
+            Opcode.CHANNEL: self._channels,
+            Opcode.STATISTICS: self._statistics(),
+            Opcode.CHUNK_INDEX: self._chunk_index,
+            Opcode.ATTACHMENT_INDEX: self._attachment_index,
+            Opcode.METADATA_INDEX: self._metadata_index,
+        }
+        begin, offsets, crc = self.position, b"", 0
+        for opcode, group in summary.items():
+            if group:
+                data = bytes(group)
+                place = self._put(data)
+                crc = zlib.crc32(data, crc)
+                offsets += pack_record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, place, len(group)))
+        where = self._put(offsets)
+        footer = _FOOTER.pack(Opcode.FOOTER, 20, begin, where, 0)[:-4]
+        crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
+        self._put(footer + struct.pack("<I", crc) + MAGIC)
+        self._stream.flush()
+
+
+def _index_of(channel: int, entries: list[int]) -> bytes:
+    """Returns the index of a channel's messages in a chunk."""
+    body = struct.pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
+    return pack_record(Opcode.MESSAGE_INDEX, body)

@@ -1,0 +1,190 @@
+"""Packer of standard ROS 2 messages: CDR, little-endian; no ROS installation needed.
+
+Invariant: the bytes equal those of any other serializer. Fields are aligned to their size, counted from
+the end of the four-byte header; padding is zero. The constant layout is computed once, so that a message
+is one `struct` call.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+from ...core.ticks import NS_PER_S
+
+ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
+STRING = "std_msgs/msg/String"
+LOG = "rcl_interfaces/msg/Log"
+
+_HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
+_TIME = "int32 sec\nuint32 nanosec\n"
+_LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
+
+
+def _schema(text: str, parts: dict[str, str] = {}) -> bytes:  # noqa: B006
+    """Returns a type with those that it stands on, as recorders of ROS 2 write it."""
+    rule = "=" * 80
+    return "".join([text, *(f"{rule}\nMSG: {name}\n{part}" for name, part in parts.items())]).encode()
+
+
+ROS2_SCHEMAS: dict[str, bytes] = {
+    JOINT_STATE: _schema(
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
+        {
+            "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+            "builtin_interfaces/Time": _TIME,
+        },
+    ),
+    FLOAT64_ARRAY: _schema(
+        "std_msgs/MultiArrayLayout layout\nfloat64[] data\n",
+        {
+            "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
+            "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
+        },
+    ),
+    STRING: _schema("string data\n"),
+    LOG: _schema(
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
+        "string function\nuint32 line\n",
+        {"builtin_interfaces/Time": _TIME},
+    ),
+}
+"""The text of every type that is packed here, complete, by its name."""
+
+
+class _Fields:
+    """Fields of a message as bytes, from an offset on."""
+
+    def __init__(self, offset: int = 0) -> None:
+        self._offset = offset
+        self.data = b""
+
+    def number(self, value: int) -> None:
+        """Adds an unsigned number of 32 bits."""
+        self.data += b"\0" * (-self.end % 4) + struct.pack("<I", value)
+
+    def text(self, text: str) -> None:
+        """Adds a string."""
+        data = text.encode()
+        self.number(len(data) + 1)
+        self.data += data + b"\0"
+
+    @property
+    def end(self) -> int:
+        """The offset behind them."""
+        return self._offset + len(self.data)
+
+
+def _time(stamp_ns: int) -> tuple[int, int]:
+    """Returns a stamp as ROS 2 has it, seconds and nanoseconds."""
+    seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
+    return min(seconds, _LAST_S), rest_ns
+
+
+def _floats(offset: int, count: int) -> tuple[str, int]:
+    """Returns the format of a list of numbers, its length first, and the offset behind it."""
+    before = -offset % 4
+    start = offset + before + 4
+    gap = -start % 8 if count else 0  # an empty list has nothing to align
+    return f"{before}xI{gap}x{count}d", start + gap + 8 * count
+
+
+class JointStatePacker:
+    """Packs `sensor_msgs/msg/JointState` of some joints.
+
+    Args:
+        names: the joints.
+        frame_id: what the header calls the frame.
+        velocity: whether messages have velocities.
+        effort: whether they have efforts.
+    """
+
+    def __init__(
+        self, names: Sequence[str], frame_id: str = "", *, velocity: bool = True, effort: bool = True
+    ) -> None:
+        fields = _Fields(8)  # behind the stamp
+        fields.text(frame_id)
+        fields.number(len(names))
+        for name in names:
+            fields.text(name)
+        self._counts = [len(names) * present for present in (True, velocity, effort)]
+        form, offset = f"<4siI{len(fields.data)}s", fields.end
+        for count in self._counts:
+            part, offset = _floats(offset, count)
+            form += part
+        self._names = fields.data
+        self._pack = struct.Struct(form).pack
+
+    def pack(
+        self,
+        stamp_ns: int,
+        position: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> bytes:
+        """Returns one message.
+
+        Args:
+            stamp_ns: when, Unix ns, not below 0.
+            position: a number per joint, rad.
+            velocity: likewise, rad/s; none where messages have none.
+            effort: likewise, N m.
+        """
+        p, v, e = self._counts
+        return self._pack(_HEAD, *_time(stamp_ns), self._names, p, *position, v, *velocity, e, *effort)
+
+
+class ArrayDimension(NamedTuple):
+    """One dimension of an array: what it counts, and how many there are."""
+
+    label: str
+    size: int
+
+
+def make_float_array_packer(*dimensions: ArrayDimension) -> Callable[..., bytes]:
+    """Returns what packs `std_msgs/msg/Float64MultiArray` of one shape, given its numbers, row by row."""
+    fields = _Fields()
+    fields.number(len(dimensions))
+    sizes = [dimension.size for dimension in dimensions]
+    for n, (label, size) in enumerate(dimensions):
+        fields.text(label)
+        fields.number(size)
+        fields.number(math.prod(sizes[n:]))
+    fields.number(0)  # data_offset
+    form, _ = _floats(fields.end, count := math.prod(sizes))
+    pack, shape = struct.Struct(f"<4s{len(fields.data)}s{form}").pack, fields.data
+    return lambda *numbers: pack(_HEAD, shape, count, *numbers)
+
+
+def pack_string(text: str) -> bytes:
+    """Returns a `std_msgs/msg/String`."""
+    fields = _Fields()
+    fields.text(text)
+    return _HEAD + fields.data
+
+
+class RosLogLevel(IntEnum):
+    """How much a line of a log matters, by the numbers of ROS 2."""
+
+    INFO = 20
+    WARN = 30
+    ERROR = 40
+
+
+def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
+    """Returns an `rcl_interfaces/msg/Log`.
+
+    Args:
+        stamp_ns: when, Unix ns, not below 0.
+        level: how much it matters.
+        name: who says it.
+        text: what.
+    """
+    fields = _Fields(9)  # behind stamp and level
+    for part in (name, text, "", ""):  # no file, no function
+        fields.text(part)
+    fields.number(0)  # of no line
+    return _HEAD + struct.pack("<iIB", *_time(stamp_ns), level) + fields.data

@@ -1,0 +1,88 @@
+"""Loop statistics of a site, ten times a second: ticks, lateness, computing time and link counters."""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from ..core.site_step import Site
+from ..core.ticks import NS_PER_S, TickRecord
+from .messages import VERSION, LinkStats
+
+STATS_PER_SECOND = 10
+
+
+def ticks_per_stats(rate_hz: int) -> int:
+    """Returns how many ticks lie between two statistics; the first are those of tick 0."""
+    return max(1, rate_hz // STATS_PER_SECOND)
+
+
+class LoopStats:
+    """Counts what a loop does, between two statistics and since the start.
+
+    Args:
+        site: the site that the loop steps.
+        boot: its process start.
+        rates: tick rate of every peer, Hz, in scenario order.
+
+    Attributes:
+        dropped: messages that were not accepted, by reason.
+        overruns: ticks whose work began after the next one was due.
+    """
+
+    def __init__(self, site: Site, boot: int, rates: list[int]) -> None:
+        self._site = site
+        self._boot = boot
+        self._rates = rates
+        self._every = ticks_per_stats(site.rate_hz)
+        self._period_us = 1_000_000 / site.rate_hz
+        self._late_max_us = 0
+        self._busy_max_us = 0
+        self.dropped: Counter[str] = Counter()
+        self.overruns = 0
+
+    def tick(self, late_us: int, busy_us: int) -> None:
+        """Books one tick: its lateness, and the computing time of the one before."""
+        self._late_max_us = max(self._late_max_us, late_us)
+        self._busy_max_us = max(self._busy_max_us, busy_us)
+        self.overruns += late_us >= self._period_us
+
+    def due(self, k: int) -> bool:
+        """True at the ticks after which statistics are published."""
+        return k % self._every == 0
+
+    def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
+        """Returns the statistics as of a tick and begins anew with the largest values.
+
+        Args:
+            output: the record of that tick.
+            measured: what a clock measured, by field of `LinkStats`; none in virtual time.
+        """
+        peers = self._site.peers
+        counts = dict(zip(peers, self._site.counts(), strict=True))
+        age_us = {
+            peer: (output.t_ns - used * NS_PER_S // rate_hz) // 1000 if used >= 0 else -1
+            for peer, used, rate_hz in zip(peers, output.used, self._rates, strict=True)
+        }
+        stats = LinkStats(
+            v=VERSION,
+            site=self._site.name,
+            boot=self._boot,
+            tick=output.tick,
+            t_ns=output.t_ns,
+            mode=output.mode.name.lower(),
+            age_us=age_us,
+            accepted={peer: count.accepted for peer, count in counts.items()},
+            late={peer: count.late for peer, count in counts.items()},
+            duplicate={peer: count.duplicate for peer, count in counts.items()},
+            refused={peer: count.refused for peer, count in counts.items()},
+            lost={peer: count.lost for peer, count in counts.items()},
+            superseded={peer: count.superseded for peer, count in counts.items()},
+            copies={peer: count.copies for peer, count in counts.items()},
+            dropped=dict(self.dropped),
+            late_max_us=self._late_max_us,
+            busy_max_us=self._busy_max_us,
+            overruns=self.overruns,
+            **(measured or {}),
+        )
+        self._late_max_us = self._busy_max_us = 0
+        return stats

@@ -1,1 +1,0 @@
-"""A log once more on the network: the same bytes with the same timing, under another session."""

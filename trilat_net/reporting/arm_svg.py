@@ -1,0 +1,54 @@
+"""Stick figures of the arms at a few instants as SVG, in the page's colours, light or dark.
+
+Invariant: the poses are those of the figure `arms`.
+"""
+
+from html import escape
+
+from ..core.vectors import Array
+from ..log.log_reader import Log
+from .figures.arm_poses import ArmPose, choose_instants_s, pose_at
+
+
+def render_arms_svg(log: Log, bounds_m: tuple[float, float, float, float]) -> str:
+    """Returns HTML with a row per site and a column per instant.
+
+    Args:
+        log: the log.
+        bounds_m: left, right, bottom and top of every picture, m.
+    """
+    times = choose_instants_s(log)
+    cells = ["<span></span>", *(f'<span class="head">t = {t:.4g} s</span>' for t in times)]
+    for index, site in enumerate(log.sites):
+        cells.append(f'<span class="head">{escape(site)}</span>')
+        cells += [_picture(pose_at(log, site, t), index, bounds_m, f"{site} at {t:.4g} s") for t in times]
+    columns = f"grid-template-columns: max-content repeat({len(times)}, 1fr)"
+    return f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+
+
+def _picture(
+    drawn: ArmPose | None, index: int, bounds_m: tuple[float, float, float, float], label: str
+) -> str:
+    left, right, bottom, top = bounds_m
+    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
+    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
+    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
+    inside = (
+        ""
+        if drawn is None
+        else (
+            f'<polyline class="path site-{index}" points="{_points(drawn.path)}"/>'
+            f'<polyline class="desired" points="{_points(drawn.desired)}"/>'
+            f'<polyline class="arm site-{index}" points="{_points(drawn.actual)}"/>'
+            + "".join(
+                f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
+                for x, y in drawn.actual[1:]
+            )
+        )
+    )
+    return f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">{ground}{inside}{base}</svg>'
+
+
+def _points(xy: Array) -> str:
+    """Returns points for SVG, whose y grows downwards, m."""
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in xy)

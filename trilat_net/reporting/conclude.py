@@ -1,0 +1,112 @@
+"""The report of a finished run: checks, figures, page, summary lines, a table with a row per site.
+
+Invariant: every claim rests on an execution made just now, in another process while figures are drawn.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import LawFailed, RunFailed, ScenarioError
+from ..execution.log_checks import RECORDS_LABEL, CheckLine, check_log_files
+from ..execution.verify import find_last_ticks
+from ..execution.virtual_comparison import simulate_without_operators
+from ..log.log_reader import Log
+from ..log.mcap_reader import Progress
+from ..process import ignore_sigint, worker_pool
+from .summary_text import format_run_lines
+
+
+class Conclusion(NamedTuple):
+    """A log, judged.
+
+    Attributes:
+        columns: heads of the table.
+        rows: a row per site.
+        notes: what links did and what happened, a line each.
+        lines: what was checked and how it came out.
+        paths: the files that were made.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    notes: list[str]
+    lines: list[CheckLine]
+    paths: list[Path]
+
+    @property
+    def passed(self) -> bool:
+        """True where every check passed."""
+        return all(line.passed for line in self.lines)
+
+    @property
+    def agreed(self) -> bool:
+        """True where every execution agreed with the log, complete or not."""
+        return all(line.passed for line in self.lines if line.label != RECORDS_LABEL)
+
+
+def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:
+    """Verifies a log, compares it with virtual time, and writes figures, page and summary.
+
+    Args:
+        log: the log, from a file.
+        folder: where the results go; exists.
+        progress: told how many figures are drawn, and how many there are.
+
+    Raises:
+        LogError: a record cannot be read.
+        RunFailed: the process that executes the log was ended.
+    """
+    # Matplotlib takes a second, and `verify` needs none of it
+    from .certificate_section import build_certificate_section
+    from .page import write_report
+
+    lines: list[CheckLine] = []
+    with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
+        with ignore_sigint():
+            checking = pool.submit(check_log_files, log.sources)
+        twin = _run_without_operators(log)
+        certified = build_certificate_section(log)
+        notes = [*format_run_lines(log), f"certificate: {certified.facts['text']}"]
+
+        def verdicts() -> Iterator[CheckLine]:
+            try:
+                lines.extend(checking.result())
+            except BrokenProcessPool:
+                raise RunFailed("the process that executes the log again was ended; try again") from None
+            yield from lines
+
+        made = write_report(
+            log, folder, twin=twin, verdicts=verdicts(), progress=progress, sections=[certified]
+        )
+    rows = [_site_row(log, site) for site in log.sites]
+    return Conclusion(_COLUMNS, rows, notes, lines, [*map(Path, log.sources), *made])
+
+
+def _run_without_operators(log: Log) -> Log | None:
+    """Returns the same run without hands; None where it would be the same, or cannot be run."""
+    broke_off = any(event.kind == "failed" for event in log.events)  # so would the twin, or hang
+    pushed = any(site.hands for site in log.scenario.sites.values())
+    if broke_off or log.scenario.external or not pushed:
+        return None
+    try:
+        return simulate_without_operators(log)
+    except (ScenarioError, LawFailed):  # a law from outside that is not there, or fails: the check says so
+        return None
+
+
+_COLUMNS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
+
+
+def _site_row(log: Log, site: str) -> tuple[str, ...]:
+    part = log[site]
+    if not len(part):
+        return (site, "0", *("",) * (len(_COLUMNS) - 2))
+    missing = max(find_last_ticks(log)[site], int(part.tick[-1])) + 1 - len(part)
+    late = np.percentile(part.late_us, (50, 99, 100))
+    busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
+    numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")
+    return (site, str(len(part)), str(missing), *numbers)

@@ -1,0 +1,96 @@
+"""Export of a log to a file format given by name.
+
+Invariant: everything that can be refused is refused before anything is read or written.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+
+from ..files import refuse_existing_export, stage_export
+from ..log.log_reader import Log
+from .export_tables import WriteExport, make_csv_writer, make_mat_writer, make_npz_writer, make_parquet_writer
+from .ros2_bag import export_ros2
+
+ExportProgress = Callable[[int, int], None]
+"""Told how much of something is done: (so far, in all)."""
+
+
+class ExportFormat(StrEnum):
+    """What a log can be exported to."""
+
+    ROS2 = "ros2"
+    PARQUET = "parquet"
+    CSV = "csv"
+    NPZ = "npz"
+    MAT = "mat"
+
+    @property
+    def is_folder(self) -> bool:
+        """True where it is a folder of files, False where it is one file."""
+        return self in (ExportFormat.CSV, ExportFormat.PARQUET)
+
+
+class Exporter:
+    """What exports a log to one form, at one place.
+
+    Args:
+        form: what to.
+        path: where to: a file, or a folder of files.
+        force: whether an export that is there may be replaced.
+
+    Raises:
+        UsageError: the place is taken, or a package is missing.
+    """
+
+    def __init__(self, form: ExportFormat, path: Path, *, force: bool = False) -> None:
+        self._form, self._path, self._force = form, path, force
+        refuse_existing_export(path, folder=form.is_folder, force=force)
+        self._write = _WRITES[form]()
+
+    def export(self, log: Log, progress: ExportProgress | None = None) -> None:
+        """Exports a log.
+
+        Args:
+            log: the log.
+            progress: told how many records are written, and how many there are.
+
+        Raises:
+            LogError: a record cannot be read.
+            LogRefused: the disk is full.
+            UsageError: the place cannot be written to.
+        """
+        total = sum(len(log[site]) for site in log.sites)
+        done = 0
+
+        def written(records: int) -> None:
+            nonlocal done
+            done += records
+            if progress is not None:
+                progress(done, total)
+
+        with stage_export(self._path, folder=self._form.is_folder, force=self._force) as path:
+            self._write(log, path, written)
+
+
+def default_export_path(form: ExportFormat, first: Path) -> Path:
+    """Returns where an export goes if nobody says: beside the log, by its name.
+
+    Args:
+        form: what to.
+        first: the log, or its first part.
+    """
+    name = first.name.removesuffix(".active").removesuffix(".mcap")
+    ending = {ExportFormat.NPZ: ".npz", ExportFormat.MAT: ".mat", ExportFormat.ROS2: "-ros2.mcap"}.get(
+        form, f"-{form}"
+    )
+    return first.with_name(f"{name}{ending}")
+
+
+_WRITES: dict[ExportFormat, Callable[[], WriteExport]] = {
+    ExportFormat.ROS2: lambda: export_ros2,
+    ExportFormat.PARQUET: make_parquet_writer,
+    ExportFormat.CSV: make_csv_writer,
+    ExportFormat.NPZ: make_npz_writer,
+    ExportFormat.MAT: make_mat_writer,
+}

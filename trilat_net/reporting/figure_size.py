@@ -1,0 +1,53 @@
+"""Width, type size and resolution of a figure, for the report or for one or two columns of a paper.
+
+Invariant: type in print is 8 pt throughout.
+"""
+
+from typing import NamedTuple
+
+from ..errors import UsageError
+
+PRINT_TYPE_PT = 8.0
+"""Size of type in print, pt."""
+COLUMN_IN, PAGE_IN = 3.5, 7.0
+"""Widths of one column and of two, in."""
+_REPORT_DPI, _PRINT_DPI = 200, 600
+
+
+class FigureSize(NamedTuple):
+    """The measures of a figure.
+
+    Attributes:
+        width_in: its width, in.
+        tick_pt: size of the numbers at its axes, pt.
+        small_pt: size of its footnotes, pt.
+        dpi: of its PNG.
+    """
+
+    width_in: float
+    tick_pt: float
+    small_pt: float
+    dpi: int
+
+    @property
+    def narrow(self) -> bool:
+        """True where two panels beside each other have no room for many words."""
+        return self.width_in < 5.0
+
+
+REPORT_SIZE = FigureSize(PAGE_IN, 7.0, 6.0, _REPORT_DPI)
+"""The figures beside the report."""
+
+
+def make_print_size(width_in: float) -> FigureSize:
+    """Returns the form of a figure in a paper.
+
+    Args:
+        width_in: 3.5 for one column, 7 for two, in.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    if width_in not in (COLUMN_IN, PAGE_IN):
+        raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in:g}")
+    return FigureSize(width_in, PRINT_TYPE_PT, PRINT_TYPE_PT, _PRINT_DPI)

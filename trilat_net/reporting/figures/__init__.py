@@ -1,0 +1,1 @@
+"""Figures of a log: one function per figure, and their registry."""

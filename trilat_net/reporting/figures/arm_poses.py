@@ -1,0 +1,147 @@
+"""Poses of the arms at a few instants: base, elbow and end effector, and the figure of them.
+
+Invariant: forward kinematics are those of `core.arm`; the reference pose is dashed behind each arm.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis import site_signals
+from ...core.two_link_arm import JOINTS, forward_kinematics
+from ...core.vectors import Array
+from ...log.log_reader import Log
+from ...scenario import Arm
+from .. import style
+from ..figure_size import REPORT_SIZE, FigureSize
+
+INSTANTS = 6
+_NARROW_INSTANTS = 3
+_PATH_POINTS = 400
+
+
+class ArmPose(NamedTuple):
+    """One site at one instant.
+
+    Attributes:
+        actual: base, elbow and tip, shape (3, 2), m.
+        desired: the same under the reference, shape (3, 2), m.
+        path: where the tip has been until then, shape (P, 2), m.
+    """
+
+    actual: Array
+    desired: Array
+    path: Array
+
+
+def joint_positions_m(arm: Arm, q: Array) -> Array:
+    """Returns base, elbow and tip in the plane, shape (K, 3, 2), m, base at the origin.
+
+    Args:
+        arm: the links.
+        q: joint angles, shape (K, 2), rad.
+    """
+    points = np.zeros((len(q), 1 + JOINTS, 2))
+    for pose, angles in zip(points, q, strict=True):
+        pose[1:] = forward_kinematics((arm.l1_m, arm.l2_m), angles)
+    return points
+
+
+def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
+    """Returns instants to draw, first and last included, s: half by the clock, half by how much moves.
+
+    Equal steps of time alone would spend most of a row on arms at rest.
+    """
+    end_s = style.time_axis_end_s(log)
+    grid = np.linspace(0.0, end_s, 1001)
+    moved = np.zeros_like(grid)
+    for name in log.sites:
+        part = log[name]
+        if len(part):
+            step = np.abs(np.diff(site_signals.joint_angles(part), axis=0, prepend=part.q[:1])).sum(axis=1)
+            moved += np.interp(grid, part.t_s, np.cumsum(step))
+    share = grid / end_s + (moved / moved[-1] if moved[-1] > 0.0 else 0.0)
+    chosen = np.interp(np.linspace(0.0, share[-1], count), share, grid)
+    step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
+    inner = (float(np.round(t / step_s) * step_s) for t in chosen[1:-1])
+    return sorted({0.0, *(round(t, 6) for t in inner if t < end_s), end_s})
+
+
+def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
+    """Returns a site at an instant: its last record until then; None where there is none."""
+    part, arm = log[site], log.scenario.sites[site].arm
+    last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
+    if last < 0:
+        return None
+    rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
+    actual = joint_positions_m(arm, part.q[rows])
+    return ArmPose(actual[-1], joint_positions_m(arm, part.q_des[last : last + 1])[0], actual[:, 2])
+
+
+def pose_box_m(poses: Sequence[ArmPose | None]) -> tuple[float, float, float, float]:
+    """Returns left, right, bottom and top of a box around poses with a margin, m; the base is inside."""
+    points = [np.concatenate(drawn) for drawn in poses if drawn is not None]
+    every = np.concatenate([*points, np.zeros((1, 2))])
+    low, high = every.min(axis=0), every.max(axis=0)
+    centre = (low + high) / 2.0
+    half = np.maximum((high - low) / 2.0, 0.35 * max(float((high - low).max()), 0.1)) + 0.08 * max(
+        float((high - low).max()), 0.1
+    )
+    (left, bottom), (right, top) = centre - half, centre + half
+    return float(left), float(right), float(bottom), float(top)
+
+
+def draw_arms(log: Log, instants: Sequence[float] | None = None, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
+
+    Args:
+        log: the log.
+        instants: which, s; None for `instants_s`.
+        form: what it is drawn for.
+    """
+    count = _NARROW_INSTANTS if form.narrow else INSTANTS
+    times = choose_instants_s(log, count) if instants is None else list(instants)
+    drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
+    left, right, bottom, top = pose_box_m([p for row in drawn.values() for p in row])
+    side_in = (form.width_in - 0.6) / len(times)
+    with style.figure_style(form):
+        height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
+        figure = style.new_figure(height_in, form.width_in)
+        grid = style.add_panels(figure, len(log.sites), len(times), sharex=True, sharey=True)
+        for site, row in zip(log.sites, grid, strict=True):
+            for axes, one in zip(row, drawn[site], strict=True):
+                _arm(axes, one, style.site_colour(log, site))
+            row[0].set_ylabel(f"{site}: y (m)")
+        for axes, t_s in zip(grid[0], times, strict=True):
+            axes.set_title(f"t = {t_s:.4g} s")
+        for axes in grid[-1]:
+            axes.set_xlabel("x (m)")
+        grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
+        style.add_legend(figure, _entries(log))
+    return figure
+
+
+def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
+    axes.set_aspect("equal")
+    if drawn is None:
+        style.annotate_empty_panel(axes, "no record")
+        return
+    axes.plot(*drawn.path.T, color=colour, linewidth=0.6, alpha=0.55)
+    axes.plot(*drawn.desired.T, **_DESIRED)
+    axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")
+    axes.plot(*drawn.actual[1:].T, linestyle="none", marker="o", markersize=2.6, color=colour)
+    axes.plot(0.0, 0.0, linestyle="none", marker="s", markersize=4.5, color=style.REFERENCE)
+
+
+def _entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    sites = [
+        (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0}) for s in log.sites
+    ]
+    base = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
+    return [*sites, ("desired", _DESIRED), ("base", base)]
+
+
+_DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}

@@ -1,0 +1,137 @@
+"""Figure of the certificate's energies.
+
+V and its parts, dissipation and work, and the residual of the balance.
+
+Invariant: energies in J over the time of the whole run; spans without complete records are shaded, the
+largest rise is marked.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis.certificate.energy_balance import EnergyBalance
+from ...analysis.certificate.premises import find_unjudged_spans
+from ...analysis.certificate.stability_certificate import Certificate
+from ...core.vectors import Array
+from ...log.log_reader import Log
+from .. import style
+from ..event_markers import EventMarkers
+from ..figure_size import REPORT_SIZE, FigureSize
+
+_PARTS = {
+    "kinetic": "r'Mr / 2",
+    "parameter": "parameter error",
+    "position": "e'ΛKd e / 2",
+    "delay": "under way",
+}
+_TAKEN = {"damping": "taken: r'Kp r", "disagreement": "taken: disagreement"}
+_COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
+_TOTAL: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.6}
+_ONES: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 0.9, "linestyle": (0, (4, 2))}
+_RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
+_UNJUDGED: dict[str, Any] = {"color": style.FAINT, "alpha": 0.3, "linewidth": 0.0, "zorder": 0.3}
+_HEIGHTS = (1.5, 1.2, 1.3, 1.0)
+
+
+def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns V with its sites, its parts, dissipation and work, and the residual of the balance, J.
+
+    Args:
+        log: the log.
+        certificate: its certificate.
+        form: what it is drawn for.
+    """
+    balance = certificate.balance
+    if balance is None:
+        return style.empty_figure(certificate.verdict.text, form)
+    marks = EventMarkers(log, form)
+    with style.figure_style(form):
+        figure = style.new_figure(7.2 if form.narrow else 6.4, form.width_in)
+        rows = style.add_panels(figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
+        _functional(log, certificate, rows[0])
+        _parts(balance, rows[1], form)
+        _work(balance, rows[2], form)
+        _residual(balance, rows[3], form)
+        for axes in rows:
+            marks.draw(axes, log.sites, numbered=axes is rows[0])  # others have a legend there
+            for from_s, to_s in find_unjudged_spans(balance):
+                axes.axvspan(from_s, to_s, **_UNJUDGED)
+        rise = certificate.verdict.rise
+        if rise is not None:
+            rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
+            rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
+        style.set_time_axis(log, [rows[-1]])
+        ones = [] if certificate.ones is None else [("V with the paper's ones", _ONES)]
+        style.add_legend(figure, [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *ones])
+        marks.explain(figure)
+    return figure
+
+
+def _draw(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
+    style.plot_decimated(axes, np.arange(len(balance.t_s)), balance.t_s, values, **options)
+
+
+def _functional(log: Log, certificate: Certificate, axes: Axes) -> None:
+    balance, ones = certificate.balance, certificate.ones
+    assert balance is not None
+    _draw(balance, axes, balance.V, **_TOTAL)
+    if ones is not None:
+        _draw(ones, axes, ones.V, **_ONES)
+    for site, values in balance.sites.items():
+        _draw(balance, axes, values, **style.site_line(log, site, 1.0))
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
+
+
+def _parts(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+    for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
+        _draw(balance, axes, values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
+    axes.set_ylabel("parts of V (J)")
+    _entries(axes, form)
+
+
+def _entries(axes: Axes, form: FigureSize) -> None:
+    """Puts a legend above the lines."""
+    low, high = axes.get_ylim()
+    columns = 2 if form.narrow else 4
+    rows = -(-len(axes.get_legend_handles_labels()[0]) // columns)
+    room = 0.25 * rows if form.narrow else 0.35
+    axes.set_ylim(low, high + room * (high - low))
+    axes.legend(loc="upper left", ncols=columns, fontsize=_legend_pt(form))
+
+
+def _legend_pt(form: FigureSize) -> float:
+    """Returns the size of type inside a panel, pt."""
+    return form.small_pt if form.small_pt == form.tick_pt else form.small_pt + 0.5
+
+
+def _work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+    for (name, values), line in zip(balance.taken.items(), style.DASHES, strict=False):
+        _draw(balance, axes, values, label=_TAKEN[name], color=style.REFERENCE, linestyle=line)
+    links = np.sum([x for name, x in balance.given.items() if "->" in name], axis=0)
+    given = {name: x for name, x in balance.given.items() if "->" not in name}
+    shown = {"hands": given.pop("hands"), "walls": given.pop("walls"), "links": links, **given}
+    shown["sampling"] = balance.sampling
+    least = 1e-4 * balance.scale
+    for (name, values), colour in zip(shown.items(), (*_COLOURS, *_COLOURS), strict=False):
+        if np.abs(values).max() > least:
+            _draw(balance, axes, values, label=f"given: {name}", color=colour)
+    _entries(axes, form)
+    axes.set_ylabel("taken and given (J)")
+
+
+def _residual(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+    scale = balance.scale or 1.0
+    floor = 1e-9 * scale
+    for label, values, line in (
+        ("V - V(0) + taken - given", balance.residual, "-"),
+        ("with sampling booked", balance.unexplained, (0, (1, 1))),
+    ):
+        positive = np.maximum(np.abs(values), floor)
+        _draw(balance, axes, positive, label=label, color=style.REFERENCE, linestyle=line)
+    axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
+    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, (1e12 if form.narrow else 1e4) * scale))
+    axes.legend(loc="upper left", ncols=1 if form.narrow else 3, fontsize=_legend_pt(form))

@@ -1,0 +1,72 @@
+"""The root map: the rightmost continuous and sampled roots in the complex plane, one column wide.
+
+Invariant: every root of the analysis is drawn, conjugate ones too; the imaginary axis is the edge of
+stability.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...theory.characteristic_roots import Spectrum
+from ...theory.linear_analysis import LinearAnalysis
+from .. import style
+
+WIDTH_IN = 3.5
+_HEIGHT_IN = 3.0
+_UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
+
+
+def draw_root_map(found: LinearAnalysis) -> Figure:
+    """Returns the map of continuous and sampled roots.
+
+    Args:
+        found: the analysis.
+    """
+    with style.figure_style():
+        figure = style.new_figure(_HEIGHT_IN, WIDTH_IN)
+        axes = figure.add_subplot()
+        _draw(axes, found.continuous, "o", style.SITE_COLOURS[0], "continuous")
+        if found.sampled is not None:
+            _draw(axes, found.sampled, "x", style.SITE_COLOURS[1], "as computed")
+        if found.judged.zeros:
+            axes.plot(
+                [0.0],
+                [0.0],
+                linestyle="",
+                marker="s",
+                markersize=4.0,
+                fillstyle="none",
+                color=style.FAINT,
+                label=f"zero by structure ({found.judged.zeros})",
+            )
+        _frame(axes)
+        figure.legend(loc="outside upper center", ncols=3, handlelength=1.0, columnspacing=1.0)
+    return figure
+
+
+def _draw(axes: Axes, found: Spectrum, mark: str, colour: str, label: str) -> None:
+    roots = [root.s for root in found.roots]
+    both = np.array([*roots, *(s.conjugate() for s in roots if s.imag)])
+    axes.plot(
+        both.real,
+        both.imag,
+        linestyle="",
+        marker=mark,
+        markersize=4.5,
+        fillstyle="none",
+        color=colour,
+        label=label,
+    )
+
+
+def _frame(axes: Axes) -> None:
+    low, high = axes.get_xlim()
+    high = max(high, 0.06 * (high - low), 0.0)
+    axes.axvline(0.0, **style.LIMIT_LINE)
+    axes.axvspan(0.0, high, **_UNSTABLE)
+    axes.set_xlim(low, high)
+    axes.set_xlabel("real part (1/s)")
+    axes.set_ylabel("imaginary part (rad/s)")

@@ -1,0 +1,169 @@
+"""Figures of the links: age of the samples in use over time, and distributions of delay and age.
+
+Invariant: a measured link has no line of stated delay; a log of constant links has no distributions.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from ...analysis import site_signals
+from ...analysis.delivery import count_sent, predict_delivery, read_arrivals
+from ...analysis.link_summary import has_one_constant_delay, sample_ages_ns
+from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
+from ...core.vectors import Array
+from ...log.log_reader import Log
+from .. import style
+from ..event_markers import EventMarkers
+from ..figure_size import REPORT_SIZE, FigureSize
+
+NO_VARYING_DELAY = "every link is said to give one constant delay: nothing is distributed"
+_POINTS = 400
+_TALL = 6.0
+
+
+class DelayDistribution(NamedTuple):
+    """What a link gave, and what its controller saw.
+
+    Attributes:
+        peer: who sends.
+        site: who receives.
+        delay_ms: delays of the samples: what the model gave them, or else what was measured, ms.
+        age_ms: ages of the sample in use at the receiver's ticks, ms.
+    """
+
+    peer: str
+    site: str
+    delay_ms: Array
+    age_ms: Array
+
+
+def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
+    marks, changed = EventMarkers(log, form), list_changes(log)
+    lines = {
+        link: stated_delay_line(log, list_stated_models(log, link, changed)) for link in log.scenario.links
+    }
+    with style.figure_style(form):
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
+        grid = style.add_panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+        drawn: list[Array] = []
+        for site, row in zip(log.sites, grid, strict=True):
+            part = log[site]
+            for peer, age_ms, axes in zip(
+                part.peers, site_signals.sample_ages_ms(log, site).T, row, strict=True
+            ):
+                line = lines[f"{peer}->{site}"]
+                marks.draw(axes, [site], f"{peer}->{site}")
+                style.plot_decimated(axes, part.tick, part.t_s, age_ms, **style.site_line(log, peer, 1.4))
+                axes.plot(*line, **style.LIMIT_LINE)
+                axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+                if not np.any(np.isfinite(age_ms)):
+                    style.annotate_empty_panel(axes, "no sample in use")
+                drawn += [age_ms, line[1]]
+        for axes in grid[:, 0]:
+            axes.set_ylabel("age (ms)")
+        _age_axis(grid[0, 0], np.concatenate(drawn))
+        style.set_time_axis(log, grid[-1])
+        known = any(np.any(np.isfinite(values)) for _, values in lines.values())
+        style.add_legend(
+            figure, [*_senders(log), *([("mean delay as stated", style.LIMIT_LINE)] if known else [])]
+        )
+        marks.explain(figure, links=True)
+    return figure
+
+
+def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the distributions of delay and age on every link: a row per receiver.
+
+    A curve says how many samples, or ticks, have no more than so much, %.
+    """
+    if not has_varying_delay(log):
+        return style.empty_figure(NO_VARYING_DELAY, form)
+    found = {(d.peer, d.site): d for d in measure_delay_distributions(log)}
+    with style.figure_style(form):
+        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
+        grid = style.add_panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+        x_ms = delay_axis_ms(list(found.values()))
+        for site, row in zip(log.sites, grid, strict=True):
+            for peer, axes in zip(log[site].peers, row, strict=True):
+                link = found[peer, site]
+                axes.plot(x_ms, cumulative_percent(link.age_ms, x_ms), **style.site_line(log, peer, 1.8))
+                axes.plot(x_ms, cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE)
+                axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+        for axes in grid[:, 0]:
+            axes.set_ylabel("cumulative (%)")
+        for axes in grid[-1]:
+            axes.set_xlabel("delay or age (ms)")
+        grid[0, 0].set(ylim=(0.0, 104.0), xlim=(0.0, x_ms[-1]))
+        entries = [(f"age, {text}", options) for text, options in _senders(log)]
+        style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
+    return figure
+
+
+def has_varying_delay(log: Log) -> bool:
+    """True where some link was said to do more than give one constant delay."""
+    changed = list_changes(log)
+    return not all(
+        has_one_constant_delay(list_stated_models(log, link, changed)) for link in log.scenario.links
+    )
+
+
+def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
+    """Returns delays and ages of every link, by receiver and then by peer."""
+    found = []
+    for site in log.sites:
+        for peer, came in read_arrivals(log, site).items():
+            count = count_sent(log, peer, int(came.sample.max(initial=-1)))
+            delay_ms = predict_delivery(log, peer, site, count).drawn_ms
+            if not len(delay_ms) and log.driver == "live":
+                delay_ms = came.delay_us / 1e3
+            found.append(DelayDistribution(peer, site, delay_ms, sample_ages_ns(log, peer, site) / 1e6))
+    return found
+
+
+def delay_axis_ms(found: list[DelayDistribution]) -> Array:
+    """Returns the delays at which distributions are drawn, ms: what an outage leads to lies beyond."""
+    ends = [np.percentile(d.delay_ms, 99.5) for d in found if len(d.delay_ms)]
+    ends += [np.percentile(d.age_ms, 90.0) for d in found if len(d.age_ms)]
+    return np.linspace(0.0, 1.15 * max([*ends, 1.0]), _POINTS)
+
+
+def cumulative_percent(values: Array, limits: Array) -> Array:
+    """Returns how many of some values are at most as large as each limit, %; NaN where there are none."""
+    if not len(values):
+        return np.full(len(limits), np.nan)
+    percent: Array = 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
+    return percent
+
+
+def stated_delay_line(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
+    """Returns the stated mean delay over time as a line: times, s, and delays, ms; NaN between states."""
+    starts = [state.from_s for state in states]
+    ends = [*starts[1:], max(recorded_end_s(log), starts[-1])]
+    times = [t for start, end in zip(starts, ends, strict=True) for t in (start, end, end)]
+    means = [mean for state in states for mean in (*(state.link.moments().mean_ms,) * 2, np.nan)]
+    return np.array(times), np.array(means)
+
+
+def needs_log_axis(ages_ms: Array) -> bool:
+    """True where a few ages, as after an outage, would press all others into a line at the bottom."""
+    known = ages_ms[np.isfinite(ages_ms)]
+    return len(known) > 0 and bool(known.max() > _TALL * np.percentile(known, 95.0))
+
+
+def _age_axis(axes: Axes, values: Array) -> None:
+    """Gives panels their axis of ages."""
+    known = values[np.isfinite(values)]
+    if needs_log_axis(known):
+        axes.set(yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max())))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    else:
+        axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
+
+
+def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    return [(f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8)) for site in log.sites]

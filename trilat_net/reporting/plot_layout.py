@@ -1,0 +1,185 @@
+"""Layout of a log's plots in Rerun: pages, a column per site, a row per quantity; saved as a blueprint.
+
+Invariant: a plot has one unit, and every curve a name. Quantities that a log lacks take no space. All
+views, names and colors are set here, none by the viewer, so that two logs look alike.
+"""
+
+from collections.abc import Iterator, Mapping
+from itertools import cycle
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..files import import_extra
+from ..log.ros2.cdr import JOINT_STATE
+from ..log.ros2.ros2_messages import EVENTS, LINES, Ros2Channel
+
+Ros2Channels = Mapping[str, Ros2Channel]
+
+
+class PlotCurves(NamedTuple):
+    """Curves of one channel.
+
+    Attributes:
+        entity: where Rerun puts their numbers.
+        names: their names, in the order of the numbers.
+        shown: which of them are shown.
+    """
+
+    entity: str
+    names: tuple[str, ...]
+    shown: tuple[bool, ...]
+
+
+class CurvePlot(NamedTuple):
+    """One plot: its title, with the unit, and its curves."""
+
+    title: str
+    curves: tuple[PlotCurves, ...]
+
+
+PlotPage = list[list[CurvePlot]]
+"""Rows of plots."""
+
+_POSITION, _VELOCITY, _EFFORT = "position", "velocity", "effort"
+_PAGES = {
+    "Motion": (
+        ("joint angles and reference", "rad", (("joint_states", _POSITION), ("reference", _POSITION))),
+        ("error", "rad", (("error", ""),)),
+        ("torque, and exogenous torque", "N m", (("joint_states", _EFFORT), ("tau_x", ""))),
+    ),
+    "Speeds, estimates": (
+        ("joint velocities", "rad/s", (("joint_states", _VELOCITY), ("reference", _VELOCITY))),
+        ("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
+        ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""),)),
+    ),
+    "Links, timing": (
+        ("age of samples in use, by peer", "ms", (("link_age", ""),)),
+        ("one-way delay, by peer", "ms", (("link_delay", ""),)),
+        ("clock offset, by peer", "ms", (("link_offset", ""),)),
+        ("largest in 100 ms", "us", (("timing", ""),)),
+    ),
+}
+"""Per page its rows: what, the unit, and the parts: channel, and of joint states which of their lists."""
+
+
+class PlotLayout(NamedTuple):
+    """All pages by name, and where the lines of what happened stand; "" where there are none."""
+
+    pages: dict[str, PlotPage]
+    lines: str
+
+
+def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
+    """Returns what to show of the standard channels of a log.
+
+    Args:
+        channels: those that there are, by topic: `<root>/<site>/<name>`, and of the session `<root>/log`.
+    """
+    session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES)]
+    roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
+    pages = {
+        name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
+        for name, rows in _PAGES.items()
+    }
+    lines = next((topic for topic in session if topic.endswith(f"/{LINES}")), "")
+    return PlotLayout({name: page for name, page in pages.items() if page}, lines)
+
+
+def _row(
+    channels: Ros2Channels, roots: list[str], what: str, unit: str, parts: tuple[tuple[str, str], ...]
+) -> Iterator[CurvePlot]:
+    """Yields a quantity of every site that has it."""
+    for root in roots:
+        curves = [
+            curves
+            for name, field in parts
+            if (curves := _curves(f"{root}/{name}", field, channels.get(f"{root}/{name}"))) is not None
+        ]
+        if curves:
+            site = root.rpartition("/")[2]
+            yield CurvePlot(f"{site}: {what}" + (f" ({unit})" if unit else ""), tuple(curves))
+
+
+def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
+    """Returns the curves of a channel, or of a list of joint states."""
+    if channel is None:
+        return None
+    names = _names(channel.about.get("names", ""))
+    if channel.kind != JOINT_STATE:
+        prefix = f"{topic.rpartition('/')[2]} " if topic.endswith("/tau_x") else ""
+        return PlotCurves(topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names))
+    reference = all(name.endswith("_ref") for name in names) or topic.endswith("/reference")
+    if field == _EFFORT and reference:
+        return None
+    if reference:
+        names = tuple(name.removesuffix("_ref") + "_ref" for name in names)
+    shown = tuple(reference or field == _POSITION or not name.endswith("_ref") for name in names)
+    return PlotCurves(f"{topic}/{field}", names, shown)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Returns the names of the numbers of an array, from those along its dimensions: every one with every."""
+    names = [""]
+    for axis in text.split("; "):
+        names = [f"{before} {name}".strip() for before in names for name in axis.split(" ")]
+    return tuple(names)
+
+
+_COLORS = [(31, 119, 180), (214, 96, 20), (44, 160, 44), (148, 103, 189), (150, 120, 30)]
+_PALE = [(150, 190, 225), (245, 175, 120)]
+"""Of references, beside the joints that follow them."""
+_TIMELINE = "message_publish_time"
+
+
+def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
+    """Writes a board as a blueprint file.
+
+    Args:
+        board: what to show.
+        application: what Rerun calls the recordings that it is for.
+        path: the file.
+
+    Raises:
+        UsageError: Rerun is not installed.
+    """
+    rrb = import_extra("rerun.blueprint", "view", "viewers")
+    pages = rrb.Tabs(*(_page(rrb, name, page) for name, page in board.pages.items()))
+    views = [pages]
+    if board.lines:
+        views.append(rrb.TextLogView(origin=board.lines, name="what happened"))
+    blueprint = rrb.Blueprint(
+        rrb.Vertical(*views, row_shares=[6, 1][: len(views)]),
+        rrb.TimePanel(state="collapsed", timeline=_TIMELINE),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+    blueprint.save(application, path)
+
+
+def _page(rrb: Any, name: str, page: PlotPage) -> Any:
+    rows = [rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page]
+    return rrb.Vertical(*rows, name=name)
+
+
+def _view(rrb: Any, plot: CurvePlot) -> Any:
+    """Returns a plot; of several channels in it each has colors of its own."""
+    overrides: dict[str, Any] = {}
+    for curves in plot.curves:
+        overrides[curves.entity] = _lines(curves, 2 * len(overrides))
+    return rrb.TimeSeriesView(
+        name=plot.title,
+        origin="/",
+        contents=[curves.entity for curves in plot.curves],
+        overrides=overrides,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+    )
+
+
+def _lines(curves: PlotCurves, first: int) -> Any:
+    """Returns how curves are drawn, from a color on; references paler than what follows them."""
+    rr = import_extra("rerun", "view", "viewers")
+    pale, strong = cycle(_PALE), cycle(_COLORS[first:] + _COLORS[:first])
+    colors = [next(pale) if name.endswith("_ref") else next(strong) for name in curves.names]
+    return rr.SeriesLines(names=list(curves.names), colors=colors, visible_series=list(curves.shown))

@@ -1,0 +1,211 @@
+"""Style of all figures: colours per site, line styles, axes, legends, and files that are equal byte for byte.
+
+The first three colours are the "high contrast" set of Paul Tol's notes on colour: safe for the colour blind
+and apart in lightness, also in grey print. Sites beyond the palette differ by dashes.
+
+Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold no date, and
+fonts are embedded as TrueType.
+"""
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from ..analysis.timeline import recorded_end_s
+from ..analysis.trace_decimation import decimate
+from ..core.vectors import Array
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from .figure_size import REPORT_SIZE, FigureSize
+
+AxesGrid = NDArray[np.object_]
+
+SITE_COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
+DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
+"""The same sites on a dark page."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+REFERENCE = "#333333"
+FAINT = "#8c8c8c"
+
+LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+"""The line of what is desired, true, stated or allowed."""
+
+REPORT_WIDTH_IN = REPORT_SIZE.width_in
+REPORT_DPI = REPORT_SIZE.dpi
+BUCKETS_PER_PANEL = 700
+"""Per panel: half a page is 700 pixels wide."""
+
+_RC: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture everywhere
+    "font.size": 8.0,
+    "axes.labelsize": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.titlepad": 4.0,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.use_mathtext": True,
+    "axes.formatter.useoffset": False,  # an axis says what it shows, not what it shows less one
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.1,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "legend.columnspacing": 1.6,
+    "figure.constrained_layout.h_pad": 0.03,
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.dpi": REPORT_DPI,
+    "savefig.dpi": REPORT_DPI,
+    "path.simplify": True,
+}
+
+_NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "legend.borderaxespad": 0.2}
+
+
+@contextmanager
+def figure_style(form: FigureSize = REPORT_SIZE) -> Iterator[None]:
+    """Makes figures inside the block look like ours; outside, nothing changes.
+
+    Args:
+        form: what they are drawn for.
+    """
+    sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
+    with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
+        yield
+
+
+def new_figure(height_in: float, width_in: float = REPORT_WIDTH_IN) -> Figure:
+    """Returns an empty figure of a size in inches."""
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
+    """Returns the panels of a figure as an array, shape (rows, columns), of `Axes`."""
+    grid: AxesGrid = figure.subplots(rows, columns, squeeze=False, **options)
+    return grid
+
+
+def site_colour(log: Log, site: str) -> str:
+    """Returns the colour of a site, the same in every figure."""
+    return SITE_COLOURS[log.sites.index(site) % len(SITE_COLOURS)]
+
+
+def site_dashes(log: Log, site: str) -> Any:
+    """Returns the line style of a site: solid until the colours are used up."""
+    return DASHES[log.sites.index(site) // len(SITE_COLOURS) % len(DASHES)]
+
+
+def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
+    """Returns how the line of a site is drawn.
+
+    Where sites share a panel, later ones are drawn thinner, so that lines on top of each other all show.
+
+    Args:
+        log: whose site.
+        site: which one.
+        width: of the line, pt; None where sites share a panel.
+    """
+    shared = 2.0 - 1.2 * log.sites.index(site) / (len(log.sites) - 1)
+    width = shared if width is None else width
+    return {"color": site_colour(log, site), "linestyle": site_dashes(log, site), "linewidth": width}
+
+
+def site_title(log: Log, site: str) -> str:
+    """Returns what a legend calls a site."""
+    return f"{site} ({log.scenario.sites[site].role})"
+
+
+def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws one quantity over time, thinned.
+
+    Args:
+        axes: where.
+        tick: ticks, shape (K,).
+        t_s: their time, shape (K,), s.
+        values: shape (K,).
+        **options: of the line.
+    """
+    trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
+    axes.plot(trace.t_s, trace.values[:, 0], **options)
+
+
+def set_time_axis(log: Log, row: Sequence[Axes]) -> None:
+    """Gives the lowest panels their time axis: the time of the whole run, in every figure."""
+    for axes in row:
+        axes.set_xlabel("time (s)")
+        axes.set_xlim(0.0, time_axis_end_s(log))
+
+
+def time_axis_end_s(log: Log) -> float:
+    """Returns the time that figures show, s: to the end of the last record's period."""
+    return recorded_end_s(log)
+
+
+def add_legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for.
+
+    Args:
+        figure: whose.
+        entries: (text, options of the line).
+    """
+    handles = [Line2D([], [], label=text, **options) for text, options in entries]
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    for columns in range(min(len(handles), 6), 0, -1):
+        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+        if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        made.remove()
+
+
+def site_legend_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the entries of a legend of sites."""
+    return [(site_title(log, s), site_line(log, s)) for s in sites]
+
+
+def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns a figure that says why there is nothing to draw."""
+    with figure_style(form):
+        figure = new_figure(1.0, form.width_in)
+        lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
+        figure.text(0.5, 0.5, lines, ha="center", va="center", color=REFERENCE)
+    return figure
+
+
+def annotate_empty_panel(axes: Axes, text: str) -> None:
+    """Says in an empty panel why it is empty."""
+    axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
+
+
+FIGURE_FORMATS = ("pdf", "png", "svg")
+
+_FILE_RC: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "trilat-net"}
+_UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "png": {}, "svg": {"Date": None}}
+
+
+def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
+    """Writes a figure; the suffix says how: one of `FORMATS`.
+
+    Args:
+        drawn: the figure.
+        path: where to.
+        dpi: dots per inch of a .png.
+    """
+    kind = path.suffix.removeprefix(".").lower()
+    with mpl.rc_context(_FILE_RC):
+        drawn.savefig(path, format=kind, dpi=dpi, metadata=_UNDATED[kind])

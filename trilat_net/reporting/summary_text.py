@@ -1,0 +1,153 @@
+"""Summary of a run in lines for the terminal.
+
+Links, changes, modes, clocks, and messages of user laws and arms.
+
+Invariant: a link with one constant delay and no loss gets no line.
+"""
+
+from collections.abc import Sequence
+
+from ..analysis.health import ClockSummary, summarise_clock
+from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
+from ..analysis.timeline import ModeInterval, StatedModel, find_mode_intervals, list_changes
+from ..log.log_reader import Log
+
+MOST_LINES = 12
+"""Lines of each kind; what is more stands in summary.json."""
+MOST_LINE_CHARACTERS = 400
+OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
+"""Kinds of the events that tell of what came from outside of the program."""
+
+
+def format_run_lines(log: Log) -> list[str]:
+    """Returns what there is to say of a run besides its numbers: its links, changes, modes and clocks.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    return [
+        *format_outside_lines(log),
+        *format_link_lines(log),
+        *format_change_lines(log),
+        *format_mode_lines(log),
+        *format_clock_lines(log),
+    ]
+
+
+def format_outside_lines(log: Log) -> list[str]:
+    """Returns what sites said of laws and arms from outside: why one ended the run, and what was odd."""
+    return _first([_plain(event.text) for event in log.events if event.kind in OUTSIDE_EVENT_KINDS])
+
+
+def _plain(text: str) -> str:
+    """Returns what somebody wrote into a log as a line of bounded length."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:MOST_LINE_CHARACTERS])
+
+
+def format_link_lines(log: Log) -> list[str]:
+    """Returns a line per link that was not said to be constant without loss, or was not."""
+    return _first([format_link_line(use) for use in summarise_links(log) if not use.plain])
+
+
+def format_change_lines(log: Log) -> list[str]:
+    """Returns a line per change of a link or of a site's shares."""
+    lines = []
+    for changed in list_changes(log):
+        tick = changed.taken_at_tick
+        how = "" if tick is None else f", ordered at tick {tick}"
+        lines.append(f"change at {changed.change.at_s:g} s{how}: {changed.about}: {changed.text}")
+    return _first(lines)
+
+
+def format_mode_lines(log: Log) -> list[str]:
+    """Returns a line per site that held, braked or returned."""
+    lines = []
+    for site in log.sites:
+        if found := find_mode_intervals(log[site]):
+            words = [_span(span) for span in found[:MOST_LINES]]
+            more = [f"and {len(found) - MOST_LINES} more"] if len(found) > MOST_LINES else []
+            lines.append(f"{site}: {', '.join([*words, *more])}")
+    return lines
+
+
+def format_clock_lines(log: Log) -> list[str]:
+    """Returns a line per link between two clocks."""
+    lines = []
+    for site in log.sites:
+        for peer in log[site].peers:
+            use = summarise_clock(log, peer, site)
+            if use is not None and not use.shared:
+                lines.append(f"clock of {peer} seen by {site}: {format_clock(use)}")
+    return _first(lines)
+
+
+def format_link_line(use: LinkSummary) -> str:
+    """Returns what one link did, in a line."""
+    measured = any(state.link.measured for state in use.stated)
+    parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
+    if use.one_way_us is not None and measured:
+        parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
+    parts.append("no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}")
+    if use.counts is not None:
+        parts.append(_losses(use, use.counts))
+    return "; ".join(parts)
+
+
+def format_stated_models(states: Sequence[StatedModel]) -> str:
+    """Returns what a link was said to do; of many changes the last one."""
+    first, *later = states
+    words = [first.link.describe()]
+    if len(later) > 2:
+        words.append(f"{len(later) - 1} changes")
+        later = later[-1:]
+    words += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
+    return ", then ".join(words)
+
+
+def format_clock(use: ClockSummary) -> str:
+    """Returns where a clock stood, in a few words."""
+    known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
+    words = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
+    if use.drift_ppm is not None:
+        words.append(f"drift {use.drift_ppm:+.2f} ppm")
+    if use.faults:
+        words.append(f"{use.faults} samples came before they were sent: a clock has stepped")
+    return ", ".join(words)
+
+
+def _ms(spread: ValueStatistics, factor: float = 1.0) -> str:
+    values = (spread.mean, spread.deviation, spread.p99, spread.max)
+    mean, deviation, p99, largest = (_number(factor * value) for value in values)
+    return f"{mean} +- {deviation} ms (p99 {p99}, max {largest})"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+def _losses(use: LinkSummary, counts: SampleCounts) -> str:
+    said = {
+        "missing on the way": counts.missing,
+        "lost": counts.lost,
+        "late": counts.late,
+        "superseded": counts.superseded,
+        "duplicates": counts.duplicate + counts.copies,
+    }
+    words = [f"{name} {_share(count, counts.judged)}" for name, count in said.items() if count]
+    if use.burst is not None and use.burst > 1.005:
+        words.append(f"{_number(use.burst)} in a row")
+    return ", ".join(words) or "nothing lost"
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count} ({100 * count / max(of, 1):.2g} %)"
+
+
+def _span(span: ModeInterval) -> str:
+    doing = {"hold": "held", "brake": "braked", "return": "returned"}
+    return f"{doing.get(span.mode, span.mode)} {span.from_s:.3f}-{span.to_s:.3f} s"
+
+
+def _first(lines: list[str]) -> list[str]:
+    more = len(lines) - MOST_LINES
+    return lines if more <= 0 else [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]

@@ -1,0 +1,202 @@
+"""Expectations of a run: the table [expect] and its [[expect.windows]], evaluated by `trilat test`.
+
+Invariant: a key names a quantity, its limit and its unit, and its docstring defines the quantity exactly;
+an absent key asks nothing. `..._max_...` is the largest value that still holds, `..._min_...` the
+smallest; a window's key holds [least, most].
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from .fields import check_keys, field_names, suggest_nearest
+
+WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
+LeastMost = Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(min_length=2, max_length=2)]
+
+_WHERE = ("from_s", "to_s", "site")
+ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
+"""Quantities that all sites together have."""
+
+
+class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """What must hold of the ticks from one time to another, as [least, most] of each quantity.
+
+    A wall's force is that of the scenario's walls at the logged state, along their normals; of several it is
+    the sum. Where a run ends before the window does, nothing of it is measured, and nothing holds.
+
+    Attributes:
+        from_s: nominal time of its first tick, s.
+        to_s: its end, s; a tick at that time is no longer in it.
+        site: of which site; left out: of all, which only the first three quantities allow.
+        error_peak_rad: largest |e| of a joint.
+        speed_peak_rad_s: largest speed of a joint.
+        torque_peak_nm: largest control torque of a joint.
+        q1_rad: angle of joint 1, at every tick.
+        q2_rad: angle of joint 2, at every tick.
+        push1_mean_nm: torque of operator and environment ON joint 1, the mean over the ticks.
+        push2_mean_nm: the same of joint 2.
+        wall_mean_n: force of the walls, the mean over the ticks, with or without contact.
+        wall_deviation_n: its standard deviation over the ticks (of the population).
+        wall_peak_n: the largest.
+        wall_hits: how often it begins: ticks with force after one without, within the window.
+    """
+
+    from_s: WindowTime
+    to_s: WindowTime
+    site: str = ""
+    error_peak_rad: LeastMost | None = None
+    speed_peak_rad_s: LeastMost | None = None
+    torque_peak_nm: LeastMost | None = None
+    q1_rad: LeastMost | None = None
+    q2_rad: LeastMost | None = None
+    push1_mean_nm: LeastMost | None = None
+    push2_mean_nm: LeastMost | None = None
+    wall_mean_n: LeastMost | None = None
+    wall_deviation_n: LeastMost | None = None
+    wall_peak_n: LeastMost | None = None
+    wall_hits: LeastMost | None = None
+
+    @property
+    def asked(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+        """Yields what is asked: quantity, and its least and most."""
+        for key in WINDOW_QUANTITIES:
+            if (limits := getattr(self, key)) is not None:
+                yield key, limits
+
+
+WINDOW_QUANTITIES: tuple[str, ...] = tuple(key for key in field_names(ExpectWindow) if key not in _WHERE)
+"""What can be asked of a window."""
+
+
+def check_window_keys(written: Any) -> None:
+    """Refuses keys that a window does not have, as its author wrote them.
+
+    Args:
+        written: the value of `windows`; what is no list of tables is refused later.
+
+    Raises:
+        ScenarioError: with the path of the key and the nearest valid one.
+    """
+    for n, table in enumerate(written if isinstance(written, list) else []):
+        check_keys(table, field_names(ExpectWindow), f"expect.windows[{n}]")
+
+
+def find_window_problem(window: ExpectWindow, sites: Sequence[str]) -> tuple[str, str] | None:
+    """Returns what no run of a scenario could meet: (key, problem), or None; the key "" is the window itself.
+
+    Args:
+        window: what is expected.
+        sites: names of the scenario's sites.
+    """
+    if window.to_s <= window.from_s:
+        return "to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}"
+    if window.site and window.site not in sites:
+        return (
+            "site",
+            f"no site {window.site!r}{suggest_nearest(window.site, sites)}; its sites are {', '.join(sites)}",
+        )
+    asked = dict(window.asked)
+    if not asked:
+        return "", f"asks nothing; it may ask {', '.join(WINDOW_QUANTITIES)}"
+    for key, (least, most) in asked.items():
+        if not window.site and key not in ALL_SITES_QUANTITIES:
+            return "site", f"is missing: {key} is of one site; its sites are {', '.join(sites)}"
+        if least > most:
+            return key, f"must be [least, most], is [{least:g}, {most:g}]"
+    return None
+
+
+NotNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
+Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
+JointPose = Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(min_length=2, max_length=2)]
+
+END_WINDOW_S = 1.0
+"""The end of a run, where a key speaks of it: its last second."""
+
+
+class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """What must hold of every run of a scenario, for every seed.
+
+    The error of a site is e = q_i - q_id, Eq. (9); |e| is taken per joint. "Largest" and "smallest" are over
+    all sites (or links), joints and ticks of the run. A run that diverged ends there: its figures are of the
+    part before, and it fails unless `stable = false` is asked.
+
+    Attributes:
+        stable: true: no site diverges and the envelope of the largest |e| does not grow; false: one of the
+            two happens. A run too short to tell fails both, see `analysis.envelope`.
+        synchronised_by_s: from this time to the end of the run the largest |e| stays below
+            `synchronised_rad`.
+        synchronised_rad: what counts as synchronised, rad.
+        peak_error_max_rad: largest |e| of the run.
+        peak_error_min_rad: the same figure, from below: what must be seen to happen.
+        rms_error_max_rad: root mean square of e over the run, of the worst joint of any site.
+        end_error_max_rad: largest |e| of the last second.
+        end_error_min_rad: the same figure, from below.
+        end_spread_max_rad: largest difference between two sites' angles of one joint at one instant of the
+            last second, undelayed; instants are the ticks of the first site.
+        end_pose_rad: joint angles of a site's last tick, by the site's name, rad.
+        end_pose_within_rad: how far each of those angles may be off, rad.
+        peak_torque_max_nm: largest control torque of a joint.
+        peak_speed_max_rad_s: largest speed of a joint.
+        age_max_ms: largest age of the sample in use (now minus its stamp), from the first sample of a link
+            on; a link that never had one fails.
+        mean_age_max_ms: that age, averaged over a link's ticks; of the link where it is largest.
+        mean_age_min_ms: the same average, of the link where it is smallest, from below.
+        late_samples_max: samples of all links that came in too late to be used as their link meant them.
+        no_gaps: true: there is a record of every tick, from 0 to the last that any site had to make; false
+            asks nothing.
+        windows: what stretches of the run must show, see `Window`.
+    """
+
+    stable: bool | None = None
+    synchronised_by_s: NotNegative | None = None
+    synchronised_rad: Positive = 0.01
+    peak_error_max_rad: NotNegative | None = None
+    peak_error_min_rad: NotNegative | None = None
+    rms_error_max_rad: NotNegative | None = None
+    end_error_max_rad: NotNegative | None = None
+    end_error_min_rad: NotNegative | None = None
+    end_spread_max_rad: NotNegative | None = None
+    end_pose_rad: dict[str, JointPose] = {}
+    end_pose_within_rad: Positive = 0.01
+    peak_torque_max_nm: NotNegative | None = None
+    peak_speed_max_rad_s: NotNegative | None = None
+    age_max_ms: NotNegative | None = None
+    mean_age_max_ms: NotNegative | None = None
+    mean_age_min_ms: NotNegative | None = None
+    late_samples_max: Annotated[int, Meta(ge=0)] | None = None
+    no_gaps: bool = False
+    windows: tuple[ExpectWindow, ...] = ()
+
+    @property
+    def asks(self) -> bool:
+        """True where at least one key asks something; a tolerance alone does not."""
+        tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
+        return msgspec.structs.replace(self, **tolerances) != Expect()
+
+
+def find_expect_problem(expect: Expect, sites: Sequence[str]) -> tuple[str, str] | None:
+    """Returns what no run of a scenario could meet: (key below `expect`, problem), or None.
+
+    Args:
+        expect: what is expected.
+        sites: names of the scenario's sites.
+    """
+    for name in expect.end_pose_rad:
+        if name not in sites:
+            return f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}"
+    for n, one in enumerate(expect.windows):
+        if found := find_window_problem(one, sites):
+            return f"windows[{n}]{'.' * bool(found[0])}{found[0]}", found[1]
+    for least, most in (
+        ("peak_error_min_rad", "peak_error_max_rad"),
+        ("end_error_min_rad", "end_error_max_rad"),
+        ("mean_age_min_ms", "mean_age_max_ms"),
+    ):
+        low, high = getattr(expect, least), getattr(expect, most)
+        if low is not None and high is not None and low > high:
+            return least, f"must be at most {most} = {high:g}, is {low:g}"
+    return None

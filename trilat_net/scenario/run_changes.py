@@ -1,0 +1,169 @@
+"""Changes of links and of dominance during a run: scripted in the timeline, or requested while it runs.
+
+Invariant: a change is completed upon the state before it, and its text in a record is the whole change:
+every reader derives the same `CoreChange` from it.
+"""
+
+from typing import Any
+
+import msgspec
+
+from ..core.ticks import NS_PER_S, CoreChange
+from ..errors import ScenarioError
+from .fields import TomlTable, check_keys, field_names, is_number, suggest_nearest
+from .resolve_links import resolve_dominance_row, resolve_link
+from .scenario_types import Change, Scenario
+from .validate import check_change
+
+LinkTables = dict[str, dict[str, Any]]
+
+
+def initial_link_tables(scenario: Scenario) -> LinkTables:
+    """Returns what every link is at the start, as tables."""
+    return {name: msgspec.to_builtins(link) for name, link in scenario.links.items()}
+
+
+def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int) -> Change:
+    """Returns a change that somebody ordered, complete and checked.
+
+    Args:
+        scenario: the experiment.
+        present: what every link is now.
+        written: `link` or `dominance`, and what it is `to` be, as in a scenario's timeline.
+        from_ns: from when it holds, ns since the epoch.
+
+    Raises:
+        ScenarioError: there is no such link or site, or it cannot be that.
+    """
+    change: dict[str, Any] = {**written, "at_s": from_ns / NS_PER_S}
+    if ("link" in change) == ("dominance" in change):
+        raise ScenarioError("a change names either a link or, as dominance, a site")
+    if "link" in change:
+        change["to"] = change_link(change.get("to", {}), change["link"], present, "change")
+        if change["to"]["model"] == "trace":  # a record cannot hold it
+            raise ScenarioError("a link with a trace can only be given another model", path="change.to")
+    else:
+        change["to"] = change_dominance_row(
+            change.get("to", {}), change["dominance"], list(scenario.names), "change"
+        )
+    try:
+        complete = msgspec.convert(change, Change)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(str(error), path="change") from None
+    check_change(complete, "change")
+    return complete
+
+
+def find_owner(change: Change) -> str:
+    """Returns the site that carries a change out: a link belongs to its receiver."""
+    return change.dominance or change.link.partition("->")[2]
+
+
+def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
+    """Returns a change as its owner takes it in."""
+    text = msgspec.json.encode(change).decode()
+    site = find_owner(change)
+    if change.dominance:
+        return CoreChange(text, ramp=scenario.ramp(site, change.shares, change.start_ns, change.ramp_s))
+    peer = scenario.peers(site).index(change.link.partition("->")[0])
+    return CoreChange(text, peer=peer, model=change.after.core(change.start_ns))
+
+
+def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
+    """Returns the command that a record of a site names.
+
+    Raises:
+        ScenarioError: it names none of that site's.
+    """
+    try:
+        change = msgspec.json.decode(text, type=Change)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise ScenarioError(f"the record names a command that is none: {error}", path=text[:80]) from None
+    if change.link not in ("", *scenario.links) or change.dominance not in ("", *scenario.names):
+        raise ScenarioError(
+            "the record names a command for a link or site that does not exist", path=text[:80]
+        )
+    if find_owner(change) != site or bool(change.link) == bool(change.dominance):
+        raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
+    check_change(change, "cmd")
+    if change.dominance:
+        change_dominance_row(change.to, change.dominance, list(scenario.names), "cmd")
+    return to_core_change(scenario, change)
+
+
+def scheduled_link_tables(scenario: Scenario) -> list[tuple[int, str, dict[str, Any]]]:
+    """Returns what links become by the scenario's own timeline: (from when, ns, the link, its table)."""
+    return [(change.start_ns, change.link, change.to) for change in scenario.timeline if change.link]
+
+
+def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
+    """Returns the changes, each complete in itself, checked against the sites and the change before."""
+    if not isinstance(written, list):
+        raise ScenarioError("must be a list of tables [[timeline]]", path="timeline")
+    present = dict(links)
+    changes = []
+    before_s = 0.0
+    for n, entry in enumerate(written):
+        path = f"timeline[{n}]"
+        change = dict(check_keys(entry, field_names(Change), path))
+        at_s = change.get("at_s")
+        if not is_number(at_s):
+            raise ScenarioError("must be a time in s", path=f"{path}.at_s")
+        if at_s < before_s:
+            raise ScenarioError(
+                f"must not be before the change above it, {before_s:g} s", path=f"{path}.at_s"
+            )
+        before_s = at_s
+        if ("link" in change) == ("dominance" in change):
+            raise ScenarioError("names either a link or, as dominance, a site", path=path)
+        for key in ("link", "dominance"):
+            if not isinstance(change.get(key, ""), str):
+                raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
+        if "link" in change:
+            change["to"] = present[change["link"]] = change_link(
+                change.get("to", {}), change["link"], present, path
+            )
+        else:
+            change["to"] = change_dominance_row(change.get("to", {}), change["dominance"], names, path)
+        changes.append(change)
+    return changes
+
+
+def change_link(written: Any, link: str, present: TomlTable, path: str) -> TomlTable:
+    """Returns what a link becomes.
+
+    Args:
+        written: what is to change of it.
+        link: its name.
+        present: what every link is now.
+        path: what errors call the change.
+    """
+    if link not in present:
+        hint = suggest_nearest(link, list(present)) or f"; links are {', '.join(present)}"
+        raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
+    after = resolve_link(written, present[link], f"{path}.to")
+    before = present[link]
+    if "file" in after or "of" in after:
+        raise ScenarioError("no file can be named here", path=f"{path}.to.file")
+    if after["model"] == "trace" and after.get("trace") != before.get("trace"):
+        raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
+    if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
+        raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
+    return {**after, "outages_s": before["outages_s"]} if "outages_s" in before else after
+
+
+def change_dominance_row(written: Any, site: str, names: list[str], path: str) -> TomlTable:
+    """Returns a row of the dominance matrix, complete and checked.
+
+    Args:
+        written: the shares; a peer that is not named has none.
+        site: whose row it is.
+        names: the sites.
+        path: what errors call the change.
+    """
+    if site not in names:
+        hint = suggest_nearest(site, names) or f"; sites are {', '.join(names)}"
+        raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
+    return resolve_dominance_row(
+        check_keys(written, names, f"{path}.to"), names, names.index(site), f"{path}.to"
+    )

@@ -1,0 +1,174 @@
+"""Scenarios by name, by path or from a log, with overrides applied.
+
+Invariant: text from a log or a peer is not trusted: it names no file, and its links fit into
+`MAX_LINKS_BYTES`.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ..core.delay import MAX_DELAY_US
+from ..core.link import AHEAD_LIMIT_S, SAMPLE_DTYPE, calendar_pages
+from ..errors import ScenarioError
+from .fields import TomlTable, suggest_nearest
+from .override import apply_overrides, expand_overrides, parse_overrides
+from .resolve import resolve_scenario
+from .scenario_types import Scenario, SiteSpec
+from .validate import build_scenario
+
+MAX_LINKS_BYTES = 64 << 20
+"""Memory of a site's links, at most, in a scenario that somebody else wrote."""
+
+_FOLDER = resources.files("trilat_net") / "scenarios"
+
+
+def list_shipped() -> list[str]:
+    """Returns the names of the scenarios that come with the package."""
+    names = (entry.name for entry in _FOLDER.iterdir())
+    return sorted(n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_"))
+
+
+def read_shipped(name: str) -> str:
+    """Returns the text of a shipped scenario as its author wrote it."""
+    if name not in list_shipped():
+        raise ScenarioError(
+            f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
+            f"shipped are {', '.join(list_shipped())}; a file is named by its path, as in ./mine.toml",
+            source=name,
+        )
+    return (_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def read_template() -> str:
+    """Returns the commented template of a scenario, valid as it stands."""
+    return (_FOLDER / "_template.toml").read_text(encoding="utf-8")
+
+
+def load_scenario(
+    source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[str] = ()
+) -> Scenario:
+    """Returns a scenario by the name of a shipped one or by path, with overrides applied.
+
+    Args:
+        source: a shipped name, a path, or a scenario, in which a key of a group counts for all (`spreading`).
+        overrides: `{"control.Kd": 5}` or `["control.Kd=5"]`.
+
+    Raises:
+        ScenarioError: the source cannot be read or is not a valid scenario.
+    """
+    if isinstance(source, Scenario):
+        try:
+            return (
+                parse_scenario(source.text, source.name, expand_overrides(source, parse_overrides(overrides)))
+                if overrides
+                else source
+            )
+        except ScenarioError as error:
+            raise ScenarioError(error.problem, path=error.path, source=source.name) from None
+    text, folder = read_source(source)
+    return parse_scenario(text, str(source), overrides, folder)
+
+
+def read_source(source: str | Path) -> tuple[str, Path]:
+    """Returns a scenario as its author wrote it, and the folder where files lie that it names.
+
+    Args:
+        source: a shipped name, or a path.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    name = str(source)
+    if not (isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name):
+        return read_shipped(name), Path()
+    try:
+        return Path(source).read_text(encoding="utf-8"), Path(source).parent
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ScenarioError(f"cannot be read: {reason}", source=name) from None
+
+
+def find_site(scenario: Scenario, name: str) -> SiteSpec:
+    """Returns a site of a scenario.
+
+    Raises:
+        ScenarioError: it has none of that name.
+    """
+    if name not in scenario.sites:
+        hint = suggest_nearest(name, scenario.names)
+        raise ScenarioError(
+            f"no site {name!r}{hint}; its sites are {', '.join(scenario.names)}", source=scenario.name
+        )
+    return scenario.sites[name]
+
+
+def parse_scenario(
+    text: str,
+    source: str = "",
+    overrides: Mapping[str, Any] | Sequence[str] = (),
+    folder: Path | None = Path(),
+) -> Scenario:
+    """Returns the scenario that a TOML text describes.
+
+    Args:
+        text: the TOML text.
+        source: what errors call it.
+        overrides: see `load`.
+        folder: where the files that it names lie; None where it may name none.
+
+    Raises:
+        ScenarioError: with the path of the offending key.
+    """
+    try:
+        tables = _tables(text)
+        apply_overrides(tables, overrides)
+        return build_scenario(resolve_scenario(tables, folder))
+    except ScenarioError as error:
+        raise ScenarioError(error.problem, path=error.path, source=source) from None
+    except RecursionError:
+        raise ScenarioError("is nested too deep", source=source) from None
+
+
+def _tables(text: str) -> TomlTable:
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
+        raise ScenarioError(f"is not TOML: {error}") from None
+
+
+def parse_embedded(text: str, source: str = "") -> Scenario:
+    """Returns the scenario that a log or a peer holds: resolved, and written by who knows whom.
+
+    Args:
+        text: the TOML text.
+        source: what errors call it.
+
+    Raises:
+        ScenarioError: it is none, or names a file, or leaves to defaults what would fill the memory.
+    """
+    scenario = parse_scenario(text, source, folder=None)
+    changed = (change.after for change in scenario.timeline if change.link)
+    traces = sum(len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed))
+    if traces > len(text):
+        raise ScenarioError("its traces are not written out, link by link", source=source)
+    for name in scenario.names:
+        rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(name)]
+        if sum(map(_pages_at_most, rates)) * SAMPLE_DTYPE.itemsize <= MAX_LINKS_BYTES:
+            continue  # plainly little: the compiled core takes half a second to load, and a log opens faster
+        pages = sum(map(calendar_pages, rates))
+        if pages * SAMPLE_DTYPE.itemsize > MAX_LINKS_BYTES:
+            wanted = pages * SAMPLE_DTYPE.itemsize >> 20
+            raise ScenarioError(
+                f"its links would take {wanted} MiB, at most {MAX_LINKS_BYTES >> 20} are given",
+                path=f"sites.{name}",
+                source=source,
+            )
+    return scenario
+
+
+def _pages_at_most(rate_hz: int) -> int:
+    """Returns what `calendar_pages` does not exceed."""
+    return 2 * ((MAX_DELAY_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3)

@@ -1,0 +1,333 @@
+"""The types of a complete scenario.
+
+Sites, scripted changes, the scenario itself, and the core's setup of each site.
+
+Invariant: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it loads to the
+same scenario, and its SHA-256 names the experiment. A change names the time from which it holds and is
+complete in itself.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import tomli_w
+from msgspec import Meta
+
+from ..core import dominance
+from ..core.philox import link_key
+from ..core.site_setup import LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
+from ..core.ticks import DominanceRamp
+from ..core.two_link_arm import ArmLinks, theta_from_links
+from ..core.vectors import Array
+from .delay_models import Link, LinkBase
+from .expect import Expect
+from .fields import Frozen, Joints, NotNegative, Positive, RateHz
+from .laws import ControlLaw, ImportedLaw
+from .operators import Environment, Operator
+
+
+class Arm(Frozen, frozen=True):
+    """The two links of a planar arm; defaults are the paper's, as point masses at the link ends.
+
+    Attributes:
+        l1_m: length of link 1, m.
+        m1_kg: mass of link 1, kg.
+        lc1_m: distance of its centre of mass from joint 1, m.
+        I1_kg_m2: inertia about its centre of mass, kg m^2.
+        l2_m: length of link 2, m.
+        m2_kg: mass of link 2, kg.
+        lc2_m: distance of its centre of mass from joint 2, m.
+        I2_kg_m2: inertia about its centre of mass, kg m^2.
+        g_m_s2: gravitational acceleration, m/s^2.
+        known: false where nobody knows masses and inertias, as of a real arm that was not identified: they
+            are then in no formula. Only for an arm outside of the program.
+    """
+
+    l1_m: Positive = 1.0
+    m1_kg: Positive = 1.0
+    lc1_m: NotNegative = 1.0
+    I1_kg_m2: NotNegative = 0.0
+    l2_m: Positive = 1.0
+    m2_kg: Positive = 1.0
+    lc2_m: Positive = 1.0
+    I2_kg_m2: NotNegative = 0.0
+    g_m_s2: NotNegative = 9.81
+    known: bool = True
+
+    @property
+    def theta(self) -> Array:
+        """True parameters of Eq. (24), shape (5,)."""
+        return theta_from_links(ArmLinks(**{name: getattr(self, name) for name in ArmLinks._fields}))
+
+
+class OnStale(Frozen, frozen=True, omit_defaults=True):
+    """What a site does about a peer whose sample in use is too old.
+
+    Attributes:
+        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is.
+        age_ms: older than this is too old, ms.
+        return_s: how long the way back takes once a fresh sample is in use, s.
+    """
+
+    action: Literal["use", "hold", "brake"] = "use"
+    age_ms: Annotated[float, Meta(gt=0.0, le=1e6)] = 350.0
+    return_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
+
+    @property
+    def rule(self) -> StaleRule:
+        """The same, as the core has it."""
+        return StaleRule(
+            StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
+        )
+
+
+class Limits(Frozen, frozen=True):
+    """Where a run stops being physics.
+
+    Attributes:
+        tau_limit_nm: largest control torque of a joint, N m; more is cut off.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s.
+    """
+
+    tau_limit_nm: Positive = 200.0
+    qd_limit_rad_s: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 100.0
+
+
+class SiteSpec(Frozen, frozen=True):
+    """One manipulator.
+
+    Attributes:
+        role: what it is to a reader of figures; enters no formula.
+        rate_hz: tick rate of its loop, Hz.
+        q0_rad: start pose, rad.
+        qd0_rad_s: start velocity, rad/s.
+        arm: its links.
+        control: its law and gains.
+        limits: where it stops.
+        on_stale: what it does about a peer whose samples are too old.
+        hands: what its operator does.
+        environment: what it meets.
+        plant: "simulated"; or "external": an arm outside of the program, whose measured state comes in.
+    """
+
+    role: Literal["master", "slave"]
+    rate_hz: RateHz
+    q0_rad: Joints
+    qd0_rad_s: Joints
+    arm: Arm
+    control: ControlLaw
+    limits: Limits
+    on_stale: OnStale = OnStale()
+    hands: tuple[Operator, ...] = ()
+    environment: tuple[Environment, ...] = ()
+    plant: Literal["simulated", "external"] = "simulated"
+
+
+class Change(Frozen, frozen=True, omit_defaults=True):
+    """One change. Exactly one of `link` and `dominance` is given.
+
+    Attributes:
+        at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then on.
+        link: the link that it changes, as in "m1->s".
+        dominance: the site whose shares it changes.
+        to: all that the link is from then on, or all shares of the row.
+        ramp_s: how long shares take to change, linearly, s.
+    """
+
+    at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
+    link: str = ""
+    dominance: str = ""
+    to: dict[str, Any] = msgspec.field(default_factory=dict)
+    ramp_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+
+    @property
+    def start_ns(self) -> int:
+        """When it takes effect, ns since the epoch."""
+        return round(self.at_s * 1e9)
+
+    @property
+    def after(self) -> LinkBase:
+        """The link from then on."""
+        return msgspec.convert(self.to, Link)  # type: ignore[no-any-return]
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The shares at the end of the change."""
+        return self.to
+
+
+def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
+    """Yields what a link becomes, with the first stamp for which it holds, ns, in order."""
+    for change in timeline:
+        if change.link == name:
+            yield change.start_ns, change.after
+
+
+_UNASKED: dict[str, tuple[Any, ...]] = {
+    "timeline": ((), []),
+    "expect": ({},),
+    "on_stale": ({},),
+    "environment": ((), []),
+    "plant": ("simulated",),
+}
+"""Keys that older scenarios do not have, and the values that say nothing."""
+_NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
+
+
+def _one_line(numbers: re.Match[str]) -> str:
+    """Puts a list of numbers on one line."""
+    return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
+
+
+class Scenario(Frozen, frozen=True, dict=True):
+    """An experiment, resolved: every value of every site and link is explicit.
+
+    Attributes:
+        name: what the session and the log are called.
+        title: one line for people.
+        about: a paragraph for people.
+        assumed: what the source of the experiment does not say, and is assumed here.
+        duration_s: how long it runs, s.
+        seed: what every random draw is a function of.
+        scheme: "second_order" or "digital", see `core.site.Scheme`.
+        sites: the manipulators, in order; the first leads a live session.
+        dominance: row i, column j: share of site j in the reference of site i, Eq. (6).
+        links: "j->i" for every pair of sites.
+        timeline: what changes during the run.
+        expect: what `trilat test` demands of it.
+    """
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
+    duration_s: Annotated[float, Meta(gt=0.0, le=86_400.0)]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
+    scheme: Literal["second_order", "digital"]
+    sites: dict[str, SiteSpec]
+    dominance: dict[str, dict[str, float]]
+    links: dict[str, Link]
+    timeline: tuple[Change, ...] = ()
+    expect: Expect = Expect()
+    title: str = ""
+    about: str = ""
+    assumed: tuple[str, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites, in order."""
+        return tuple(self.sites)
+
+    @cached_property
+    def alpha(self) -> Array:
+        """The dominance matrix, shape (N, N), Eq. (6)."""
+        return np.array([[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names])
+
+    @property
+    def beta(self) -> Array | None:
+        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None where alpha is reducible."""
+        return dominance.perron_vector(self.alpha) if dominance.is_irreducible(self.alpha) else None
+
+    @cached_property
+    def text(self) -> str:
+        """The canonical TOML text."""
+        tables: dict[str, Any] = msgspec.to_builtins(self)
+        words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
+        words = {key: value for key, value in words.items() if value}
+        for site in tables["sites"].values():
+            if site["arm"]["known"]:
+                del site["arm"]["known"]
+        for table in (tables, *tables["sites"].values()):
+            for key, unasked in _UNASKED.items():  # what nobody asked for is not there
+                if table.get(key) in unasked:
+                    del table[key]
+        numbers = _NUMBERS.sub(_one_line, tomli_w.dumps(tables))
+        return tomli_w.dumps(words, multiline_strings=True) + numbers
+
+    @cached_property
+    def sha256(self) -> str:
+        """Names the experiment: hash of the canonical text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def ticks(self, site: str) -> int:
+        """Returns how many ticks a site makes."""
+        return max(1, round(self.duration_s * self.sites[site].rate_hz))
+
+    def peers(self, site: str) -> tuple[str, ...]:
+        """Returns the peers of a site, in scenario order."""
+        return tuple(name for name in self.names if name != site)
+
+    def _all_links(self) -> list[LinkBase]:
+        """Returns what every link is at any time of the run."""
+        later = [link for name in self.links for _, link in scheduled_links(self.timeline, name)]
+        return [*self.links.values(), *later]
+
+    @property
+    def random(self) -> bool:
+        """True where anything is drawn: then another seed is another run."""
+        return any(link.random for link in self._all_links())
+
+    @property
+    def measured(self) -> bool:
+        """True where a sample of some link is in use as soon as it has come: then the network decides."""
+        return any(link.measured for link in self._all_links())
+
+    @property
+    def external(self) -> tuple[str, ...]:
+        """The sites whose arms are outside of the program."""
+        return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
+    def setup(self, site: str) -> SiteSetup:
+        """Returns all that the core needs to build a site."""
+        spec = self.sites[site]
+        return SiteSetup(
+            name=site,
+            rate_hz=spec.rate_hz,
+            scheme=Scheme[self.scheme.upper()],
+            gains=spec.control.gains(spec.arm.theta),
+            theta=spec.arm.theta,
+            g_m_s2=spec.arm.g_m_s2,
+            lengths_m=(spec.arm.l1_m, spec.arm.l2_m),
+            tau_limit_nm=spec.limits.tau_limit_nm,
+            qd_limit_rad_s=spec.limits.qd_limit_rad_s,
+            q0=spec.q0_rad,
+            qd0=spec.qd0_rad_s,
+            actors=tuple(one.actor for one in (*spec.hands, *spec.environment)),
+            links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
+            ramps=tuple(
+                self.ramp(site, change.shares, change.start_ns, change.ramp_s)
+                for change in self.timeline
+                if change.dominance == site
+            ),
+            on_stale=spec.on_stale.rule,
+            external=spec.plant == "external",
+            own=spec.control.maker(len(self.sites)) if isinstance(spec.control, ImportedLaw) else None,
+            theta_known=spec.arm.known,
+        )
+
+    def _link_setup(self, peer: str, site: str) -> LinkSetup:
+        name = f"{peer}->{site}"
+        first = self.links[name]
+        models: list[tuple[int, LinkBase]] = [(0, first), *scheduled_links(self.timeline, name)]
+        return LinkSetup(
+            peer=peer,
+            alpha=self.dominance[site].get(peer, 0.0),
+            rate_hz=self.sites[peer].rate_hz,
+            q0=self.sites[peer].q0_rad,
+            key=link_key(self.seed, name),
+            models=tuple(link.core(from_ns) for from_ns, link in models),
+            traces=tuple(link.points for _, link in models),
+            outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
+        )
+
+    def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> DominanceRamp:
+        """Returns a change of a site's shares, as the core has it."""
+        alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
+        return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
+
+    def without_hands(self) -> "Scenario":
+        """Returns the same experiment with nobody at the arms: the twin that hands are measured against."""
+        sites = {name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()}
+        return msgspec.structs.replace(self, sites=sites)

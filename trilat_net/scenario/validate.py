@@ -1,0 +1,232 @@
+"""Validation: resolved tables become types, and what does not fit becomes an error with the key's path.
+
+Invariant: what a law needs and a scenario does not give (knowledge of the arm, a number of sites) is
+refused before anything runs, with the reason.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, get_args
+
+import msgspec
+
+from ..core.two_link_arm import is_positive_definite
+from ..errors import ScenarioError
+from . import expect
+from .delay_models import ConstantDelay, Link, LinkBase, TraceDelay
+from .fields import TomlTable
+from .laws import AdaptiveBox, ForceReflecting, ProportionalDamped, ProportionalDerivativeDamped
+from .operators import EndEffectorSpring, Environment, JointSpring, Operator, RecordedTorque, Wall
+from .scenario_types import Change, OnStale, Scenario, SiteSpec
+
+FORCE_REFLECTION_SITES = 2
+"""Sites of direct force reflection: one master, one slave."""
+
+
+def check_law(name: str, site: SiteSpec, sites: int) -> None:
+    """Refuses a law that its site cannot carry out, and an arm that is not what its plant says.
+
+    Args:
+        name: the site's name.
+        site: the site.
+        sites: how many there are in the experiment.
+
+    Raises:
+        ScenarioError: with the path of the key.
+    """
+    path, law = f"sites.{name}", site.control
+    outside = site.plant == "external"
+    if not site.arm.known and not outside:
+        raise ScenarioError(
+            "a simulated arm moves by its masses: leave it true, or set plant = 'external' for an arm "
+            "outside of the program",
+            path=f"{path}.arm.known",
+        )
+    if isinstance(law, AdaptiveBox):
+        _check_box(law, f"{path}.control")
+    if isinstance(law, ForceReflecting) and sites != FORCE_REFLECTION_SITES:
+        raise ScenarioError(
+            f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more of "
+            "them it is not said whose contact a site feels; choose p_d, pd_d or adaptive, or two sites",
+            path=f"{path}.control.law",
+        )
+    if (
+        isinstance(law, ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting)
+        and not site.arm.known
+        and law.gravity * site.arm.g_m_s2 > 0.0
+    ):
+        raise ScenarioError(
+            f"{law.__struct_config__.tag} takes gravity from the arm's masses, which nobody knows "
+            "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
+            "horizontal plane, or choose adaptive, which learns it",
+            path=f"{path}.control.gravity",
+        )
+    for group in ("hands", "environment") if outside else ():
+        if getattr(site, group):
+            raise ScenarioError(
+                "an arm outside of the program is pushed outside of it: leave them out",
+                path=f"{path}.{group}",
+            )
+
+
+def _check_box(law: AdaptiveBox, path: str) -> None:
+    """Refuses a box without an inside, and a first estimate that is not in it."""
+    for n, (low, first, high) in enumerate(zip(law.theta_low, law.theta_hat0, law.theta_high, strict=True)):
+        if low > high:
+            raise ScenarioError(
+                f"must be at least theta_low = {low:g}, is {high:g}", path=f"{path}.theta_high[{n}]"
+            )
+        if not low <= first <= high:
+            raise ScenarioError(
+                f"must lie in its box from {low:g} to {high:g}, is {first:g}", path=f"{path}.theta_hat0[{n}]"
+            )
+
+
+_CHOICES = {
+    key: get_args(kind.__annotations__[key])
+    for kind, key in (
+        (Scenario, "scheme"),
+        (SiteSpec, "role"),
+        (SiteSpec, "plant"),
+        (LinkBase, "order"),
+        (TraceDelay, "at_end"),
+        (OnStale, "action"),
+    )
+}
+
+
+def build_scenario(resolved: TomlTable) -> Scenario:
+    """Turns resolved tables into types; wrong types and ranges become errors with the key's path."""
+    try:
+        scenario = msgspec.convert(resolved, Scenario)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at ")
+        dotted = _dotted(resolved, path.strip("`"))
+        raise ScenarioError(_plain(problem, dotted), path=dotted) from None
+    for name, site in scenario.sites.items():
+        if not is_positive_definite(site.arm.theta):
+            raise ScenarioError(
+                "its inertia matrix is singular in some pose: give the links mass away from their joints",
+                path=f"sites.{name}.arm",
+            )
+        check_law(name, site, len(scenario.sites))
+        _check_actors(site.hands, f"sites.{name}.hands")
+        _check_actors(site.environment, f"sites.{name}.environment")
+    for name, link in scenario.links.items():
+        if found := link.fault():
+            raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
+    _check_stale_rules(scenario)
+    for n, change in enumerate(scenario.timeline):
+        check_change(change, f"timeline[{n}]")
+    scenario = msgspec.structs.replace(scenario, timeline=tuple(map(_spelt, scenario.timeline)))
+    if expected := expect.find_expect_problem(scenario.expect, scenario.names):
+        key, problem = expected
+        raise ScenarioError(problem, path=f"expect.{key}")
+    return scenario
+
+
+def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
+    """Refuses what ends before it begins, a wall without a side, and recorded torque out of order."""
+    for n, actor in enumerate(actors):
+        if isinstance(actor, RecordedTorque):
+            if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
+                raise ScenarioError("must be in the order of their times", path=f"{path}[{n}].points")
+            continue
+        if actor.end_s <= actor.start_s:
+            raise ScenarioError(
+                f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}",
+                path=f"{path}[{n}].end_s",
+            )
+        if isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
+            raise ScenarioError("must point somewhere, is zero", path=f"{path}[{n}].normal")
+        if isinstance(actor, JointSpring | EndEffectorSpring) and actor.move_end_s < actor.move_start_s:
+            raise ScenarioError(
+                f"must not be before move_start_s = {actor.move_start_s:g}, is {actor.move_end_s:g}",
+                path=f"{path}[{n}].move_end_s",
+            )
+
+
+def _spelt(change: Change) -> Change:
+    """Returns a change with its link spelt as in `links`, so that 350 and 350.0 are one experiment."""
+    if not change.link:
+        return change
+    return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
+
+
+def _check_stale_rules(scenario: Scenario) -> None:
+    """Refuses a rule by which a site would hold for ever: its links' delay alone is older than that."""
+    for name, site in scenario.sites.items():
+        for peer in scenario.peers(name):
+            link = scenario.links[f"{peer}->{name}"]
+            delay_ms = max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
+            follows = scenario.dominance[name].get(peer, 0.0) > 0.0
+            if site.on_stale.action != "use" and follows and delay_ms >= site.on_stale.age_ms:
+                raise ScenarioError(
+                    f"must be above the {delay_ms:g} ms of {peer}->{name}, is {site.on_stale.age_ms:g}: "
+                    f"the site would never follow {peer}",
+                    path=f"sites.{name}.on_stale.age_ms",
+                )
+
+
+def check_change(change: Change, path: str) -> None:
+    """Refuses a change that makes no link of its link."""
+    if not change.link:
+        return
+    if change.ramp_s:
+        raise ScenarioError("a link changes at once; only shares have a ramp", path=f"{path}.ramp_s")
+    try:
+        found = change.after.fault()
+    except msgspec.ValidationError as error:
+        problem, _, key = str(error).partition(" - at ")
+        raise ScenarioError(_plain(problem, key.strip("`$.")), path=f"{path}.to{key.strip('`$')}") from None
+    if found:
+        raise ScenarioError(found.problem, path=f"{path}.to.{found.key}")
+
+
+def _plain(problem: str, path: str) -> str:
+    """Puts a validation message into the words of a scenario's author."""
+    if problem.startswith("Invalid enum value"):
+        choices = _CHOICES[path.rpartition(".")[2]]
+        return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"
+    if problem.startswith("Object missing required field"):
+        return f"{problem.split()[-1].strip('`')} is missing"
+    words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
+    for old, new in words:
+        problem = problem.replace(old, new)
+    return problem
+
+
+def _dotted(resolved: TomlTable, path: str) -> str:
+    """Turns `$.sites[...].control.Kp[0]` into the dotted path of the first value that it can mean."""
+    parts = re.findall(r"\.?([^.\[\]]+|\[[^\]]*\])", path.removeprefix("$"))
+    return _search(resolved, [p for p in parts if p], "") or path.removeprefix("$.")
+
+
+def _search(value: Any, parts: list[str], path: str) -> str:
+    """Follows the parts; where one is `[...]` (any key), takes the entry whose value breaks the rule."""
+    if not parts:
+        return path
+    head, rest = parts[0], parts[1:]
+    if head == "[...]":
+        found = ""
+        for key in value:
+            found = _search(value[key], rest, f"{path}.{key}")
+            if found and not _valid_entry(path, value[key]):
+                return found
+        return found
+    if head.startswith("["):
+        return _search(value[int(head[1:-1])], rest, f"{path}{head}")
+    if isinstance(value, dict) and head in value:
+        return _search(value[head], rest, f"{path}.{head}" if path else head)
+    return f"{path}.{head}" if path else head
+
+
+def _valid_entry(folder: str, entry: Any) -> bool:
+    kind: Any = {"sites": SiteSpec, "links": Link}.get(folder)
+    try:
+        msgspec.convert(entry, kind)
+    except msgspec.ValidationError:
+        return False
+    return True

@@ -1,1 +1,0 @@
-"""Virtual time: the same sites, joined by a simulated network, as fast as the machine can."""

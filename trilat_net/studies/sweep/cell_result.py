@@ -1,0 +1,173 @@
+"""The class and the numbers of one cell.
+
+Runs its scenario, extends an undecided run, and classifies how it ends.
+
+Invariant: a result is a function of the cell's scenario and its longest extension; the class follows from
+the same numbers as the certificate, so a log of the same run gets the same one.
+"""
+
+import math
+from enum import StrEnum
+
+import msgspec
+
+from ...analysis.run_end import EndBehaviour, classify_run_end
+from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...errors import ScenarioError
+from ...execution.fused import FusedRun, check_fusable
+from ...scenario import Scenario, parse_scenario
+
+
+class CellClass(StrEnum):
+    """What a cell is; the text is the word for people and in results."""
+
+    CONVERGED = "converged"
+    BOUNDED = "bounded oscillation"
+    DIVERGED = "diverged"
+    UNDECIDED = "undecided"
+
+    @property
+    def stable(self) -> bool | None:
+        """True where errors die away, False where they stay or grow; None where nobody knows."""
+        return None if self is CellClass.UNDECIDED else self is CellClass.CONVERGED
+
+
+CLASS_OF_MOTION = {
+    EndBehaviour.CONVERGED: CellClass.CONVERGED,
+    EndBehaviour.DECAYS: CellClass.CONVERGED,
+    EndBehaviour.BOUNDED: CellClass.BOUNDED,
+    EndBehaviour.GROWS: CellClass.DIVERGED,
+    EndBehaviour.DIVERGED: CellClass.DIVERGED,
+    EndBehaviour.UNDECIDED: CellClass.UNDECIDED,
+}
+"""What is called what, of the motions that `certificate.growth` tells."""
+
+
+class CellResult(msgspec.Struct, frozen=True):
+    """One cell, run and judged.
+
+    Attributes:
+        verdict: what it is.
+        motion: the word of the certificate, which tells growing from diverged and decaying from converged.
+        ran_s: how long it ran in the end, extensions and an early stop included, s.
+        extended: how often its time was doubled because it had not been decided.
+        end_error_rad: the largest abs(e) of the last second, rad.
+        end_speed_rad_s: the largest abs(qd) of the last second, rad/s.
+        error_rate_per_s: the trend of abs(e) over the second half: it goes as exp(rate t), 1/s; None where it
+            has none.
+        speed_rate_per_s: the same of abs(qd).
+        peak_error_rad: the largest abs(e) of the run, rad.
+        settled_s: since when abs(e) is below 0.01 rad; None where it is not at the end.
+        diverged_s: when the first site left its limits, or None.
+    """
+
+    verdict: CellClass
+    motion: EndBehaviour
+    ran_s: float
+    extended: int
+    end_error_rad: float
+    end_speed_rad_s: float
+    error_rate_per_s: float | None
+    speed_rate_per_s: float | None
+    peak_error_rad: float
+    settled_s: float | None
+    diverged_s: float | None
+
+
+FLAT_LOG_CHANGE = 0.02
+"""An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
+
+
+def check_sweepable(scenario: Scenario) -> None:
+    """Refuses what cannot be run without a network, or not fast.
+
+    Raises:
+        ScenarioError: a link has the delay of a real network, which here would be one tick; or see
+            `sim.fused.check_fuses`.
+    """
+    if scenario.measured:
+        raise ScenarioError(
+            "a measured link has the delay of a real network, and a sweep runs without one: give it a model, "
+            "as in link.model=constant and link.delay_ms=50",
+            path="link.model",
+        )
+    check_fusable(scenario)
+
+
+def classify_cell(text: str, longest_s: float) -> CellResult:
+    """Runs a cell in virtual time and returns what became of it.
+
+    A run that has not made itself plain when its time is over (see `plain`) goes on for as long again, and so
+    on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for a
+    trend of a run in which anything is drawn: such errors wander, and a slow trend is chance.
+
+    Args:
+        text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
+        longest_s: how long it may run in the end, s; not more than its own time: it is never extended.
+    """
+    scenario = parse_scenario(text)
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    ends_s = scenario.duration_s
+    run.advance(ends_s)
+    extended = 0
+    while not is_conclusive(outcome := _cell_result(run, extended)) and ends_s < longest_s:
+        ends_s = min(2.0 * ends_s, longest_s)
+        extended += 1
+        run.advance(ends_s)
+    wanders = (
+        scenario.random
+        and outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
+        and not _pronounced(outcome)
+    )
+    return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED) if wanders else outcome
+
+
+def is_conclusive(outcome: CellResult) -> bool:
+    """True where a longer run would hardly be called something else.
+
+    That is: it left its limits; or it came to rest; or it grows, and the largest speed at least doubled over
+    the second half; or neither that nor the largest error changed by more than `FLAT`. Near the edge of
+    stability a finite run looks steady whatever it does later, and what decays may hide what grows slowly
+    until it is gone.
+    """
+    if outcome.motion is EndBehaviour.BOUNDED:
+        return max(map(abs, _changes(outcome))) <= FLAT_LOG_CHANGE
+    if outcome.motion is EndBehaviour.GROWS:
+        return _pronounced(outcome)
+    return outcome.motion in (EndBehaviour.DIVERGED, EndBehaviour.CONVERGED)
+
+
+def _pronounced(outcome: CellResult) -> bool:
+    """True where over the second half the largest speed doubled, or that and the largest error halved."""
+    error, speed = _changes(outcome)
+    return speed >= math.log(2.0) or max(error, speed) <= -math.log(2.0)
+
+
+def _changes(outcome: CellResult) -> tuple[float, float]:
+    """Returns by how much the logarithms of the largest |e| and |qd| change over the second half."""
+    half_s = 0.5 * outcome.ran_s
+    return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
+
+
+def _cell_result(run: FusedRun, extended: int) -> CellResult:
+    maxima = run.maxima
+    end = classify_run_end(maxima, run.ran_s)
+    diverged_s = run.diverged_s
+    motion = end.motion if diverged_s is None else EndBehaviour.DIVERGED
+    return CellResult(
+        verdict=CLASS_OF_MOTION[motion],
+        motion=motion,
+        ran_s=run.ran_s,
+        extended=extended,
+        end_error_rad=end.end_error_rad,
+        end_speed_rad_s=end.end_speed_rad_s,
+        error_rate_per_s=_finite(end.error.rate_per_s),
+        speed_rate_per_s=_finite(end.speed.rate_per_s),
+        peak_error_rad=max(float(values[:, 0].max()) for values in maxima),
+        settled_s=run.settled_s,
+        diverged_s=diverged_s,
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,178 @@
+"""Confirmation of a map over a real network: runs cells near its edges live and compares the classes.
+
+Invariant: a cell is confirmed if the log of the live session, classified over the same duration, has the
+class of virtual time. A failed session confirms nothing, unless it failed by diverging.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from ...analysis.run_end import EndBehaviour, classify_log_end
+from ...errors import LogError, UsageError
+from ...log.log_reader import open_log
+from ...scenario import Scenario, parse_scenario
+from .cell_result import CLASS_OF_MOTION, CellClass
+
+MAX_SESSION_S = 60.0
+"""A live session lasts as long as the cell ran: longer ones are passed over, s."""
+_BEYOND_S = 0.5
+"""A cell that diverged runs so much longer than it needed to, s: not to end on the very tick."""
+
+CellRow = Mapping[str, Any]
+
+
+class LiveSession(NamedTuple):
+    """How a live session went.
+
+    Attributes:
+        log: its log, which may be missing.
+        problems: what went wrong, in order.
+    """
+
+    log: Path
+    problems: Sequence[str]
+
+
+SessionRunner = Callable[[Scenario, str], LiveSession]
+"""Runs a scenario over a network, called by a name, and says how it went."""
+
+
+class ConfirmedCell(NamedTuple):
+    """One cell, run live.
+
+    Attributes:
+        row: the cell, as its results have it.
+        virtual: its verdict in virtual time.
+        live: the verdict of the log; None where there is none.
+        text: what the log shows in numbers, or what went wrong.
+        log: where it lies; None where there is none.
+    """
+
+    row: CellRow
+    virtual: CellClass
+    live: CellClass | None
+    text: str
+    log: Path | None
+
+    @property
+    def same(self) -> bool:
+        """Whether both verdicts are the same."""
+        return self.virtual is self.live
+
+
+def choose_cells_near_edges(
+    rows: Sequence[CellRow], axes: Sequence[str], count: int, longest_s: float = MAX_SESSION_S
+) -> list[CellRow]:
+    """Returns cells beside edges: so many on the stable side and so many on the other.
+
+    How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
+    other way. The nearest are taken whose runs were short enough; of more than are asked for, those that are
+    spread most evenly along the edge.
+
+    Args:
+        rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
+        axes: the keys of the axes.
+        count: how many on each side.
+        longest_s: cells that ran longer are passed over, s.
+
+    Raises:
+        UsageError: there is no edge, or no cell beside one that ran short enough.
+    """
+    if count < 1:
+        raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
+    places, order = _places(rows, axes)
+    away = _steps_away(places, len(axes))
+    if not away:
+        raise UsageError("no two cells along an axis were decided differently: there is no edge to confirm")
+    chosen = []
+    for side in (True, False):
+        ours = {
+            place: steps
+            for place, steps in away.items()
+            if CellClass(places[place]["verdict"]).stable is side
+        }
+        brief = [place for place in ours if places[place]["ran_s"] <= longest_s]
+        if not brief:
+            word = "stable" if side else "other"
+            raise UsageError(f"every cell on the {word} side of an edge ran longer than {longest_s:g} s")
+        farthest = sorted(ours[place] for place in brief)[min(count, len(brief)) - 1]
+        near = [places[place] for place in brief if ours[place] <= farthest]
+        chosen += _spread(near, order, count)
+    return chosen
+
+
+def confirm_cell(row: CellRow, run: SessionRunner, longest_s: float = MAX_SESSION_S) -> ConfirmedCell:
+    """Runs a cell over a network and compares verdicts.
+
+    Args:
+        row: the cell, with "scenario", its text.
+        run: runs a session.
+        longest_s: how long a session may be, s.
+    """
+    virtual = CellClass(row["verdict"])
+    extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
+    scenario = parse_scenario(row["scenario"])
+    scenario = msgspec.structs.replace(
+        scenario, duration_s=min(row["ran_s"] + extra_s, longest_s + _BEYOND_S)
+    )
+    session = run(scenario, f"cell-{row['cell']}")
+    log = session.log if session.log.exists() else None
+    try:
+        found = classify_log_end(open_log(session.log))
+    except LogError as error:
+        return ConfirmedCell(row, virtual, None, "; ".join([*session.problems, str(error)]), log)
+    if (
+        session.problems and found.motion is not EndBehaviour.DIVERGED
+    ):  # one that diverges ends all, as it should
+        return ConfirmedCell(row, virtual, None, "; ".join(session.problems), log)
+    return ConfirmedCell(row, virtual, CLASS_OF_MOTION[found.motion], found.text, log)
+
+
+GridIndex = tuple[Any, ...]
+
+
+def _places(
+    rows: Sequence[CellRow], axes: Sequence[str]
+) -> tuple[dict[GridIndex, CellRow], Callable[[CellRow], GridIndex]]:
+    """Returns rows by place: numbers of the axes' values, then law and seed; and how a row is placed."""
+    values = [sorted({row[key] for row in rows}, key=_sortable) for key in axes]
+    numbers = [{value: n for n, value in enumerate(some)} for some in values]
+
+    def place(row: CellRow) -> GridIndex:
+        where = [number[row[key]] for key, number in zip(axes, numbers, strict=True)]
+        return (*where, row.get("law"), row.get("seed"))
+
+    return {place(row): row for row in rows}, place
+
+
+def _sortable(value: Any) -> tuple[bool, Any]:
+    return isinstance(value, str), value
+
+
+def _steps_away(places: Mapping[GridIndex, CellRow], axes: int) -> dict[GridIndex, int]:
+    """Returns of decided places how many steps along an axis the first one is that was decided otherwise."""
+    stable = {place: CellClass(row["verdict"]).stable for place, row in places.items()}
+    lines: dict[GridIndex, list[GridIndex]] = {}
+    for place, side in stable.items():
+        if side is not None:
+            for n in range(axes):
+                lines.setdefault((n, *place[:n], *place[n + 1 :]), []).append(place)
+    away: dict[GridIndex, int] = {}
+    for (n, *_), line in lines.items():
+        for place in line:
+            others = [abs(one[n] - place[n]) for one in line if stable[one] is not stable[place]]
+            if others:
+                away[place] = min(min(others), away.get(place, min(others)))
+    return away
+
+
+def _spread(rows: Sequence[CellRow], order: Callable[[CellRow], GridIndex], count: int) -> list[CellRow]:
+    """Returns some rows, as evenly apart as they can be in the order of their places."""
+    ordered = sorted(rows, key=lambda row: tuple(map(str, order(row)[2:])) + order(row)[:2])
+    if len(ordered) <= count:
+        return ordered
+    return [ordered[n] for n in np.linspace(0, len(ordered) - 1, count).round().astype(int)]

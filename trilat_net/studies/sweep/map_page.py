@@ -1,0 +1,383 @@
+"""The figure and the page of a stability map: map.png, map.svg and map.md.
+
+Invariant: the page holds only results, lines and commands, and equal results give equal bytes. A cell of the
+figure is coloured by its classes alone: with several seeds by the stable share of the decided runs, hatched
+where half or more are undecided. Cells stay pixels in vector output, since viewers show seams between
+touching shapes; the classes differ in lightness for grey print and colour-blind readers.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import Normal, Stroke
+from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
+
+from ...core.vectors import Array
+from ...reporting import style
+from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
+from .cell_result import CellClass
+from .live_confirmation import ConfirmedCell
+from .map_plane import (
+    CELL_CLASSES,
+    STABLE_CLASSES,
+    UNSTABLE_CLASSES,
+    MapEdge,
+    MapPanel,
+    MapPlane,
+    PlaneAxis,
+    find_map_edges,
+    label_axis,
+)
+from .stability_map import StabilityMap, SweepTable
+from .theory_lines import TheoryLine
+
+CLASS_COLOURS = {
+    CellClass.CONVERGED: "#d3e4f3",
+    CellClass.BOUNDED: "#e6b84c",
+    CellClass.DIVERGED: "#a23b53",
+    CellClass.UNDECIDED: "#ffffff",
+}
+"""Light, middle, dark; white and hatched is what nobody knows."""
+_HATCH = "/////"
+_HATCHED: Any = {"facecolor": "none", "edgecolor": "#8a8a8a", "linewidth": 0.0, "hatch": _HATCH}
+_LINE_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
+    {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
+    {"color": "#000000", "linestyle": (0, (1, 1.2)), "linewidth": 1.4},
+)
+_HALO_PT = 2.6
+_COUNT_PT = 5.0
+_LETTERS_PER_IN = 13
+"""Of titles: those of panels beside each other stay apart."""
+_LETTER = 0.62
+"""Width of a digit over its size."""
+_FULL_IN = 2.3
+"""Height of a panel that has a row to itself."""
+_BESIDE_IN = 1.75
+_STRIP_IN = 0.7
+
+
+def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], form: FigureSize) -> Figure:
+    """Returns the figure of a plane.
+
+    Args:
+        plane: what became of its places.
+        lines: per panel the lines to draw on it.
+        form: what it is drawn for.
+    """
+    columns = _columns(len(plane.panels), form)
+    rows = -(-len(plane.panels) // columns)
+    each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
+    with style.figure_style(form):
+        figure = style.new_figure(0.95 + rows * each_in, form.width_in)
+        grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
+        for axes in grid[len(plane.panels) :]:
+            axes.set_axis_off()
+        for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
+            _draw_panel(axes, plane, panel, drawn)
+            _entitle(
+                axes,
+                panel.title,
+                round((form.width_in - 0.6 * (plane.seeds > 1)) * _LETTERS_PER_IN / columns),
+            )
+        for n, axes in enumerate(grid[: len(plane.panels)]):
+            _scale(axes, plane)
+            axes.tick_params(labelleft=n % columns == 0 and bool(plane.y.key))
+            axes.tick_params(labelbottom=n + columns >= len(plane.panels))
+        if columns * rows == 1:
+            grid[0].set_xlabel(plane.x.label)
+            grid[0].set_ylabel(plane.y.label)
+        else:
+            figure.supxlabel(plane.x.label, fontsize=8.0)
+            figure.supylabel(plane.y.label, fontsize=8.0)
+        if plane.seeds > 1:
+            _draw_scale(figure, grid)
+        _draw_legend(figure, plane, lines)
+        figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
+        if plane.seeds > 1:  # only now it is known how much room there is
+            for axes, panel in zip(grid, plane.panels, strict=False):
+                _draw_counts(axes, plane, panel)
+    return figure
+
+
+def _columns(panels: int, form: FigureSize) -> int:
+    if panels == 1:
+        return 1
+    if form.narrow:
+        return 2
+    return panels if panels <= 3 else 4 if panels in (4, 7, 8) else 3
+
+
+def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> None:
+    """Draws one panel: cells, hatches, lines."""
+    x, y = _bounds(plane.x), _bounds(plane.y)
+    axes.grid(visible=False)
+    axes.set_facecolor("#f4f4f4")  # where nothing has run
+    ran = panel.runs > 0
+    undecided = _undecided(panel)
+    if plane.seeds > 1:
+        shown = np.ma.masked_invalid(panel.share)
+        axes.pcolormesh(x, y, shown, cmap=_shares(), vmin=0.0, vmax=1.0, rasterized=True)
+    else:
+        classes = np.ma.masked_where(~ran, panel.counts.argmax(axis=2))
+        norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
+        palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
+        axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
+    if undecided.any():
+        _hatch(axes, x, y, undecided)
+    for line in lines:
+        _draw_line(axes, plane, line)
+
+
+def _draw_line(axes: Axes, plane: MapPlane, line: TheoryLine) -> None:
+    """Draws where a line is zero, out to the borders of the outermost cells."""
+    x, y, spare = plane.x.places, plane.y.places, line.spare
+    bounds = _bounds(plane.x), _bounds(plane.y)
+    x = np.concatenate([bounds[0][:1], x, bounds[0][-1:]])
+    y = np.concatenate([bounds[1][:1], y, bounds[1][-1:]])
+    spare = _extended(_extended(spare).T).T
+    look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
+    drawn = axes.contour(
+        x, y, np.ma.masked_invalid(spare), [0.0], colors=look["color"], linewidths=look["linewidth"]
+    )
+    drawn.set(
+        linestyle=look["linestyle"],
+        path_effects=[Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()],
+    )
+
+
+def _extended(rows: Array) -> Array:
+    """Returns a field with a row more at either end, half a step on."""
+    first, last = 1.5 * rows[0] - 0.5 * rows[1], 1.5 * rows[-1] - 0.5 * rows[-2]
+    extended: Array = np.concatenate([first[np.newaxis], rows, last[np.newaxis]])
+    return extended
+
+
+def _undecided(panel: MapPanel) -> Any:
+    """Returns where half of the runs or more are undecided, shape (y, x)."""
+    return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
+
+
+def _entitle(axes: Axes, text: str, letters: int) -> None:
+    """Gives a panel its title, in as many lines as it needs."""
+    axes.set_title(text if len(text) <= letters else text.replace(", ", ",\n"))
+
+
+def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
+    """Hatches cells: those beside each other in a row as one, so that the hatch goes through."""
+    for i, row in enumerate(where):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
+
+
+def _bounds(side: PlaneAxis) -> Array:
+    """Returns the borders of the cells of an axis: half way between its values, shape (n + 1,)."""
+    places = side.places
+    if len(places) == 1:
+        return np.array([places[0] - 0.5, places[0] + 0.5])
+    between = 0.5 * (places[1:] + places[:-1])
+    ends = [1.5 * places[0] - 0.5 * places[1]], [1.5 * places[-1] - 0.5 * places[-2]]
+    bounds: Array = np.concatenate([ends[0], between, ends[1]])
+    return bounds
+
+
+def _scale(axes: Axes, plane: MapPlane) -> None:
+    """Gives a panel its ticks: round numbers on an even axis, else every value that there is room for."""
+    x, y = _bounds(plane.x), _bounds(plane.y)
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    for axis, side in ((axes.xaxis, plane.x), (axes.yaxis, plane.y)):
+        if side.even:
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
+        else:
+            axis.set_major_locator(FixedLocator(list(side.places)))
+            axis.set_major_formatter(FixedFormatter([f"{value:g}" for value in side.values]))
+    if not plane.y.key:
+        axes.set_yticks([])
+    for spine in ("top", "right"):
+        axes.spines[spine].set_visible(True)
+
+
+def _shares() -> LinearSegmentedColormap:
+    """Returns the colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
+    ends = [
+        CLASS_COLOURS[verdict] for verdict in (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
+    ]
+    return LinearSegmentedColormap.from_list("share", ends)
+
+
+def _draw_scale(figure: Figure, grid: Sequence[Axes]) -> None:
+    """Draws what the colours of shares mean."""
+    colours = ScalarMappable(cmap=_shares())
+    colours.set_clim(0.0, 1.0)
+    bar = figure.colorbar(colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30)
+    bar.set_label("share of stable runs")
+    bar.outline.set_linewidth(0.6)
+
+
+def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Writes how many runs were stable, of the decided ones, into places where not all agree: if they fit."""
+    width_pt = 72.0 * axes.get_window_extent().width / axes.figure.dpi / len(plane.x.values)
+    height_pt = 72.0 * axes.get_window_extent().height / axes.figure.dpi / len(plane.y.values)
+    stable = panel.counts[:, :, STABLE_CLASSES].sum(axis=2)
+    decided = stable + panel.counts[:, :, UNSTABLE_CLASSES].sum(axis=2)
+    letters = 2 * len(str(plane.seeds)) + 1
+    if width_pt < letters * _LETTER * _COUNT_PT or height_pt < 1.2 * _COUNT_PT:
+        return
+    for i, j in np.argwhere((stable > 0) & (stable < decided)):
+        text = f"{stable[i, j]}/{decided[i, j]}"
+        where = plane.x.places[j], plane.y.places[i]
+        axes.text(*where, text, ha="center", va="center", fontsize=_COUNT_PT, color="#000000")
+
+
+def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[TheoryLine]]) -> None:
+    """Draws the legend above the panels: the classes that occur, then the lines."""
+    counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
+    handles: list[Any] = []
+    for n, verdict in enumerate(CELL_CLASSES):
+        if verdict is CellClass.UNDECIDED:
+            if not any(_undecided(panel).any() for panel in plane.panels):
+                continue
+        elif not counts[n] or plane.seeds > 1:
+            continue
+        look: Any = {"facecolor": CLASS_COLOURS[verdict], "edgecolor": "#6b6b6b"}
+        if verdict is CellClass.UNDECIDED:
+            look = {**_HATCHED}
+        look["linewidth"] = 0.5
+        word = "half or more undecided" if plane.seeds > 1 else verdict.value
+        handles.append(Patch(label=word, **look))
+    named = {line.label: line for some in lines for line in some}
+    handles += [
+        Line2D([], [], label=text, **_LINE_STYLES[line.rank % len(_LINE_STYLES)])
+        for text, line in named.items()
+    ]
+    _above(figure, handles)
+
+
+def _above(figure: Figure, handles: Sequence[Any]) -> None:
+    """Puts handles above the panels, in as many columns as there is room for."""
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    for columns in range(min(len(handles), 6), 0, -1):
+        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=1.6)
+        if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        made.remove()
+
+
+_DPI = 300
+
+
+def write_map(
+    chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN, name: str = "map"
+) -> list[Path]:
+    """Writes a map into a folder that exists, and returns the paths.
+
+    Args:
+        chart: the map.
+        folder: where to.
+        width_in: 3.5 for one column, 7 for two, in.
+        name: of the files, before their suffix.
+
+    Raises:
+        UsageError: there is no such width.
+    """
+    form = make_print_size(width_in)
+    figure = draw_stability_map(chart.plane, chart.lines, form)
+    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "md")]
+    for path in paths[:2]:
+        style.write_figure(figure, path, _DPI)
+    paths[2].write_text(build_map_page(chart, paths[0].name), encoding="utf-8")
+    return paths
+
+
+def build_map_page(chart: StabilityMap, picture: str) -> str:
+    """Returns the page of a map, as Markdown.
+
+    Args:
+        chart: the map.
+        picture: name of the figure's file.
+    """
+    parts = [f"# {chart.title}", "```sh\n" + "\n".join(chart.commands) + "\n```", f"![map]({picture})"]
+    parts.append(tabulate_classes(chart.plane).markdown())
+    if meanings := _meanings(chart):
+        parts.append("\n".join(f"- {one}" for one in meanings))
+    for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
+        table = tabulate_edges(chart.plane, panel, lines)
+        if table.rows:
+            parts += [f"## {panel.title}"] if panel.title else []
+            parts.append(table.markdown())
+    return "\n\n".join(parts) + "\n"
+
+
+def tabulate_classes(plane: MapPlane) -> SweepTable:
+    """Returns how many runs had which verdict, a row per panel."""
+    rows = [
+        (panel.title or "all", *(str(int(count)) for count in panel.counts.sum(axis=(0, 1))))
+        for panel in plane.panels
+    ]
+    return SweepTable(("runs", *CELL_CLASSES), rows)
+
+
+def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> SweepTable:
+    """Returns the measured edges beside the lines, a row each; none where only one axis was swept.
+
+    The difference is that of a line from the middle of the measured edge; "within" where the line lies in the
+    measured edge, as well as its grid can tell.
+    """
+    heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
+    for line in lines:
+        heads += [line.text, "difference"]
+    rows = []
+    for edge in find_map_edges(plane, panel) if plane.y.key else []:
+        row = [f"{edge.x:g}", f"{edge.low:g} to {edge.high:g}", "below" if edge.stable_below else "above"]
+        for line in lines:
+            row += _compare_with_line(plane, edge, line)
+        rows.append(tuple(row))
+    return SweepTable(tuple(heads), rows)
+
+
+def _compare_with_line(plane: MapPlane, edge: MapEdge, line: TheoryLine) -> list[str]:
+    """Returns where a line crosses the column of an edge, next to it, and how far that is from it."""
+    values = line.crossings(plane.x.values.index(edge.x), plane.y)
+    if not values:
+        return ["-", "-"]
+    value = min(values, key=lambda one: abs(one - edge.middle))
+    if edge.low <= value <= edge.high:
+        return [f"{value:.4g}", "within"]
+    return [f"{value:.4g}", f"{100.0 * (value / edge.middle - 1.0):+.1f} %"]
+
+
+def _meanings(chart: StabilityMap) -> list[str]:
+    """Returns what the lines are, each once, and the remarks."""
+    told = {line.text: line.about for lines in chart.lines for line in lines}
+    return [f"{text}: {about}" for text, about in told.items()] + list(chart.remarks)
+
+
+def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> SweepTable:
+    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is.
+
+    Args:
+        found: the cells.
+        axes: the keys of the axes.
+    """
+    heads = ("cell", *map(label_axis, axes), "seed", "virtual", "live", "", "the log shows", "log")
+    rows = []
+    for one in found:
+        values = [one.row[key] for key in axes]
+        place = [value if isinstance(value, str) else f"{value:g}" for value in values]
+        live = "none" if one.live is None else one.live.value
+        same = "same" if one.same else "DIFFERS"
+        where = "none" if one.log is None else str(one.log)
+        cell, seed = str(one.row["cell"]), str(one.row["seed"])
+        rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
+    return SweepTable(heads, rows)

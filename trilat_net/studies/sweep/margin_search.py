@@ -1,0 +1,415 @@
+"""Stability margins.
+
+Per grid point the edges along one key by a scan and bisection, with the edges of theory, as a table, a
+Markdown page and plain values.
+
+Invariant: an edge lies between two values that were run, one stable and one not. Undecided values widen
+it and count for neither side; every edge that the scan sees is kept. The margin of a grid point is a
+function of its scenario, its seed and the range.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import ScenarioError, UsageError
+from ...process import count_cores
+from ...scenario import Scenario
+from ..executor import open_worker_pool
+from . import cell_result
+from .map_plane import label_axis
+from .stability_map import SweepTable, build_sweep_command, format_override, format_override_value
+from .sweep_cell import SweepCell, SweepSource
+from .sweep_plan import SweepPlan
+from .theory_lines import evaluate_criterion, find_criterion_edge, find_root_crossings
+
+SCAN_POINTS = 9
+"""Values of the scan: islands that are wider than an eighth of the range are seen."""
+MARGIN_TOLERANCE = 0.005
+_MOST = 60
+
+StabilityTest = Callable[[float], bool | None]
+"""Whether a run at a value is stable; None where nobody knows."""
+
+
+class StableInterval(NamedTuple):
+    """Where an edge lies.
+
+    Attributes:
+        low: the last value below it that was decided.
+        high: the first one above it.
+        stable_below: whether what lies below is the stable side.
+        sharp: whether the two are as close as was asked; else what is between them was undecided.
+    """
+
+    low: float
+    high: float
+    stable_below: bool
+    sharp: bool
+
+    @property
+    def middle(self) -> float:
+        """The value half way."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half_width(self) -> float:
+        """Half of what is not known."""
+        return 0.5 * (self.high - self.low)
+
+
+class KeyMargin(NamedTuple):
+    """What was found along one key.
+
+    Attributes:
+        spans: the edges, from below; none where nothing changes, more than one where the scan saw islands.
+        stable: where there is no edge, whether all that was decided is stable; None where nothing was.
+        undecided: how many values stayed undecided.
+        runs: how many values were run.
+    """
+
+    spans: tuple[StableInterval, ...]
+    stable: bool | None
+    undecided: int
+    runs: int
+
+
+def search_key_margin(
+    stable: StabilityTest,
+    low: float,
+    high: float,
+    tolerance: float = MARGIN_TOLERANCE,
+    *,
+    whole: bool = False,
+) -> KeyMargin:
+    """Returns the edges between two values.
+
+    Args:
+        stable: runs and judges one value.
+        low: the first value of the range.
+        high: the last one.
+        tolerance: how wide an edge may be, over its value.
+        whole: whether only whole numbers can be run.
+    """
+    known: dict[float, bool | None] = {}
+
+    def ask(value: float) -> bool | None:
+        if value not in known:
+            known[value] = stable(value)
+        return known[value]
+
+    scan = np.linspace(low, high, SCAN_POINTS)
+    values = list(dict.fromkeys((np.round(scan) if whole else scan).tolist()))
+    decided = [value for value in values if ask(value) is not None]
+    spans = tuple(
+        _narrowed(ask, a, b, tolerance, whole) for a, b in pairwise(decided) if known[a] != known[b]
+    )
+    everywhere = known[decided[0]] if decided and not spans else None
+    return KeyMargin(spans, everywhere, sum(one is None for one in known.values()), len(known))
+
+
+def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool) -> StableInterval:
+    """Returns an edge between two values that were decided and differ, narrowed from both sides."""
+    below = ask(low) is True
+    side = {value: ask(value) for value in (low, high)}
+
+    def is_low(value: float) -> bool:
+        return ask(value) is side[first]
+
+    def is_not_high(value: float) -> bool:
+        return ask(value) is not side[last]
+
+    first, last = low, high
+    low, above = _halved(is_low, low, high, tolerance, whole)
+    if ask(above) is not None:
+        return StableInterval(low, above, below, sharp=True)
+    _, high = _halved(is_not_high, above, high, tolerance, whole)
+    return StableInterval(low, high, below, sharp=False)
+
+
+def _halved(
+    holds: Callable[[float], bool], low: float, high: float, tolerance: float, whole: bool
+) -> tuple[float, float]:
+    """Returns the last value at which something holds and the first at which it does not, by bisection."""
+    for _ in range(_MOST):
+        wide = high - low > (1.0 if whole else tolerance * max(abs(low), abs(high)))
+        if not wide:
+            break
+        middle = 0.5 * (low + high)
+        middle = float(np.floor(middle)) if whole else middle
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low, high
+
+
+class SearchRange(NamedTuple):
+    """Where edges are looked for.
+
+    Attributes:
+        key: along which key, dotted.
+        low: from.
+        high: to.
+        tolerance: how wide an edge may be, over its value.
+    """
+
+    key: str
+    low: float
+    high: float
+    tolerance: float
+
+
+class MarginTask(NamedTuple):
+    """One place to be searched: picklable, and all that a process needs."""
+
+    written: SweepSource
+    overrides: tuple[str, ...]
+    seed: int
+    longest_s: float
+    range: SearchRange
+
+
+MarginFinding = tuple[KeyMargin, tuple[float, ...], str, float | None]
+"""Margin, linear edges, what is to be known of them, edge in closed form."""
+
+
+class GridPointMargin(NamedTuple):
+    """One place that was searched.
+
+    Attributes:
+        cell: the place; its values lie along the axes.
+        seed: of its runs.
+        margin: what the runs show.
+        linear: where the linear analysis has edges in the range, from below.
+        remark: what is to be known of those, or "".
+        closed: where the condition in closed form has its edge; None where it has none in the range.
+    """
+
+    cell: SweepCell
+    seed: int
+    margin: KeyMargin
+    linear: tuple[float, ...]
+    remark: str
+    closed: float | None
+
+
+def parse_search_range(asked: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
+    """Returns the range that a text such as "control.d=0.2:3" names.
+
+    Raises:
+        UsageError: it names none.
+    """
+    key, _, text = asked.partition("=")
+    low, colon, high = text.partition(":")
+    try:
+        found = SearchRange(key.strip(), float(low), float(high), tolerance)
+    except ValueError:
+        raise UsageError(f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {asked!r}") from None
+    if not 0.0 < tolerance < 1.0:
+        raise UsageError(f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}")
+    if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
+        raise UsageError(
+            f"--margin reads KEY=FROM:TO with FROM below TO, as in control.d=0.2:3, not {asked!r}"
+        )
+    return found
+
+
+def format_range_axis(found: SearchRange) -> str:
+    """Returns a range as an axis of its two ends: a plan with it has been checked at both."""
+    return f"{found.key}={format_override_value(found.low)},{format_override_value(found.high)}"
+
+
+def search_margins(
+    asked: SweepPlan,
+    within: SearchRange,
+    jobs: int | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> list[GridPointMargin]:
+    """Returns the edges of every place of a plan and every seed.
+
+    Args:
+        asked: the plan; its last axis is the two ends of the range.
+        within: the range.
+        jobs: in how many processes; None for one per core.
+        progress: told how many places are done, and how many there are.
+
+    Raises:
+        ScenarioError: some value makes no scenario.
+        RunFailed: a process was ended.
+    """
+    cells = [asked.cell(first) for first in range(0, asked.cells, 2)]
+    places = [(cell, seed) for cell in cells for seed in _seeds(asked, cell)]
+    searches = [
+        MarginTask(asked.written, cell.overrides[:-1], seed, asked.longest_s, within) for cell, seed in places
+    ]
+    found: dict[int, GridPointMargin] = {}
+    with open_worker_pool(min(jobs or count_cores(), len(searches))) as hands:
+        for n, told in hands.each(search_margin_task, searches):
+            cell, seed = places[n]
+            found[n] = GridPointMargin(cell._replace(values=cell.values[:-1]), seed, *told)
+            progress(len(found), len(searches))
+    return [found[n] for n in range(len(searches))]
+
+
+def _seeds(asked: SweepPlan, cell: SweepCell) -> Sequence[int]:
+    """Returns the seeds of a place: one alone where nothing is random."""
+    return asked.seeds if asked.written.scenario(*cell.overrides).random else asked.seeds[:1]
+
+
+def search_margin_task(one: MarginTask) -> MarginFinding:
+    """Searches one place, and asks theory for the same.
+
+    Raises:
+        ScenarioError: some value makes no scenario.
+    """
+    within = one.range
+
+    def at(value: float) -> Scenario:
+        return one.written.scenario(*one.overrides, format_override(within.key, value), f"seed={one.seed}")
+
+    def stable(value: float) -> bool | None:
+        return cell_result.classify_cell(
+            at(value).text, max(one.longest_s, at(value).duration_s)
+        ).verdict.stable
+
+    whole = not _fractions(at, within)
+    found = search_key_margin(stable, within.low, within.high, within.tolerance, whole=whole)
+    closed = find_criterion_edge(lambda value: evaluate_criterion(at(value)), within.low, within.high)
+    return found, *find_root_crossings(at(within.high), within.key, within.low, within.high), closed
+
+
+def _fractions(at: Callable[[float], Scenario], within: SearchRange) -> bool:
+    """Whether a key can have values between whole numbers."""
+    try:
+        at(within.low + (within.high - within.low) / 3.0**0.5)
+    except ScenarioError:
+        return False
+    return True
+
+
+def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> SweepTable:
+    """Returns margins as a table, a row per edge, or per place that has none.
+
+    Args:
+        asked: the plan whose last axis is the range.
+        within: the range.
+        found: per place what was found.
+    """
+    axes = asked.axes[:-1]
+    seeds = len({one.seed for one in found}) > 1
+    closed = any(one.closed is not None for one in found)
+    heads = [*(label_axis(axis.key, asked.base) for axis in axes), *(["law"] if asked.laws else [])]
+    heads += [*(["seed"] if seeds else []), f"edge of {label_axis(within.key, asked.base)}", "stable is"]
+    heads += ["linear", "difference", *(["closed form", "difference"] if closed else []), "runs"]
+    rows = []
+    for one in found:
+        place = [_text(value) for value in one.cell.values] + ([one.cell.law] if asked.laws else [])
+        place += [str(one.seed)] if seeds else []
+        for span in one.margin.spans or (None,):
+            cells = [
+                *place,
+                *_edge_cells(one.margin, span),
+                *_theory_cells(span, _nearest_linear_edge(one, span)),
+            ]
+            cells += _theory_cells(span, one.closed) if closed else []
+            rows.append((*cells, str(one.margin.runs)))
+    return SweepTable(tuple(heads), rows)
+
+
+def build_margin_page(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:
+    """Returns margins as a page in Markdown.
+
+    Args:
+        asked: the plan whose last axis is the range.
+        within: the range.
+        found: per place what was found.
+    """
+    command = build_margin_command(asked, within)
+    remarks = dict.fromkeys(one.remark for one in found if one.remark)
+    parts = [f"# {asked.base.title or asked.base.name}: margin", f"```sh\n{command}\n```"]
+    parts.append(tabulate_margins(asked, within, found).markdown())
+    parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
+    islands = sum(len(one.margin.spans) > 1 for one in found)
+    if islands:
+        parts.append(
+            f"Stability is not monotone in {islands} of {len(found)} places: they have several edges."
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def margins_to_json(
+    asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]
+) -> dict[str, Any]:
+    """Returns margins as plain values, for JSON.
+
+    Args:
+        asked: the plan whose last axis is the range.
+        within: the range.
+        found: per place what was found.
+    """
+    keys = [axis.key for axis in asked.axes[:-1]]
+    return {
+        "command": build_margin_command(asked, within),
+        "scenario_sha256": asked.base.sha256,
+        "key": within.key,
+        "low": within.low,
+        "high": within.high,
+        "tolerance": within.tolerance,
+        "places": [
+            {
+                **dict(zip(keys, one.cell.values, strict=True)),
+                **({"law": one.cell.law} if asked.laws else {}),
+                "seed": one.seed,
+                "edges": [span._asdict() for span in one.margin.spans],
+                "stable_everywhere": one.margin.stable,
+                "undecided": one.margin.undecided,
+                "runs": one.margin.runs,
+                "linear": list(one.linear),
+                "closed_form": one.closed,
+                "remark": one.remark,
+            }
+            for one in found
+        ],
+    }
+
+
+def build_margin_command(asked: SweepPlan, within: SearchRange) -> str:
+    """Returns the command that searches margins."""
+    reach = f"{within.key}={format_override_value(within.low)}:{format_override_value(within.high)}"
+    words = ["--margin", reach, "--tolerance", format_override_value(within.tolerance)]
+    return build_sweep_command(asked._replace(axes=asked.axes[:-1]), *words)
+
+
+def _text(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
+    """Returns where an edge lies and which side is stable, or why there is none."""
+    if span is None:
+        words = {True: "none: all stable", False: "none: nothing stable", None: "none: nothing decided"}
+        return [words[margin.stable], "-"]
+    digits = 5 if span.sharp else 4
+    blur = "" if span.sharp else " (undecided between)"
+    return [
+        f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}",
+        "below" if span.stable_below else "above",
+    ]
+
+
+def _nearest_linear_edge(one: GridPointMargin, span: StableInterval | None) -> float | None:
+    """Returns the linear edge that is next to a measured one; the lowest where nothing was measured."""
+    if not one.linear:
+        return None
+    return one.linear[0] if span is None else min(one.linear, key=lambda edge: abs(edge - span.middle))
+
+
+def _theory_cells(span: StableInterval | None, value: float | None) -> list[str]:
+    """Returns what theory says, and how far that is from the middle of the edge."""
+    if value is None:
+        return ["-", "-"]
+    difference = "-" if span is None else f"{100.0 * (value / span.middle - 1.0):+.2f} %"
+    return [f"{value:.5g}", difference]

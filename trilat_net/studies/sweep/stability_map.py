@@ -1,0 +1,183 @@
+"""A stability map: the plane of a sweep's results with the lines of theory, and the commands that make both.
+
+Invariant: the runs come from the results and the lines from the plan alone; neither depends on the other.
+"""
+
+import shlex
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from ...process import count_cores
+from ...scenario import Scenario
+from ...scenario.fields import is_number
+from ..executor import open_worker_pool
+from .map_plane import MapPanel, MapPlane, build_plane
+from .sweep_cell import SweepSource
+from .sweep_plan import MAX_EXTENSION, MAX_SCENARIO_S, SweepPlan
+from .sweep_results import SweepResults
+from .theory_lines import TheoryLine, compute_growth_rates, trace_closed_form, trace_linear_analysis
+
+
+class SweepTable(NamedTuple):
+    """A table.
+
+    Attributes:
+        heads: of its columns.
+        rows: texts, as many as there are heads each.
+    """
+
+    heads: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+    def markdown(self) -> str:
+        """Returns it in Markdown."""
+        lines = (self.heads, ["---"] * len(self.heads), *self.rows)
+        return "\n".join(f"| {' | '.join(cell or ' ' for cell in line)} |" for line in lines)
+
+
+LAW_AXIS = "law"
+
+
+class StabilityMap(NamedTuple):
+    """A map with what is drawn on it.
+
+    Attributes:
+        plane: what became of its places.
+        lines: per panel the lines of theory.
+        remarks: what is to be known of the lines.
+        commands: what makes the results and the map, in order.
+        title: of the page.
+    """
+
+    plane: MapPlane
+    lines: tuple[tuple[TheoryLine, ...], ...]
+    remarks: tuple[str, ...]
+    commands: tuple[str, ...]
+    title: str
+
+
+class PanelScenarios(NamedTuple):
+    """The scenarios of a panel: of its cells, and of what lies between them. Picklable.
+
+    Attributes:
+        written: the experiment.
+        fixed: overrides of the panel.
+        x: the key to the right.
+        y: the key upwards.
+    """
+
+    written: SweepSource
+    fixed: tuple[str, ...]
+    x: str
+    y: str
+
+    def scenario(self, right: float, up: float) -> Scenario:
+        """Returns the scenario of a place."""
+        return self.written.scenario(*self.fixed, format_override(self.x, right), format_override(self.y, up))
+
+
+def build_stability_map(
+    results: SweepResults,
+    commands: tuple[str, ...],
+    jobs: int | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    *,
+    linearly: bool = True,
+) -> StabilityMap:
+    """Returns the map of results.
+
+    Args:
+        results: a sweep that was run.
+        commands: what makes them.
+        jobs: in how many processes the linear analysis works; None for one per core.
+        progress: told how many columns of it are done, and how many there are.
+        linearly: whether its line is wanted.
+
+    Raises:
+        UsageError: there is nothing to draw, or too many panels.
+    """
+    asked = results.plan
+    keys = [*([LAW_AXIS] if len(asked.laws) > 1 else []), *(one.key for one in asked.axes)]
+    drawn = build_plane(results.rows, keys, asked.base)
+    title = asked.base.title or asked.base.name
+    if not drawn.y.key or len(drawn.y.values) < 2:
+        return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
+    at = [panel_scenarios(asked, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
+    lines = [[trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
+    remarks: dict[str, None] = {}
+    if linearly:
+        for some, columns in zip(lines, _columns(drawn, at, jobs, progress), strict=True):
+            line, why = trace_linear_analysis(columns)
+            some.append(line)
+            remarks |= dict.fromkeys(why)
+    kept = tuple(tuple(line for line in some if line is not None) for some in lines)
+    return StabilityMap(drawn, kept, tuple(remarks), commands, title)
+
+
+GrowthColumn = tuple[list[float], list[str]]
+
+
+def _columns(
+    drawn: MapPlane, at: Sequence[PanelScenarios], jobs: int | None, progress: Callable[[int, int], None]
+) -> list[list[GrowthColumn]]:
+    """Returns per panel the real parts of the rightmost roots, column by column."""
+    tasks = [(one, x, drawn.y.values) for one in at for x in drawn.x.values]
+    found: dict[int, GrowthColumn] = {}
+    with open_worker_pool(min(jobs or count_cores(), len(tasks))) as hands:
+        for n, column in hands.each(_column, tasks):
+            found[n] = column
+            progress(len(found), len(tasks))
+    wide = len(drawn.x.values)
+    return [[found[n] for n in range(first, first + wide)] for first in range(0, len(tasks), wide)]
+
+
+def _column(task: tuple[PanelScenarios, float, tuple[float, ...]]) -> GrowthColumn:
+    at, x, values = task
+    return compute_growth_rates([at.scenario(x, y) for y in values])
+
+
+def panel_scenarios(asked: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
+    """Returns what makes the scenario of any place of a panel.
+
+    Args:
+        asked: the sweep.
+        panel: one of its planes.
+        x: the key to the right.
+        y: the key upwards.
+    """
+    settings = dict(panel.settings)
+    law = settings.pop(LAW_AXIS, asked.laws[0] if asked.laws else None)
+    fixed = () if law is None else asked.law_overrides[asked.laws.index(law)]
+    others = tuple(format_override(key, value) for key, value in settings.items())
+    return PanelScenarios(asked.written, (*fixed, *others), x, y)
+
+
+def build_sweep_command(asked: SweepPlan, *more: str) -> str:
+    """Returns the command that makes a sweep.
+
+    Args:
+        asked: the sweep.
+        *more: further words.
+    """
+    words = ["trilat", "sweep", asked.written.source]
+    words += [word for text in asked.written.overrides for word in ("--set", text)]
+    words += [word for one in asked.axes for word in ("--over", one.asked)]
+    own, count = asked.base.seed, len(asked.seeds)
+    if asked.seeds == tuple(range(own, own + count)):
+        words += ["--seeds", str(count)] if count > 1 else []
+    else:
+        words += ["--seeds", ",".join(map(str, asked.seeds)) + ("," if count == 1 else "")]
+    words += ["--law", ",".join(asked.laws)] if asked.laws else []
+    if asked.longest_s != min(MAX_SCENARIO_S, MAX_EXTENSION * asked.base.duration_s):
+        words += ["--longest", format_override_value(asked.longest_s)]
+    return shlex.join([*words, *more])
+
+
+def format_override(key: str, value: Any) -> str:
+    """Returns an override that sets a value: a whole number as one, a word as it is."""
+    return f"{key}={format_override_value(value) if is_number(value) else value}"
+
+
+def format_override_value(value: float) -> str:
+    """Returns a number as an override's text, which reads as just that number; whole ones without a point."""
+    return repr(value).removesuffix(".0")

@@ -1,0 +1,251 @@
+"""The folder of a sweep: its plan, the journal of finished runs, and at the end the results.
+
+Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed in. Each
+journal line carries a CRC-32 over sweep and text, so a torn line is ignored; a process that dies at any
+moment loses no earlier line and spoils no later one.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shlex
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ...core.fingerprint import compute_fingerprint
+from ...errors import LogRefused, UsageError
+from ...files import make_results_folder
+from ...log.log_layout import collect_provenance
+from .sweep_cell import CellRun
+from .sweep_plan import SweepPlan, plan_from_json
+from .sweep_results import RESULTS_FILE
+
+JOURNAL_FILE = "cells.journal"
+
+RunKey = tuple[int, int]
+"""A run: cell and seed."""
+
+
+class SweepJournal:
+    """The runs that are done, in a file that is only ever appended to; a context, which closes it.
+
+    Args:
+        path: the file; made where there is none.
+        sweep: what names the sweep: lines of another one count for nothing.
+
+    Attributes:
+        done: the runs, by cell and seed.
+    """
+
+    def __init__(self, path: Path, sweep: str) -> None:
+        self._path, self._sweep = path, sweep
+        self.done: dict[RunKey, CellRun] = {}
+        before = path.read_bytes() if path.exists() else b""
+        for entry in _entries(before, sweep):
+            self.done.setdefault((entry.cell, entry.seed), entry)
+        self._file = path.open("ab", buffering=0)
+        if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
+            self._put(b"\n")
+
+    def __enter__(self) -> "SweepJournal":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def add(self, entry: CellRun) -> None:
+        """Writes one run down, at once; one that is there already changes nothing.
+
+        Raises:
+            LogRefused: the disk refused it.
+        """
+        if (entry.cell, entry.seed) in self.done:
+            return
+        self._put(encode_journal_line(entry, self._sweep))
+        self.done[entry.cell, entry.seed] = entry
+
+    def _put(self, data: bytes) -> None:
+        try:
+            written = self._file.write(data)
+        except OSError as error:
+            raise write_refused(self._path, error) from None
+        if written != len(data):  # a disk that became full takes a part, and says nothing
+            raise write_refused(self._path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+
+def write_refused(path: Path, error: OSError) -> LogRefused:
+    """Returns what is said of a file of a sweep that the disk refused."""
+    return LogRefused(
+        f"{path}: cannot be written: {error.strerror}; what is done is kept: make room, and go on with: "
+        f"trilat sweep --resume {shlex.quote(str(path.parent))}"
+    )
+
+
+def encode_journal_line(entry: CellRun, sweep: str) -> bytes:
+    """Returns the line of a run: JSON, a tab, and the CRC-32 of sweep and JSON in hexadecimal digits."""
+    text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
+    return b"%s\t%08x\n" % (text, _checksum(text, sweep))
+
+
+def _checksum(text: bytes, sweep: str) -> int:
+    return zlib.crc32(text, zlib.crc32(sweep.encode()))
+
+
+def _entries(data: bytes, sweep: str) -> Iterator[CellRun]:
+    for one in data.split(b"\n"):
+        text, tab, digits = one.rpartition(b"\t")
+        if tab and digits == b"%08x" % _checksum(text, sweep):
+            yield msgspec.convert(_plain(text), CellRun)
+
+
+def _plain(text: bytes) -> Any:
+    return json.loads(text)  # unlike msgspec it knows infinity
+
+
+PLAN_FILE = "plan.json"
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+_DIFFERENCES = {
+    "text": "another text of the scenario",
+    "scenario_sha256": "another scenario",
+    "overrides": "other settings",
+    "over": "other axes",
+    "laws": "other laws",
+    "seeds": "other seeds",
+    "longest_s": "another longest time",
+    "arithmetic": "another kind of arithmetic",
+    "versions": "another version of the program",
+}
+"""What two sweeps may differ in, in words, in the order in which it is said."""
+
+
+class SweepFolder(NamedTuple):
+    """A folder of results.
+
+    Attributes:
+        path: where it is.
+        plan: the sweep.
+        facts: what names it, with the arithmetic and the versions that it is made with.
+    """
+
+    path: Path
+    plan: SweepPlan
+    facts: Mapping[str, Any]
+
+    @property
+    def results(self) -> Path:
+        """Where the results are, once all runs are done."""
+        return self.path / RESULTS_FILE
+
+    def journal(self) -> SweepJournal:
+        """Opens the journal."""
+        return SweepJournal(self.path / JOURNAL_FILE, hashlib.sha256(_text(self.facts).encode()).hexdigest())
+
+
+def prepare_sweep_folder(asked: SweepPlan, path: Path | None) -> SweepFolder:
+    """Returns the folder of a sweep, made, or as it was left.
+
+    Args:
+        asked: the sweep.
+        path: where; None for the next free one below runs.
+
+    Raises:
+        UsageError: it holds something else, or another sweep, or cannot be made.
+    """
+    facts = {**asked.facts(), **_made_with()}
+    if path is not None and (path / PLAN_FILE).exists():
+        return _resume_same(path, facts)
+    chosen = make_results_folder(path, f"sweep-{asked.base.name}", force=False)
+    write_whole(chosen / PLAN_FILE, _text(facts).encode())
+    return SweepFolder(chosen, asked, facts)
+
+
+def open_sweep_folder(path: Path) -> SweepFolder:
+    """Returns the folder of a sweep that was begun.
+
+    Raises:
+        UsageError: there is none, or it was made with another arithmetic.
+        ScenarioError: its scenario cannot run here.
+    """
+    facts = _read(path)
+    asked = plan_from_json(facts)
+    now = {**asked.facts(), **_made_with()}
+    _refuse_other(path, facts, now)
+    return SweepFolder(path, asked, facts)
+
+
+def _resume_same(path: Path, facts: Mapping[str, Any]) -> SweepFolder:
+    """Returns a folder that holds this very sweep."""
+    before = _read(path)
+    _refuse_other(path, before, facts)
+    return SweepFolder(path, plan_from_json(before), before)
+
+
+def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    for key, words in _DIFFERENCES.items():
+        if before.get(key) != now[key]:
+            there, here = (_shown(key, facts) for facts in (before, now))
+            raise UsageError(
+                f"{path}: holds a sweep of {words}: there {there}, here {here}; results are not mixed: "
+                "choose another folder"
+            )
+
+
+def _shown(key: str, facts: Mapping[str, Any]) -> str:
+    value = facts.get(key)
+    if key in ("text", "scenario_sha256"):
+        digest = hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
+        return f"{facts.get('name')} (sha256 {digest[:12]})"
+    if isinstance(value, dict):
+        return ", ".join(f"{name.removeprefix('version_')} {one}" for name, one in value.items())
+    if key == "seeds" and isinstance(value, list) and value == list(range(value[0], value[-1] + 1)):
+        return f"{value[0]}..{value[-1]}"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g} s" if isinstance(value, float) else str(value)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    file = path / PLAN_FILE
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no sweep was begun there: it has no {PLAN_FILE}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "is not JSON"
+        raise UsageError(f"{file}: cannot be read: {reason}") from None
+    if not isinstance(facts, dict) or not {"source", "folder", "name", *_DIFFERENCES} <= facts.keys():
+        raise UsageError(f"{file}: is no plan of a sweep")
+    return facts
+
+
+def _made_with() -> dict[str, Any]:
+    """Returns what results depend on besides the plan."""
+    known = collect_provenance()
+    return {"arithmetic": compute_fingerprint(), "versions": {name: known[name] for name in _VERSIONS}}
+
+
+def _text(facts: Mapping[str, Any]) -> str:
+    return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Writes a file that is there whole or not at all.
+
+    Raises:
+        LogRefused: the disk refused it.
+    """
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    try:
+        with unfinished.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        raise write_refused(path, error) from None

@@ -1,0 +1,418 @@
+"""The plan of a sweep: the scenario, the axes with their values, the control laws and the seeds.
+
+Invariant: a plan that cannot run is refused before the first run. Cells are numbered row by row, and a
+cell is a function of the plan and its number. An axis value is the text of an override; steps are counted
+in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
+"""
+
+import math
+import tomllib
+from collections.abc import Iterator, Sequence
+from decimal import Decimal, InvalidOperation
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple, overload
+
+from ...errors import ScenarioError, UsageError
+from ...scenario import Scenario, apply_overrides
+from ...scenario.fields import is_number, suggest_nearest
+from ...scenario.laws import LAWS
+from ...scenario.scenario_reader import read_source
+from . import cell_result
+from .sweep_cell import CellTask, SweepCell, SweepSource
+
+_ON_GRID = Decimal("1e-9")
+"""An end that is no further than this from the grid, in steps, lies on it."""
+_ELSEWHERE = {
+    "seed": "seeds have an option of their own, as in --seeds 1..20",
+    "duration_s": "how long a cell runs follows from its verdict: --duration says how long at first, "
+    "--longest how long at most",
+}
+_MOST = 10**12
+_HOW = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
+
+
+class SweepAxis(NamedTuple):
+    """One axis.
+
+    Attributes:
+        asked: as a person wrote it, "KEY=a:b:step" or "KEY=v1,v2,v3".
+        key: dotted, as an override names it.
+        texts: its values, each as an override's text.
+    """
+
+    asked: str
+    key: str
+    texts: Sequence[str]
+
+    def value(self, number: int) -> float | str:
+        """Returns one value: a number where it is one, else its text."""
+        value = _read(self.texts[number])
+        return float(value) if is_number(value) else self.texts[number]
+
+    @property
+    def numeric(self) -> bool:
+        """True where every value is a number."""
+        return isinstance(self.texts, _Steps) or all(is_number(_read(text)) for text in self.texts)
+
+    def override(self, number: int) -> str:
+        """Returns the override that sets one value."""
+        return f"{self.key}={self.texts[number]}"
+
+
+class _Steps(Sequence[str]):
+    """The values a, a + step, ... as texts, made as they are asked for."""
+
+    def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
+        self._first, self._step, self._count = first, step, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, place: int) -> str: ...
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[str]: ...
+    def __getitem__(self, place: int | slice) -> str | Sequence[str]:
+        if isinstance(place, slice):
+            return [self[n] for n in range(*place.indices(self._count))]
+        n = range(self._count)[place]
+        return f"{self._first + n * self._step:f}"
+
+
+def parse_axis(asked: str) -> SweepAxis:
+    """Returns the axis that a text describes.
+
+    Args:
+        asked: "KEY=a:b:step", with b where it lies on the grid, or "KEY=v1,v2,v3" with numbers, words or
+            other TOML values.
+
+    Raises:
+        ScenarioError: it has no key, no values, or values that make no grid.
+    """
+    key, equals, text = (part.strip() for part in asked.partition("="))
+    if not equals or not key:
+        raise ScenarioError(f"--over reads KEY=VALUES, {_HOW}, not {asked!r}")
+    if key in _ELSEWHERE:
+        raise ScenarioError(f"is no axis: {_ELSEWHERE[key]}", path=key)
+    parts = _split(text, ":")
+    if len(parts) == 1:
+        return SweepAxis(f"{key}={text}", key, _listed(key, text))
+    if len(parts) != 3:
+        raise ScenarioError(f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key)
+    return SweepAxis(f"{key}={text}", key, _steps(key, *(_decimal(key, part.strip()) for part in parts)))
+
+
+def _steps(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
+    if step == 0:
+        raise ScenarioError(f"a step of 0 never comes from {first:f} to {last:f}", path=key)
+    count = int((last - first) / step + _ON_GRID) + 1
+    if (last - first) * step < 0:
+        size = abs(step)
+        right = f"{min(first, last):f}:{max(first, last):f}:{size:f}"
+        raise ScenarioError(
+            f"is empty: a step of {step:f} does not lead from {first:f} to {last:f}; did you mean {right}?",
+            path=key,
+        )
+    if count > _MOST:
+        raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
+    return _Steps(first, step, count)
+
+
+def _decimal(key: str, text: str) -> Decimal:
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        raise ScenarioError(
+            f"a range is of numbers, a:b:step, and {text!r} is none; words go as in KEY=first,second",
+            path=key,
+        ) from None
+    if not number.is_finite():
+        raise ScenarioError(f"a range is of finite numbers, and {text!r} is none", path=key)
+    if abs(number) > Decimal("1e18") or (number and abs(number) < Decimal("1e-18")):
+        raise ScenarioError(f"{text} is beyond what a range is for: from 1e-18 to 1e18", path=key)
+    return number
+
+
+def _listed(key: str, text: str) -> tuple[str, ...]:
+    texts = tuple(part.strip() for part in _split(text, ","))
+    if "" in texts:
+        raise ScenarioError(f"is empty: say which values, {_HOW}", path=key)
+    values = list(map(_read, texts))
+    for n, (one, value) in enumerate(zip(texts, values, strict=True)):
+        if value in values[:n]:
+            raise ScenarioError(f"has {one} twice", path=key)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ScenarioError(f"must be finite numbers, one is {one}", path=key)
+    return texts
+
+
+def _split(text: str, mark: str) -> list[str]:
+    """Returns the parts between marks that stand in no bracket and in no quotes."""
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        depth += (letter in "[{") - (letter in "]}") if not quote else 0
+        if letter == mark and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
+def _read(text: str) -> Any:
+    """Returns the value of an override's text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+MAX_SEEDS = 100_000
+MAX_EXTENSION = 8.0
+"""A cell that is undecided runs at most so many times as long as the scenario does, unless told otherwise."""
+MAX_SCENARIO_S = 86_400.0
+"""No scenario is longer, s."""
+_CHECKED_VALUES = 32
+"""So many values of an axis are tried before anything runs."""
+
+
+class SweepPlan(NamedTuple):
+    """A sweep.
+
+    Attributes:
+        written: the experiment, as its author wrote it.
+        base: the same, resolved.
+        axes: what is swept; the last changes fastest.
+        laws: swept around the axes, slowest; none: the experiment's own.
+        law_overrides: per law what puts it into force.
+        seeds: of the runs of a cell in which anything is random; in others the first alone is run.
+        longest_s: how long a cell may be extended, s.
+    """
+
+    written: SweepSource
+    base: Scenario
+    axes: tuple[SweepAxis, ...]
+    laws: tuple[str, ...]
+    law_overrides: tuple[tuple[str, ...], ...]
+    seeds: tuple[int, ...]
+    longest_s: float
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many laws (1 where none is swept), and how many values along every axis."""
+        return (max(1, len(self.laws)), *(len(one.texts) for one in self.axes))
+
+    @property
+    def cells(self) -> int:
+        """How many cells there are."""
+        return math.prod(self.shape)
+
+    def cell(self, number: int) -> SweepCell:
+        """Returns a cell by its number.
+
+        Raises:
+            UsageError: there is none of that number.
+        """
+        if not 0 <= number < self.cells:
+            raise UsageError(f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}")
+        places = []
+        rest = number
+        for count in reversed(self.shape):
+            rest, place = divmod(rest, count)
+            places.append(place)
+        return self.cell_at(places[::-1])
+
+    def cell_at(self, places: Sequence[int]) -> SweepCell:
+        """Returns a cell by its place: number of the law (0 where none is swept), then along every axis."""
+        number = 0
+        for count, place in zip(self.shape, places, strict=True):
+            number = number * count + place
+        law, *others = places
+        return SweepCell(
+            number,
+            self.laws[law] if self.laws else "",
+            tuple(one.value(n) for one, n in zip(self.axes, others, strict=True)),
+            (
+                *(self.law_overrides[law] if self.laws else ()),
+                *(one.override(n) for one, n in zip(self.axes, others, strict=True)),
+            ),
+        )
+
+    def task(self, number: int, seed: int) -> CellTask:
+        """Returns one run of a cell, to be made."""
+        return CellTask(self.written, number, self.cell(number).overrides, seed, self.longest_s)
+
+    def facts(self) -> dict[str, Any]:
+        """Returns all that names it, as plain values; `plan_of` reads them."""
+        return {
+            "source": self.written.source,
+            "folder": self.written.folder,
+            "overrides": list(self.written.overrides),
+            "over": [one.asked for one in self.axes],
+            "laws": list(self.laws),
+            "seeds": list(self.seeds),
+            "longest_s": self.longest_s,
+            "name": self.base.name,
+            "scenario_sha256": self.base.sha256,
+            "text": self.written.text,
+        }
+
+
+def plan_sweep(
+    source: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    over: Sequence[str] = (),
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str] = (),
+    longest_s: float | None = None,
+) -> SweepPlan:
+    """Returns a sweep, checked and ready to run.
+
+    Args:
+        source: the name of a shipped scenario, or a path.
+        overrides: what is to be changed of it everywhere, as texts KEY=VALUE.
+        over: the axes, as "link.delay_ms=0:1600:50" or "link.order=newest,in_order".
+        seeds: how many, from the scenario's own on; or which.
+        laws: names of laws, swept besides the axes. One that all sites have stays with the gains of the
+            scenario; another one replaces the law of every site, with its default gains. Overrides of gains
+            count for either.
+        longest_s: how long an undecided cell may be extended, s; by default eight times its duration.
+
+    Raises:
+        ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
+        UsageError: another argument cannot be right.
+    """
+    text, folder = read_source(source)
+    written = SweepSource(str(source), text, str(folder), tuple(overrides))
+    base = written.scenario()
+    axes = tuple(map(parse_axis, over))
+    _refuse_twice(axes, laws)
+    chosen = tuple(dict.fromkeys(laws))
+    found = SweepPlan(
+        written,
+        base,
+        axes,
+        chosen,
+        tuple(_law_overrides(written, base, law) for law in chosen),
+        _seeds(seeds, base.seed),
+        _longest_s(longest_s, base),
+    )
+    for law in range(found.shape[0]):
+        _refuse_unfit(found, law)
+    return found
+
+
+def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
+    """Returns the plan that was kept as facts, from its own text; files that it names are read again.
+
+    Raises:
+        ScenarioError: it cannot run here.
+    """
+    written = SweepSource(facts["source"], facts["text"], facts["folder"], tuple(facts["overrides"]))
+    base = written.scenario()
+    return SweepPlan(
+        written,
+        base,
+        tuple(map(parse_axis, facts["over"])),
+        tuple(facts["laws"]),
+        tuple(_law_overrides(written, base, law) for law in facts["laws"]),
+        tuple(facts["seeds"]),
+        facts["longest_s"],
+    )
+
+
+def _refuse_twice(axes: Sequence[SweepAxis], laws: Sequence[str]) -> None:
+    keys = [one.key for one in axes]
+    for n, key in enumerate(keys):
+        if key in keys[:n]:
+            raise ScenarioError("is swept twice: give one --over with all its values", path=key)
+    if laws and "control.law" in keys:
+        raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
+
+
+def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
+    if isinstance(asked, int):
+        if not 1 <= asked <= MAX_SEEDS:
+            raise UsageError(f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}")
+        asked = range(own, own + asked)
+    if len(asked) > MAX_SEEDS:
+        raise UsageError(f"{len(asked)} seeds are more than {MAX_SEEDS}")
+    for seed in asked:
+        if not 0 <= seed < 2**63:
+            raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
+    return tuple(dict.fromkeys(asked)) or (own,)
+
+
+def _longest_s(asked: float | None, base: Scenario) -> float:
+    if asked is None:
+        return min(MAX_SCENARIO_S, MAX_EXTENSION * base.duration_s)
+    if not base.duration_s <= asked <= MAX_SCENARIO_S:
+        raise UsageError(
+            f"--longest is how long an undecided cell may run, from its {base.duration_s:g} s to "
+            f"{MAX_SCENARIO_S:g} s, not {asked:g}"
+        )
+    return asked
+
+
+def _law_overrides(written: SweepSource, base: Scenario, law: str) -> tuple[str, ...]:
+    """Returns what puts a law into force at every site."""
+    ours = [name for name in LAWS if name != "own"]
+    if law not in ours:
+        outside = ":" in law or law == "own"
+        why = "laws from outside are not swept" if outside else f"there is no law {law!r}"
+        hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}"
+        raise UsageError(f"--law: {why}{hint}")
+    if all(spec.control.__struct_config__.tag == law for spec in base.sites.values()):
+        return ()
+    tables = tomllib.loads(written.text)
+    apply_overrides(tables, written.overrides)
+    own = [name for name, site in tables["sites"].items() if "control" in site]
+    return (f"control.law={law}", *(f"sites.{name}.control.law={law}" for name in own))
+
+
+def _refuse_unfit(asked: SweepPlan, law: int) -> None:
+    """Refuses an axis with a value that makes no scenario or no difference, and corners that cannot run."""
+    origin = [law] + [0] * len(asked.axes)
+    for n, one in enumerate(asked.axes, 1):
+        seen: dict[str, str] = {}
+        for place in _sample_indices(len(one.texts)):
+            scenario = _checked(asked, [*origin[:n], place, *origin[n + 1 :]])
+            text = one.texts[place]
+            if scenario.sha256 in seen:
+                raise ScenarioError(
+                    f"{seen[scenario.sha256]} and {text} are the same experiment: nothing here follows this "
+                    "key; a site or link may have one of its own, as in sites.NAME.control or links.A->B",
+                    path=one.key,
+                    source=asked.written.source,
+                )
+            seen[scenario.sha256] = text
+    ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in asked.axes)]
+    for places in product(*ends):
+        _checked(asked, places)
+
+
+def _checked(asked: SweepPlan, places: Sequence[int]) -> Scenario:
+    """Returns the scenario of a cell.
+
+    Raises:
+        ScenarioError: there is none, or it cannot run here; says with which law where several are swept.
+    """
+    cell = asked.cell_at(places)
+    try:
+        scenario = asked.written.scenario(*cell.overrides)
+        cell_result.check_sweepable(scenario)
+    except ScenarioError as error:
+        problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
+        raise ScenarioError(problem, path=error.path, source=asked.written.source) from None
+    return scenario
+
+
+def _sample_indices(count: int) -> Iterator[int]:
+    """Yields the first, the last, and some between them."""
+    few = min(count, _CHECKED_VALUES)
+    return (n * (count - 1) // max(1, few - 1) for n in range(few))

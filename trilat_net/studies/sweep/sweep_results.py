@@ -1,0 +1,306 @@
+"""The results of a sweep as self-describing Parquet.
+
+One row per run, and one row per grid point over its seeds.
+
+Invariant: the bytes are a function of the runs alone, whatever their order or the number of processes.
+Each row's scenario, run again, reproduces the row. A grid point counts every run once; its stable share
+is taken over the decided runs and carries a 95 % Wilson interval within [0, 1].
+"""
+
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ...errors import UsageError
+from ...files import import_extra
+from .cell_result import CellClass, CellResult
+from .sweep_cell import CellRun, apply_diff, build_sim_command
+from .sweep_plan import SweepPlan, plan_from_json
+
+_TWO_SIDED_95 = 1.959963984540054
+"""The 0.975 quantile of the normal distribution."""
+
+
+class ShareInterval(NamedTuple):
+    """From where to where a share may lie."""
+
+    low: float
+    high: float
+
+
+def wilson_interval(successes: int, runs: int) -> ShareInterval:
+    """Returns the 95 % score interval of a share.
+
+    With n runs, p = successes / n and z the 0.975 quantile of the normal distribution it is
+    (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n). Unlike p -+ z sqrt(p (1 - p) / n)
+    it has a width where all runs agree.
+
+    Args:
+        successes: how many runs had it.
+        runs: how many there were.
+
+    Returns:
+        the interval, shares of 1.
+
+    Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
+    Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta, "Interval estimation for a
+    binomial proportion", Statistical Science 16 (2001).
+    """
+    if not 0 <= successes <= runs:
+        raise ValueError(f"{successes} of {runs} runs is no share")
+    if runs == 0:
+        return ShareInterval(0.0, 1.0)
+    share, weight = successes / runs, _TWO_SIDED_95**2 / runs
+    middle = share + weight / 2.0
+    half = math.sqrt(weight * (share * (1.0 - share) + weight / 4.0))
+    low = (middle - half) / (1.0 + weight) if successes else 0.0
+    high = (middle + half) / (1.0 + weight) if successes < runs else 1.0
+    return ShareInterval(low, high)
+
+
+RESULTS_FILE = "results.parquet"
+_PLAN_KEY = "trilat_net.sweep"
+"""The key of the file's metadata under which the plan stands, as JSON."""
+_ROWS_OF_A_GROUP = 16_384
+
+ResultRow = Mapping[str, Any]
+"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, every field of `Outcome`,
+`scenario_sha256`, `command` and `scenario`, its canonical text. Verdict and motion are their words."""
+
+
+def require_polars() -> Any:
+    """Returns polars, which reads and writes results.
+
+    Raises:
+        UsageError: it is not installed, or too old to keep a file's metadata.
+    """
+    pl = import_extra("polars", "frames", "sweeps")
+    if not hasattr(pl, "read_parquet_metadata"):
+        raise UsageError(
+            "sweeps need polars 1.30 or newer: pip install --upgrade 'trilat-net[frames]' polars"
+        )
+    return pl
+
+
+class SweepResults(NamedTuple):
+    """A sweep that was run.
+
+    Attributes:
+        plan: what was asked.
+        rows: its runs, by cell and then in the order of the seeds.
+    """
+
+    plan: SweepPlan
+    rows: Sequence[ResultRow]
+
+    def of_cell(self, number: int) -> list[ResultRow]:
+        """Returns the runs of a cell, one per seed.
+
+        Raises:
+            UsageError: there is no such cell.
+        """
+        self.plan.cell(number)
+        return [row for row in self.rows if row["cell"] == number]
+
+    def outcome(self, row: ResultRow) -> CellResult:
+        """Returns what became of a run."""
+        return msgspec.convert({field: row[field] for field in CellResult.__struct_fields__}, CellResult)
+
+
+def build_result_rows(asked: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
+    """Returns the rows that runs make, in their order.
+
+    Args:
+        asked: the sweep.
+        entries: its runs, in any order.
+    """
+    order = {seed: n for n, seed in enumerate(asked.seeds)}
+    seeds_of: dict[int, int] = {}
+    for entry in entries:
+        seeds_of[entry.cell] = seeds_of.get(entry.cell, 0) + 1
+    return [
+        _row(asked, entry, alone=seeds_of[entry.cell] == 1)
+        for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed]))
+    ]
+
+
+def _row(asked: SweepPlan, entry: CellRun, *, alone: bool) -> ResultRow:
+    cell = asked.cell(entry.cell)
+    text = apply_diff(entry.scenario, asked.base.text)
+    log = f"cell-{cell.number}.mcap" if alone else f"cell-{cell.number}-seed-{entry.seed}.mcap"
+    lasts_s = reproduction_duration_s(asked, entry.outcome)
+    return {
+        "cell": cell.number,
+        **{one.key: value for one, value in zip(asked.axes, cell.values, strict=True)},
+        "law": entry.law,
+        "seed": entry.seed,
+        "random": entry.random,
+        **msgspec.to_builtins(entry.outcome),
+        "scenario_sha256": entry.sha256,
+        "command": build_sim_command(asked.written, cell.overrides, entry.seed, lasts_s, log),
+        "scenario": text,
+    }
+
+
+def reproduction_duration_s(asked: SweepPlan, outcome: CellResult) -> float:
+    """Returns a duration that makes a run again: as long as it ran, or until it diverges by itself, s."""
+    if outcome.diverged_s is None:
+        return outcome.ran_s
+    return max(outcome.ran_s, min(asked.longest_s, asked.base.duration_s * 2.0**outcome.extended))
+
+
+def encode_results(asked: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[str, Any]) -> bytes:
+    """Returns results as a Parquet file.
+
+    Args:
+        asked: the sweep.
+        rows: its runs, in their order.
+        facts: what names the sweep, for the file's metadata.
+
+    Raises:
+        UsageError: polars is not installed.
+    """
+    pl = require_polars()
+    schema = {
+        "cell": pl.Int64,
+        **{one.key: pl.Float64 if one.numeric else pl.String for one in asked.axes},
+        "law": pl.String,
+        "seed": pl.Int64,
+        "random": pl.Boolean,
+        **_outcome_schema(pl),
+        "scenario_sha256": pl.String,
+        "command": pl.String,
+        "scenario": pl.String,
+    }
+    made = io.BytesIO()
+    pl.DataFrame(
+        {name: pl.Series(name, [row[name] for row in rows], dtype=kind) for name, kind in schema.items()}
+    ).write_parquet(
+        made,
+        compression="zstd",
+        row_group_size=_ROWS_OF_A_GROUP,
+        metadata={_PLAN_KEY: json.dumps(facts, ensure_ascii=False, sort_keys=True)},
+    )
+    return made.getvalue()
+
+
+def _outcome_schema(pl: Any) -> dict[str, Any]:
+    kinds = {"verdict": pl.String, "motion": pl.String, "extended": pl.Int64}
+    return {name: kinds.get(name, pl.Float64) for name in CellResult.__struct_fields__}
+
+
+def read_results(path: Path) -> SweepResults:
+    """Returns the results of a sweep.
+
+    Args:
+        path: its folder, or the Parquet file.
+
+    Raises:
+        UsageError: there are none, or the sweep has not come to its end; or polars is not installed.
+    """
+    pl = require_polars()
+    file = path / RESULTS_FILE if path.is_dir() else path
+    if not file.is_file():
+        more = f"; go on with it: trilat sweep --resume {path}" if path.is_dir() else ""
+        raise UsageError(f"{file}: there are no results of a sweep{more}")
+    try:
+        facts = json.loads(pl.read_parquet_metadata(file)[_PLAN_KEY])
+        frame = pl.read_parquet(file)
+    except KeyError:
+        raise UsageError(f"{file}: holds no results of a sweep: its metadata name none") from None
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise UsageError(f"{file}: cannot be read as Parquet: {str(error).splitlines()[0]}") from None
+    return SweepResults(plan_from_json(facts), frame.to_dicts())
+
+
+GRID_POINTS_FILE = "places.parquet"
+
+
+class GridPoint(NamedTuple):
+    """One cell with all its seeds.
+
+    Attributes:
+        cell: its number.
+        law: the laws of its sites.
+        values: along every axis.
+        counts: how many runs came to each verdict, in the order of `Verdict`.
+    """
+
+    cell: int
+    law: str
+    values: tuple[float | str, ...]
+    counts: tuple[int, ...]
+
+    @property
+    def decided(self) -> int:
+        """How many runs showed whether they are stable."""
+        return sum(n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable is not None)
+
+    @property
+    def stable(self) -> int:
+        """How many runs are stable."""
+        return sum(n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable)
+
+    @property
+    def doubtful(self) -> bool:
+        """True where some runs are stable and some are not."""
+        return 0 < self.stable < self.decided
+
+    @property
+    def interval(self) -> ShareInterval:
+        """The 95 % interval of the share of stable runs, among those that decide."""
+        return wilson_interval(self.stable, self.decided)
+
+
+def collect_grid_points(results: SweepResults) -> list[GridPoint]:
+    """Returns every place of a sweep, in the order of the cells."""
+    counted: dict[int, Counter[str]] = {}
+    laws: dict[int, str] = {}
+    for row in results.rows:
+        counted.setdefault(row["cell"], Counter())[row["verdict"]] += 1
+        laws[row["cell"]] = row["law"]
+    return [
+        GridPoint(
+            number,
+            laws[number],
+            results.plan.cell(number).values,
+            tuple(counts[verdict.value] for verdict in CellClass),
+        )
+        for number, counts in counted.items()
+    ]
+
+
+def encode_grid_points(asked: SweepPlan, found: Sequence[GridPoint]) -> bytes:
+    """Returns places as a Parquet file: a row each, its counts, and the share of stable runs with its ends.
+
+    Raises:
+        UsageError: polars is not installed.
+    """
+    pl = require_polars()
+    intervals = [one.interval for one in found]
+    columns = {
+        "cell": ([one.cell for one in found], pl.Int64),
+        **{
+            axis.key: ([one.values[n] for one in found], pl.Float64 if axis.numeric else pl.String)
+            for n, axis in enumerate(asked.axes)
+        },
+        "law": ([one.law for one in found], pl.String),
+        "runs": ([sum(one.counts) for one in found], pl.Int64),
+        **{
+            verdict.value: ([one.counts[n] for one in found], pl.Int64) for n, verdict in enumerate(CellClass)
+        },
+        "stable_share": ([one.stable / one.decided if one.decided else None for one in found], pl.Float64),
+        "stable_share_low": ([one.low for one in intervals], pl.Float64),
+        "stable_share_high": ([one.high for one in intervals], pl.Float64),
+    }
+    made = io.BytesIO()
+    pl.DataFrame(
+        {name: pl.Series(name, values, dtype=kind) for name, (values, kind) in columns.items()}
+    ).write_parquet(made, compression="zstd")
+    return made.getvalue()

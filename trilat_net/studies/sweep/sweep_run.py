@@ -1,0 +1,202 @@
+"""Runs a sweep on all cores: estimates its duration, runs the cells that are missing, writes the results.
+
+Invariant: results are a function of the plan; the number of processes, their order and the number of
+interruptions do not enter. A run that is in the journal is never made again.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from ...errors import UsageError
+from ...net.clock import SystemClock
+from ...process import count_cores
+from ..executor import WorkerPool, open_worker_pool
+from . import cell_result
+from .sweep_cell import CellRun, run_cell
+from .sweep_folder import SweepFolder, SweepJournal, write_whole
+from .sweep_plan import SweepPlan
+from .sweep_results import (
+    GRID_POINTS_FILE,
+    SweepResults,
+    build_result_rows,
+    collect_grid_points,
+    encode_grid_points,
+    encode_results,
+    require_polars,
+)
+
+MAX_RUNS = 1_000_000
+MAX_SWEEP_S = 86_400.0
+"""A sweep of more, or one that would take longer, is asked about first."""
+_PROBES = 7
+_PROBING_S = 3.0
+"""So many runs tell how long all will take; fewer, once that has taken so long."""
+_RESUME_HINT = "what is done is kept: go on with --resume, "
+
+SweepProgress = Callable[[int, int], None]
+
+
+class DurationEstimate(NamedTuple):
+    """How long a sweep will take, by a few of its runs, which are done then.
+
+    Attributes:
+        runs: how many there are at most, those that are done left out.
+        seconds: how long they will take on the processes that were asked for.
+        entries: the runs that were made.
+    """
+
+    runs: int
+    seconds: float
+    entries: list[CellRun]
+
+
+class SweepSpeed(NamedTuple):
+    """How fast a sweep went, this time.
+
+    Attributes:
+        runs: how many were made.
+        simulated_s: how much time of the experiment that was.
+        wall_s: how long it took.
+        jobs: by how many processes.
+    """
+
+    runs: int
+    simulated_s: float
+    wall_s: float
+    jobs: int
+
+    @property
+    def times_real_time(self) -> float:
+        """Simulated seconds per second of one process."""
+        return self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
+
+
+class FinishedSweep(NamedTuple):
+    """A sweep that has come to its end.
+
+    Attributes:
+        results: what came of it.
+        folder: where it is.
+        speed: of what was run this time.
+    """
+
+    results: SweepResults
+    folder: SweepFolder
+    speed: SweepSpeed
+
+
+def estimate_sweep(
+    asked: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
+) -> DurationEstimate:
+    """Returns how long a sweep will take, by its first and last run and some between.
+
+    Args:
+        asked: the sweep.
+        done: cells and seeds that are done already.
+        jobs: in how many processes; None for one per core.
+    """
+    known = set(done)
+    places = dict.fromkeys(n * (asked.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
+    probes = [asked.task(n, asked.seeds[0]) for n in places if (n, asked.seeds[0]) not in known]
+    if not probes:
+        return DurationEstimate(asked.cells * len(asked.seeds) - len(known), 0.0, [])
+    first = probes[0]
+    brief_s = min(1.0, asked.base.duration_s)
+    warm = asked.written.scenario(*first.overrides, f"duration_s={brief_s!r}")
+    cell_result.classify_cell(warm.text, brief_s)  # compiles, once for all processes
+    clock = SystemClock()
+    began_ns = clock.monotonic_ns()
+    entries: list[CellRun] = []
+    took_s = 0.0
+    for task in probes:
+        if took_s < _PROBING_S:
+            entries.append(run_cell(task))
+            took_s = (clock.monotonic_ns() - began_ns) * 1e-9
+    seeds = len(asked.seeds) if any(entry.random for entry in entries) else 1
+    left = max(len(entries), asked.cells * seeds - len(known))
+    return DurationEstimate(left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries)
+
+
+def refuse_oversized_sweep(asked: SweepPlan, expected: DurationEstimate, jobs: int | None = None) -> None:
+    """Refuses a sweep of very many runs, or of more than a day.
+
+    Raises:
+        UsageError: it is one; says how many runs, and how long they would take.
+    """
+    if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
+        return
+    sizes = " x ".join(str(count) for count in asked.shape if count > 1)
+    seeds = f", {len(asked.seeds)} seeds each" if len(asked.seeds) > 1 else ""
+    raise UsageError(
+        f"{asked.cells} cells ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} on "
+        f"{jobs or count_cores()} cores; larger steps make it fewer, --yes runs it all the same"
+    )
+
+
+def format_wall_time(seconds: float) -> str:
+    """Returns a time as people say it."""
+    for unit, size, from_s in (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0)):
+        if seconds >= from_s:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{max(1, round(seconds))} s"
+
+
+def run_sweep(
+    folder: SweepFolder,
+    jobs: int | None = None,
+    progress: SweepProgress = lambda _done, _total: None,
+    known: Iterable[CellRun] = (),
+) -> FinishedSweep:
+    """Runs what is left of a sweep, writes its results, and returns them.
+
+    Args:
+        folder: of the sweep; what its journal has is not run again.
+        jobs: in how many processes; None for one per core.
+        progress: told how many runs are done, and how many there are as far as is known.
+        known: runs that were made already, for an estimate.
+
+    Raises:
+        ScenarioError: a cell cannot run; says which. What is done is kept.
+        RunFailed: a process was ended by somebody. What is done is kept.
+        UsageError: polars is not installed.
+    """
+    require_polars()
+    asked = folder.plan
+    clock = SystemClock()
+    with folder.journal() as journal:
+        for entry in known:
+            journal.add(entry)
+        before, began_ns = set(journal.done), clock.monotonic_ns()
+        left = asked.cells * len(asked.seeds) - len(before)
+        count = max(1, min(jobs or count_cores(), left))
+        with open_worker_pool(count if left else 1, _RESUME_HINT) as hands:
+            _run_cells(asked, journal, hands, progress)
+        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        made = [entry for key, entry in journal.done.items() if key not in before]
+        rows = build_result_rows(asked, list(journal.done.values()))
+    results = SweepResults(asked, rows)
+    if len(asked.seeds) > 1:
+        write_whole(folder.path / GRID_POINTS_FILE, encode_grid_points(asked, collect_grid_points(results)))
+    write_whole(folder.results, encode_results(asked, rows, folder.facts))
+    speed = SweepSpeed(len(made), sum(entry.outcome.ran_s for entry in made), wall_s, count)
+    return FinishedSweep(results, folder, speed)
+
+
+def _run_cells(asked: SweepPlan, journal: SweepJournal, hands: WorkerPool, progress: SweepProgress) -> None:
+    """Runs the first seed of every cell, then the others of those in which anything is random."""
+    first, *others = asked.seeds
+
+    def total() -> int:
+        random = sum(entry.random for (_, seed), entry in journal.done.items() if seed == first)
+        return asked.cells + random * len(others)
+
+    def make(runs: Iterable[tuple[int, int]], count: int) -> None:
+        tasks = (asked.task(*key) for key in runs if key not in journal.done)
+        for _, entry in hands.each(run_cell, tasks):
+            journal.add(entry)
+            progress(len(journal.done), count)
+
+    make(((number, first) for number in range(asked.cells)), asked.cells)
+    again = [number for number in range(asked.cells) if others and journal.done[number, first].random]
+    make(((number, seed) for number in again for seed in others), total())

@@ -1,0 +1,253 @@
+"""The results of many trials as a text table and as JUnit XML for GitLab, Jenkins and GitHub Actions.
+
+Invariant: a row shows the worst of its runs; every failed run appears with the command that repeats it.
+The XML follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per run, one `failure` with
+everything that did not hold, an `error` for a run without a result.
+"""
+
+import re
+import xml.etree.ElementTree as Xml
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from .expectations import ExpectationResult
+from .trial import TrialResult
+
+MAX_FAILURES_SHOWN = 5
+"""So many failed runs of a scenario are told in full; of the others the seeds."""
+
+TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
+_NUMBERS = ("margin", "held")
+
+
+class ExpectationRow(NamedTuple):
+    """One expectation of one scenario, over all its runs.
+
+    Attributes:
+        scenario: which.
+        key: what was expected.
+        worst: the outcome with the least margin; a failed one where there is one.
+        held: in how many runs it held.
+        runs: of how many.
+    """
+
+    scenario: str
+    key: str
+    worst: ExpectationResult
+    held: int
+    runs: int
+
+    def cells(self) -> tuple[str, ...]:
+        """Returns the row's texts, under `COLUMNS`."""
+        mark = "ok" if self.held == self.runs else "FAIL"
+        worst = self.worst
+        return (
+            mark,
+            self.scenario,
+            self.key,
+            worst.limit,
+            worst.measured,
+            format_margin(worst.margin),
+            f"{self.held}/{self.runs}",
+        )
+
+
+class TrialReport(NamedTuple):
+    """All results, in the order of scenarios and seeds.
+
+    Attributes:
+        results: one per run.
+        wall_s: how long all of them took.
+    """
+
+    results: list[TrialResult]
+    wall_s: float
+
+    @property
+    def held(self) -> bool:
+        """True where everything held."""
+        return all(result.held for result in self.results)
+
+    @property
+    def scenarios(self) -> dict[str, list[TrialResult]]:
+        """The results by scenario, as a command calls it."""
+        groups: dict[str, list[TrialResult]] = {}
+        for result in self.results:
+            groups.setdefault(result.trial.source, []).append(result)
+        return groups
+
+    def rows(self) -> list[ExpectationRow]:
+        """Returns the table: a row per scenario and expectation."""
+        return [row for name, results in self.scenarios.items() for row in _rows(name, results)]
+
+    def failures(self) -> list[str]:
+        """Returns what failed and the commands that repeat it, line by line."""
+        return [line for results in self.scenarios.values() for line in _failure_lines(results)]
+
+    def remarks(self) -> list[str]:
+        """Returns what else there is to know: what ran once, and how fast it went."""
+        once = [
+            name
+            for name, results in self.scenarios.items()
+            if not (results[0].trial.scenario.random or results[0].trial.live)
+        ]
+        changed = self.results[0].trial.overrides if self.results else ()
+        remarks = [f"changed in all: {', '.join(changed)}"] if changed else []
+        if once:
+            remarks.append(f"run once, nothing in it is random: {', '.join(once)}")
+        simulated_s = sum(result.simulated_s for result in self.results)
+        how = "ran live" if any(result.trial.live for result in self.results) else "simulated"
+        runs = "run" if len(self.results) == 1 else "runs"
+        speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
+        return [
+            *remarks,
+            f"{len(self.results)} {runs}, {simulated_s:.6g} s {how} in {self.wall_s:.1f} s{speed}",
+        ]
+
+    def table(self) -> list[str]:
+        """Returns the table as aligned lines; the first holds the heads."""
+        table = [TRIAL_COLUMNS, *(row.cells() for row in self.rows())]
+        widths = [max(len(cells[n]) for cells in table) for n in range(len(TRIAL_COLUMNS))]
+        return [
+            "  ".join(
+                cell.rjust(width) if column in _NUMBERS else cell.ljust(width)
+                for cell, width, column in zip(cells, widths, TRIAL_COLUMNS, strict=True)
+            ).rstrip()
+            for cells in table
+        ]
+
+    def text(self) -> str:
+        """Returns all of it as plain text."""
+        return "\n".join([*self.table(), *self.failures(), *self.remarks()])
+
+
+def format_margin(margin: float | None) -> str:
+    """Returns a margin in percent; "" where there is none."""
+    return "" if margin is None else f"{100.0 * margin:+,.{0 if abs(margin) >= 0.1 else 1}f} %"
+
+
+def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
+    by_key: dict[str, list[ExpectationResult]] = {}
+    for result in results:
+        for outcome in result.outcomes:
+            by_key.setdefault(outcome.key, []).append(outcome)
+    rows = [
+        ExpectationRow(name, key, min(outcomes, key=_order), sum(o.held for o in outcomes), len(outcomes))
+        for key, outcomes in by_key.items()
+    ]
+    broken = [result.error for result in results if result.error]
+    if broken:
+        outcome = ExpectationResult("a result", False, broken[0], "")
+        rows.append(ExpectationRow(name, outcome.key, outcome, len(results) - len(broken), len(results)))
+    return rows
+
+
+def _order(outcome: ExpectationResult) -> tuple[bool, float]:
+    """Sorts failed outcomes before others, then by margin."""
+    return outcome.held, outcome.margin if outcome.margin is not None else 0.0
+
+
+def _failure_lines(results: Sequence[TrialResult]) -> list[str]:
+    failed = [result for result in results if not result.held]
+    lines = []
+    for result in failed[:MAX_FAILURES_SHOWN]:
+        trial = result.trial
+        lines.append(f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}")
+        lines.append(f"  again: {trial.again}")
+        lines.append(f"  look:  trilat report {result.log}" if result.log else f"  look:  {trial.look}")
+    if len(failed) > MAX_FAILURES_SHOWN:
+        seeds = ", ".join(str(result.trial.scenario.seed) for result in failed[MAX_FAILURES_SHOWN:])
+        lines.append(f"  and {len(failed) - MAX_FAILURES_SHOWN} more, seeds {seeds}")
+    return lines
+
+
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
+    """Returns the results as an XML document.
+
+    Args:
+        report: the results.
+        began_unix_ns: when the first run began, ns since 1970.
+        host: name of the machine.
+    """
+    root = Xml.Element("testsuites", _counts(report.results), name="trilat test")
+    began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
+    for name, results in report.scenarios.items():
+        suite = Xml.SubElement(
+            root,
+            "testsuite",
+            _counts(results),
+            name=_clean(name),
+            skipped="0",
+            timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
+            hostname=_clean(host),
+        )
+        properties = Xml.SubElement(suite, "properties")
+        for key, value in _properties(results):
+            Xml.SubElement(properties, "property", name=key, value=_clean(value))
+        for result in results:
+            _add_case(suite, result)
+    Xml.indent(root)
+    document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
+    return document + b"\n"
+
+
+def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
+    errors = sum(bool(result.error) for result in results)
+    failures = sum(not result.held for result in results) - errors
+    return {
+        "tests": str(len(results)),
+        "failures": str(failures),
+        "errors": str(errors),
+        "time": f"{sum(result.wall_s for result in results):.3f}",
+    }
+
+
+def _properties(results: Sequence[TrialResult]) -> list[tuple[str, str]]:
+    trial = results[0].trial
+    return [
+        ("driver", "live" if trial.live else "virtual"),
+        ("source", trial.source),
+        ("overrides", " ".join(trial.overrides)),
+        ("duration_s", f"{trial.scenario.duration_s:g}"),
+        ("simulated_s", f"{sum(result.simulated_s for result in results):.6g}"),
+        ("random", str(trial.scenario.random).lower()),
+    ]
+
+
+def _add_case(suite: Xml.Element, result: TrialResult) -> None:
+    trial = result.trial
+    case = Xml.SubElement(
+        suite,
+        "testcase",
+        name=f"seed {trial.scenario.seed}",
+        classname=f"trilat.{trial.scenario.name}",
+        time=f"{result.wall_s:.3f}",
+    )
+    again = [
+        f"again: {trial.again}",
+        f"look:  trilat report {result.log}" if result.log else f"look:  {trial.look}",
+    ]
+    if not result.held:
+        kind = "error" if result.error else "failure"
+        found = Xml.SubElement(
+            case,
+            kind,
+            type="error" if result.error else "expectation",
+            message=_clean("; ".join(result.failures)),
+        )
+        found.text = _clean("\n".join([*result.failures, *again]))
+    lines = [
+        f"{'ok' if o.held else 'FAIL'} {o.key}: {o.measured}, asked {o.limit}"
+        + (f" ({format_margin(o.margin)})" if o.margin is not None else "")
+        for o in result.outcomes
+    ]
+    Xml.SubElement(case, "system-out").text = _clean("\n".join(lines))
+
+
+def _clean(text: str) -> str:
+    """Returns text without the characters that no XML document may hold, not even escaped."""
+    return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

@@ -1,0 +1,310 @@
+"""One candidate of a tuning: its scenario, the command that runs it, its run in virtual time, and its score.
+
+Invariant: a candidate's scenario is loaded through the same settings that its command names, and its
+score is a function of the scenario alone: None for the errors of a run that does not reach its end.
+Scores come in the order of the candidates, whatever the number of processes.
+"""
+
+import shlex
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from ... import process
+from ...analysis.run_end import EnvelopeTrend, fit_envelope
+from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...core.ticks import NS_PER_S, Mode, TickRecord
+from ...core.two_link_arm import JOINTS
+from ...core.vectors import Array
+from ...errors import RunFailed, ScenarioError
+from ...execution import virtual
+from ...log.record_columns import Ints
+from ...process import ignore_sigint, worker_pool
+from ...scenario import Scenario, load_scenario, parse_scenario
+from ...scenario.scenario_types import SiteSpec
+from .consensus_pose import build_twin, compute_consensus_pose
+from .final_posture import END_WINDOW_S, CandidateClass, CandidateEnd, classify_candidate
+from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
+
+
+class CandidateScore(msgspec.Struct, frozen=True):
+    """One candidate, measured; the formulas stand in docs/fair-comparison.md.
+
+    Attributes:
+        outcome: what became of the run.
+        error_rad: RMS distance of the arms from where they ought to be; None where the run diverged.
+        spread_rad: the part of it that is the arms' distance from each other, at one instant, undelayed.
+        pose_rad: the part of it that is the distance of their mean from the pose.
+        effort_nm: RMS torque beyond what gravity asks at the pose where the arm is.
+        settled_s: since when the largest |e| is below 0.01 rad; None where it is not at the end.
+        saturated: share of all joint torques that were at the clamp.
+        diverged_s: when the first site left its limits, or None.
+    """
+
+    outcome: CandidateClass
+    error_rad: float | None
+    spread_rad: float | None
+    pose_rad: float | None
+    effort_nm: float | None
+    settled_s: float | None
+    saturated: float
+    diverged_s: float | None = None
+
+
+def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
+    """Runs a candidate and its twin, and returns its score.
+
+    Args:
+        text: the canonical text of its scenario.
+        twin_text: of the twin on which its pose is judged; None where it is its own.
+    """
+    run = _run(parse_scenario(text))
+    alone = run if twin_text is None else _run(parse_scenario(twin_text))
+    diverged_s = run.diverged_s if run.diverged_s is not None else alone.diverged_s
+    outcome = classify_candidate(diverged_s is not None, run.trend, run.ending, alone.ending)
+    if diverged_s is not None:
+        return CandidateScore(outcome, None, None, None, None, None, run.saturated, diverged_s)
+    error_rad = float(np.hypot(run.spread_rad, alone.pose_rad))
+    return CandidateScore(
+        outcome, error_rad, run.spread_rad, alone.pose_rad, run.effort_nm, run.settled_s, run.saturated
+    )
+
+
+class _Run(NamedTuple):
+    """What is measured of one run."""
+
+    trend: EnvelopeTrend
+    ending: CandidateEnd
+    spread_rad: float
+    pose_rad: float
+    effort_nm: float
+    settled_s: float | None
+    saturated: float
+    diverged_s: float | None
+
+
+class _Record:
+    """One site's run: time, ns, and q, q_des, tau of every tick."""
+
+    def __init__(self, site: SiteSpec) -> None:
+        self.site = site
+        self._t_ns, self._floats = array("q"), array("d")
+
+    def take(self, output: TickRecord) -> None:
+        """Takes one record."""
+        self._t_ns.append(output.t_ns)
+        self._floats.extend(output.q)
+        self._floats.extend(output.q_des)
+        self._floats.extend(output.tau)
+
+    @property
+    def t_ns(self) -> Ints:
+        """Nominal times, shape (K,), ns."""
+        return np.array(self._t_ns, dtype=np.int64)
+
+    @property
+    def rows(self) -> Array:
+        """q, q_des and tau, shape (3, K, n)."""
+        return np.array(self._floats).reshape(-1, 3, JOINTS).transpose(1, 0, 2)
+
+
+def _run(scenario: Scenario) -> _Run:
+    records = {name: _Record(spec) for name, spec in scenario.sites.items()}
+    diverged_s: float | None = None
+    with process.pause_gc():
+        for site, _, output in virtual.execute_virtual(scenario):
+            records[site.name].take(output)
+            if output.mode is Mode.DIVERGED and diverged_s is None:
+                diverged_s = output.t_ns / NS_PER_S
+    t_s, q, e = _aligned(list(records.values()))
+    mean = q.mean(axis=0)
+    apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
+    largest = np.abs(e).max(axis=(0, 2))
+    efforts, saturated = zip(*map(_effort, records.values()), strict=True)
+    return _Run(
+        trend=fit_envelope(t_s, largest).trend,
+        ending=_ending(t_s, apart, off, e),
+        spread_rad=_rms(apart),
+        pose_rad=_rms(off),
+        effort_nm=float(np.sqrt(np.mean(efforts))),
+        settled_s=_settled_s(t_s, largest),
+        saturated=float(np.mean(saturated)),
+        diverged_s=diverged_s,
+    )
+
+
+def _aligned(records: list[_Record]) -> tuple[Array, Array, Array]:
+    """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape (N, K, n)."""
+    times = [record.t_ns for record in records]
+    end_ns = min(t_ns[-1] for t_ns in times)
+    slowest = min(times, key=len)
+    at_ns = slowest[slowest <= end_ns]
+    latest = [
+        record.rows[:2, np.searchsorted(t_ns, at_ns, side="right") - 1]
+        for record, t_ns in zip(records, times, strict=True)
+    ]
+    q, q_des = np.array(latest).transpose(1, 0, 2, 3)
+    return at_ns / NS_PER_S, q, q - q_des
+
+
+def _effort(record: _Record) -> tuple[float, float]:
+    """Returns the mean square of tau - G(q), (N m)^2, and the share of torques at the clamp."""
+    q, _, tau = record.rows
+    arm = record.site.arm
+    inner, outer = arm.g_m_s2 * arm.theta[3:, np.newaxis] * np.cos(np.cumsum(q, axis=1).T)
+    gravity = np.array([inner + outer, outer]).T
+    clamped = np.abs(tau) >= record.site.limits.tau_limit_nm
+    return float(np.mean((tau - gravity) ** 2)), float(np.mean(clamped))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _settled_s(t_s: Array, largest: Array) -> float | None:
+    apart = np.flatnonzero(largest >= SETTLED_ERROR_RAD)
+    if not len(apart):
+        return 0.0
+    return None if apart[-1] == len(t_s) - 1 else float(t_s[apart[-1]])
+
+
+def _ending(t_s: Array, apart: Array, off: Array, e: Array) -> CandidateEnd:
+    """Returns what the last second shows, and how the mean pose came there in the second half."""
+    last = t_s > t_s[-1] - END_WINDOW_S
+    half_s = 0.5 * t_s[-1]
+    middle = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
+    end, before = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
+    return CandidateEnd(
+        spread_rad=float(np.abs(apart[:, last]).max()),
+        fall_rad=float(end.max()),
+        ahead_rad=float((end + 2.0 * np.maximum(end - before, 0.0)).max()),
+        swing_rad=float(np.ptp(e[:, last], axis=1).max()),
+    )
+
+
+CandidateTask = tuple[str, str | None]
+"""The canonical text of a candidate's scenario, and of its twin's or None."""
+
+
+class CandidatePool:
+    """Runs candidates.
+
+    Args:
+        pool: in which processes; None: in this one.
+    """
+
+    def __init__(self, pool: ProcessPoolExecutor | None) -> None:
+        self._pool = pool
+
+    def scores(self, tasks: Sequence[CandidateTask], done: Callable[[], None]) -> list[CandidateScore]:
+        """Returns the score of every candidate.
+
+        Args:
+            tasks: the candidates.
+            done: is told of every score as it comes.
+
+        Raises:
+            RunFailed: a process was ended.
+        """
+        if not tasks:
+            return []
+        found: list[CandidateScore] = []
+        try:
+            with ignore_sigint():
+                scores = (map if self._pool is None else self._pool.map)(
+                    measure_candidate, *zip(*tasks, strict=True)
+                )
+            for score in scores:
+                found.append(score)
+                done()
+        except BrokenProcessPool:
+            raise RunFailed(
+                "a process of the search was ended, or could not begin; try again, or with --jobs 1"
+            ) from None
+        return found
+
+
+@contextmanager
+def open_candidate_pool(jobs: int) -> Iterator[CandidatePool]:
+    """Yields who runs candidates.
+
+    Args:
+        jobs: in how many processes; one is this one.
+    """
+    if jobs <= 1:
+        yield CandidatePool(None)
+        return
+    with worker_pool(jobs) as pool:
+        yield CandidatePool(pool)
+
+
+class TuningScenario(NamedTuple):
+    """The experiment in which laws are compared.
+
+    Attributes:
+        source: what a command calls it: a shipped name or a path.
+        overrides: what was changed of it, as texts KEY=VALUE.
+        scenario: it, with those.
+    """
+
+    source: str
+    overrides: tuple[str, ...]
+    scenario: Scenario
+
+    def with_controls(self, controls: SiteControls) -> "TuningScenario":
+        """Returns the same with the control of every site replaced, in as few settings as say it."""
+        single = [f"sites.{name}.control={_inline(table)}" for name, table in controls.items()]
+        wanted = load_scenario(self.source, [*self.overrides, *single])
+        first = next(iter(controls.values()))
+        if all(table == first for table in controls.values()):
+            texts = (*self.overrides, f"control={_inline(first)}")
+            with suppress(ScenarioError):  # a site has gains of its own, which are none of this law
+                scenario = load_scenario(self.source, texts)
+                if scenario.sites == wanted.sites:
+                    return TuningScenario(self.source, texts, scenario)
+        return TuningScenario(self.source, (*self.overrides, *single), wanted)
+
+    def with_gains(
+        self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
+    ) -> "TuningScenario":
+        """Returns the same under a law with a choice of gains."""
+        return self.with_controls(space.controls(self.scenario, knowledge, gains))
+
+    @property
+    def task(self) -> CandidateTask:
+        """What has to be run to measure it."""
+        alone = build_twin(self.scenario)
+        return self.scenario.text, None if alone is None else alone.text
+
+    @property
+    def command(self) -> str:
+        """The command that makes a log of it."""
+        words = [word for text in self.overrides for word in ("--set", text)]
+        return shlex.join(["trilat", "sim", self.source, *words])
+
+
+def load_tuning_scenario(source: str | Path, overrides: Sequence[str] = ()) -> TuningScenario:
+    """Returns the experiment that a name or path and overrides mean.
+
+    Raises:
+        ScenarioError: there is none.
+    """
+    return TuningScenario(str(source), tuple(overrides), load_scenario(source, overrides))
+
+
+def _inline(value: Any) -> str:
+    """Returns a value as TOML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_inline(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    if isinstance(value, str):
+        return f'"{value}"'
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)

@@ -1,0 +1,184 @@
+"""The search that every control law gets, and the Pareto front of error against effort.
+
+Invariant: the gains tried are a function of the seed, the search space and the scores of earlier rounds;
+their number is the budget. Half is a Latin hypercube in the logarithm of the gains (McKay, Beckman and
+Conover, Technometrics 21, 1979), half refinement of its front. Both objectives are minimised, only
+settled runs compete, and of equal ones the first stays.
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+
+from ...core.vectors import Array
+from .candidate import CandidateScore
+from .final_posture import CandidateClass
+from .search_space import SearchSpace
+
+ObjectivePoint = tuple[float, float]
+
+
+class Objective(StrEnum):
+    """What is weighed against effort."""
+
+    ERROR = "error"
+    SETTLING = "settling"
+
+    @property
+    def unit(self) -> str:
+        """Its unit."""
+        return "rad" if self is Objective.ERROR else "s"
+
+    def of(self, score: CandidateScore) -> float | None:
+        """Returns what it is in a run; None where the run has none."""
+        return score.error_rad if self is Objective.ERROR else score.settled_s
+
+    def point(self, score: CandidateScore) -> ObjectivePoint | None:
+        """Returns (objective, effort) of a run that may stand on a front, else None."""
+        value = self.of(score)
+        if score.outcome is not CandidateClass.SETTLED or value is None or score.effort_nm is None:
+            return None
+        return value, score.effort_nm
+
+
+def dominates(a: ObjectivePoint, b: ObjectivePoint) -> bool:
+    """True where a is no worse than b in both, and better in one."""
+    return a[0] <= b[0] and a[1] <= b[1] and a != b
+
+
+def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
+    """Returns the places of the points that none dominates, by rising effort.
+
+    Args:
+        points: (objective, effort) of every run; None for one that does not compete.
+    """
+    order = sorted((point[1], point[0], n) for n, point in enumerate(points) if point is not None)
+    kept: list[int] = []
+    least = float("inf")
+    for _, value, n in order:
+        if value < least:
+            kept.append(n)
+            least = value
+    return kept
+
+
+def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
+    """Returns how alone each point of a front is: the side of the box between its neighbours; ends: inf.
+
+    After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic algorithm: NSGA-II",
+    IEEE Trans. Evolutionary Computation 6 (2002).
+
+    Args:
+        points: a front, by rising effort.
+    """
+    if len(points) < 3:
+        return [float("inf")] * len(points)
+    spans = [abs(points[-1][axis] - points[0][axis]) or 1.0 for axis in (0, 1)]
+    inner = [
+        sum(abs(after[axis] - before[axis]) / spans[axis] for axis in (0, 1))
+        for before, after in zip(points[:-2], points[2:], strict=True)
+    ]
+    return [float("inf"), *inner, float("inf")]
+
+
+REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
+"""Deviation of the refinements, round by round, as a share of the logarithm of a gain's range."""
+GAIN_DIGITS = 4
+"""Gains are rounded to so many significant digits before they are tried, so that they can be told."""
+
+CandidateGains = dict[str, float]
+
+
+class CandidateSearch:
+    """One law's search.
+
+    Args:
+        space: where.
+        budget: how many candidates in all, at least 1.
+        seed: what chance is a function of.
+        objective: what is weighed against effort.
+
+    Attributes:
+        space: where.
+        tried: what was tried, in order.
+        scores: what came of it, in the same order.
+    """
+
+    def __init__(self, space: SearchSpace, budget: int, seed: int, objective: Objective) -> None:
+        self.space = space
+        self.tried: list[CandidateGains] = []
+        self.scores: list[CandidateScore] = []
+        self._objective = objective
+        self._rng = np.random.default_rng(seed)  # the same for every law
+        self._logs = np.log([[knob.low, knob.high] for knob in space.knobs])
+        first = (budget + 1) // 2
+        self._rounds = [first, *_parts(budget - first, len(REFINEMENT_STEPS))]
+
+    @property
+    def rounds(self) -> list[int]:
+        """How many candidates each round has."""
+        return list(self._rounds)
+
+    def ask(self, number: int) -> list[CandidateGains]:
+        """Returns the candidates of a round, all earlier ones of which were told."""
+        count = self._rounds[number]
+        places = self._hypercube(count) if number == 0 else self._refined(count, REFINEMENT_STEPS[number - 1])
+        return [self._gains(place) for place in places]
+
+    def tell(self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]) -> None:
+        """Takes what came of a round's candidates."""
+        self.tried += gains
+        self.scores += scores
+
+    def _hypercube(self, count: int) -> Array:
+        """Returns one point in every row and column of a grid, shape (count, knobs), from 0 to 1."""
+        columns = [self._rng.permutation(count) for _ in self.space.knobs]
+        points: Array = (np.stack(columns, axis=1) + self._rng.random((count, len(columns)))) / count
+        return points
+
+    def _refined(self, count: int, step: float) -> Array:
+        """Returns points beside the parents, shape (count, knobs), within the ranges."""
+        parents = self._parents(count).reshape(count, len(self.space.knobs))
+        moved: Array = np.clip(parents + step * self._rng.standard_normal(parents.shape), 0.0, 1.0)
+        return moved
+
+    def _parents(self, count: int) -> Array:
+        """Returns what to refine: every other time the best, else the loneliest points of the front.
+
+        Where nothing settled yet, those that erred least without diverging; where all diverged, anything.
+        """
+        points = [self._objective.point(score) for score in self.scores]
+        places = find_pareto_front(points)
+        if places:
+            lonely = compute_crowding([points[n] or (0.0, 0.0) for n in places])
+            by_space = [n for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])]
+            best = places[-1]
+        else:
+            by_space = sorted(range(len(self.scores)), key=lambda n: _unsettled_rank(self.scores[n]))
+            by_space, best = by_space[: max(1, count // 4)], by_space[0]
+        chosen = [best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)]
+        parents: Array = np.array([self._place(self.tried[n]) for n in chosen])
+        return parents
+
+    def _gains(self, place: Array) -> CandidateGains:
+        logs = self._logs[:, 0] + place * (self._logs[:, 1] - self._logs[:, 0])
+        return {
+            knob.name: min(max(float(f"{np.exp(log):.{GAIN_DIGITS}g}"), knob.low), knob.high)
+            for knob, log in zip(self.space.knobs, logs, strict=True)
+        }
+
+    def _place(self, gains: CandidateGains) -> Array:
+        logs = np.log([gains[knob.name] for knob in self.space.knobs])
+        place: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
+        return place
+
+
+def _parts(total: int, count: int) -> list[int]:
+    """Returns a total in parts that differ by one at most."""
+    return [total // count + (n < total % count) for n in range(count)]
+
+
+def _unsettled_rank(score: CandidateScore) -> tuple[bool, float]:
+    """Sorts runs that did not settle: diverged ones last, else by error."""
+    return score.outcome is CandidateClass.DIVERGED, score.error_rad or 0.0

@@ -1,0 +1,237 @@
+"""The search space of each control law.
+
+Its gains with units and ranges, and the model information all laws share.
+
+Invariant: ranges are log-uniform, one number for both joints and all sites of a role; a quantity has the
+same range in every law (stiffness is K or Kp Lambda, damping d or Kp). All laws get the same gravity
+parameters, the true ones times one share, and no inertia: a law that estimates it starts at zero.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from ...core.two_link_arm import PARAMETERS
+from ...errors import ScenarioError, UsageError
+from ...scenario import Scenario
+from ...scenario.fields import MAX_QUANTITY, suggest_nearest
+
+GRAVITY_PARAMETERS = slice(3, PARAMETERS)
+"""Where the gravity parameters stand in theta, Eq. (24)."""
+MIN_BOX = 0.1
+"""A box of estimates is at least so wide to either side of what is told, as a share of it."""
+
+
+class ModelInformation(NamedTuple):
+    """What is told.
+
+    Attributes:
+        gravity: what is told of gravity, as a share of the truth; 1: exactly.
+    """
+
+    gravity: float = 1.0
+
+    @property
+    def box(self) -> float:
+        """Half the width of a box of estimates, as a share of what is told: twice the error, or 10 %."""
+        return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
+
+    def prior(self, scenario: Scenario, site: str) -> list[float]:
+        """Returns the first estimate of theta, shape (5,): gravity as told, inertia unknown."""
+        told = scenario.sites[site].arm.theta * self.gravity
+        told[: GRAVITY_PARAMETERS.start] = 0.0
+        return [float(f"{value:.12g}") for value in told]
+
+    def low(self, scenario: Scenario, site: str) -> list[float]:
+        """Returns the lower sides of the box, shape (5,)."""
+        return self._side(scenario, site, -1.0)
+
+    def high(self, scenario: Scenario, site: str) -> list[float]:
+        """Returns the upper sides of the box, shape (5,)."""
+        return self._side(scenario, site, 1.0)
+
+    def _side(self, scenario: Scenario, site: str, sign: float) -> list[float]:
+        gravity = self.prior(scenario, site)[GRAVITY_PARAMETERS]
+        return [sign * MAX_QUANTITY] * GRAVITY_PARAMETERS.start + [
+            float(f"{value * (1.0 + sign * self.box):.12g}") for value in gravity
+        ]
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        how = "exactly" if self.gravity == 1.0 else f"as {100.0 * self.gravity:g} % of what it is"
+        return f"every law is told gravity {how}, and nothing of inertia"
+
+
+def build_model_information(gravity_percent: float) -> ModelInformation:
+    """Returns what a person says all laws are to be told.
+
+    Args:
+        gravity_percent: of the true gravity.
+
+    Raises:
+        UsageError: it is none that an arm could be built with.
+    """
+    if not 50.0 <= gravity_percent <= 150.0:
+        raise UsageError(f"--gravity is from 50 to 150 % of the truth, not {gravity_percent:g}")
+    return ModelInformation(gravity_percent / 100.0)
+
+
+GainValues = Mapping[str, float]
+SiteControls = dict[str, dict[str, Any]]
+"""Per site the whole of its [control]."""
+
+
+class GainRange(NamedTuple):
+    """One gain that is searched.
+
+    Attributes:
+        name: what it is called.
+        unit: its unit, or "".
+        low: the least that is tried.
+        high: the most.
+        where: which sites have it; "" for all.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    where: str = ""
+
+
+class SearchSpace(NamedTuple):
+    """A law and where it is searched.
+
+    Attributes:
+        law: what the law is called here.
+        knobs: its gains.
+        told: what of the common knowledge it can use, in words.
+        controls: writes a choice of gains out as the control of every site.
+    """
+
+    law: str
+    knobs: tuple[GainRange, ...]
+    told: str
+    controls: Callable[[Scenario, ModelInformation, GainValues], SiteControls]
+
+
+def _adaptive(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    return {
+        name: {"law": "adaptive", **gains, "theta_hat0": knowledge.prior(scenario, name)}
+        for name in scenario.names
+    }
+
+
+def _adaptive_box(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    return {
+        name: {
+            "law": "adaptive_box",
+            **gains,
+            "theta_hat0": knowledge.prior(scenario, name),
+            "theta_low": knowledge.low(scenario, name),
+            "theta_high": knowledge.high(scenario, name),
+        }
+        for name in scenario.names
+    }
+
+
+def _known(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    controls = {}
+    for name in scenario.names:
+        theta = knowledge.prior(scenario, name)
+        theta[: GRAVITY_PARAMETERS.start] = [
+            float(value) for value in scenario.sites[name].arm.theta[: GRAVITY_PARAMETERS.start]
+        ]
+        controls[name] = {"law": "adaptive", **gains, "Gamma": 0.0, "theta_hat0": theta}
+    return controls
+
+
+def _knowing_gravity(law: str) -> Callable[[Scenario, ModelInformation, GainValues], SiteControls]:
+    def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+        return {name: {"law": law, **gains, "gravity": knowledge.gravity} for name in scenario.names}
+
+    return controls
+
+
+def _p_f(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    parts = {
+        "master": {"K": 0.0, "d": gains["d_master"], "k_f": gains["k_f"]},
+        "slave": {"K": gains["K"], "d": gains["d_slave"], "k_f": 0.0},
+    }
+    return {
+        name: {"law": "p_f", **parts[spec.role], "gravity": knowledge.gravity}
+        for name, spec in scenario.sites.items()
+    }
+
+
+_LAMBDA = GainRange("Lambda", "1/s", 0.2, 20.0)
+_KP = GainRange("Kp", "N m s/rad", 0.5, 200.0)
+_KD = GainRange("Kd", "N m s/rad", 0.1, 50.0)
+_GAMMA = GainRange("Gamma", "", 0.01, 10.0)
+_K = GainRange("K", "N m/rad", 1.0, 1000.0)
+_D = GainRange("d", "N m s/rad", 0.5, 200.0)
+_ADAPTING = (_LAMBDA, _KP, _KD, _GAMMA)
+_AS_FIRST = "gravity, as its first estimate"
+
+SEARCH_SPACES: dict[str, SearchSpace] = {
+    space.law: space
+    for space in (
+        SearchSpace("adaptive", _ADAPTING, _AS_FIRST, _adaptive),
+        SearchSpace("adaptive_box", _ADAPTING, f"{_AS_FIRST}; the box is around it", _adaptive_box),
+        SearchSpace("p_d", (_K, _D), "gravity", _knowing_gravity("p_d")),
+        SearchSpace("pd_d", (_K, _KD, _D), "gravity", _knowing_gravity("pd_d")),
+        SearchSpace(
+            "p_f",
+            (
+                _K._replace(where="slave"),
+                _D._replace(name="d_slave", where="slave"),
+                _D._replace(name="d_master", where="master"),
+                GainRange("k_f", "", 0.05, 2.0, "master"),
+            ),
+            "gravity",
+            _p_f,
+        ),
+        SearchSpace(
+            "known", (_LAMBDA, _KP, _KD), "gravity, AND inertia exactly: more than the others", _known
+        ),
+    )
+}
+"""The laws that can be tuned, by name; `known` is `adaptive` with Gamma = 0 and the true inertia."""
+
+DEFAULT_LAWS = ("adaptive", "adaptive_box", "p_d", "pd_d")
+"""The laws that are compared unless others are named: all that take any number of sites."""
+PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
+"""The gains that the paper prints for `adaptive`."""
+
+
+def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
+    """Returns where the named laws are searched, once each, in their order.
+
+    Args:
+        laws: names; none means `USUAL`.
+        scenario: for which.
+
+    Raises:
+        UsageError: there is no such law to tune.
+        ScenarioError: the scenario has not the sites that it needs.
+    """
+    names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
+    for name in names:
+        if ":" in name or name == "own":
+            raise UsageError(
+                f"--law {name}: nobody has said where a law from outside is to be searched; "
+                f"tuned are {', '.join(SEARCH_SPACES)}"
+            )
+        if name not in SEARCH_SPACES:
+            raise UsageError(
+                f"--law: there is no law {name!r} to tune{suggest_nearest(name, list(SEARCH_SPACES))}; "
+                f"tuned are {', '.join(SEARCH_SPACES)}"
+            )
+    roles = sorted(spec.role for spec in scenario.sites.values())
+    if "p_f" in names and roles != ["master", "slave"]:
+        raise ScenarioError(
+            f"law p_f reflects force between one master and one slave; this has {len(roles)} sites, "
+            f"{roles.count('master')} of them masters: leave p_f out, or take contact",
+            source=scenario.name,
+        )
+    return [SEARCH_SPACES[name] for name in names]

@@ -1,0 +1,278 @@
+"""The tuning procedure: the plan, its cost, and the search of every control law.
+
+Invariant: the result is a function of the plan alone; neither the number of processes nor their speed enters.
+The gains that the paper prints are measured, never searched, and stand on no front.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ...core.jit import is_core_cached
+from ...errors import ScenarioError, UsageError
+from ...execution import virtual
+from ...net.clock import SystemClock
+from ...process import count_cores
+from .candidate import CandidateScore, TuningScenario, load_tuning_scenario, open_candidate_pool
+from .consensus_pose import build_twin, check_comparable
+from .final_posture import CandidateClass
+from .pareto_search import CandidateSearch, Objective, find_pareto_front
+from .search_space import (
+    PAPER_GAINS,
+    ModelInformation,
+    SearchSpace,
+    build_model_information,
+    select_search_spaces,
+)
+
+DEFAULT_BUDGET = 64
+"""Candidates per law: four laws on `free` take some minutes on two cores."""
+MAX_BUDGET = 100_000
+MAX_TICKS = 10_000_000
+"""Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites has 180 000."""
+
+TuningProgress = Callable[[int, int], None]
+
+
+class PaperGainsResult(NamedTuple):
+    """The gains that the paper prints, measured.
+
+    Attributes:
+        name: what they are called.
+        candidate: the experiment with them.
+        score: what came of it.
+    """
+
+    name: str
+    candidate: TuningScenario
+    score: CandidateScore
+
+
+class SearchResult(NamedTuple):
+    """What the search of one law found.
+
+    Attributes:
+        space: the law, and where it was searched.
+        tried: every candidate's gains, in order.
+        scores: what came of them.
+        front: places of the candidates that none of the same law dominates, by rising effort.
+    """
+
+    space: SearchSpace
+    tried: list[dict[str, float]]
+    scores: list[CandidateScore]
+    front: list[int]
+
+    @property
+    def outcomes(self) -> dict[CandidateClass, int]:
+        """How many runs came to each outcome, all of them counted."""
+        return {outcome: sum(score.outcome is outcome for score in self.scores) for outcome in CandidateClass}
+
+
+class TuningPlan(NamedTuple):
+    """A comparison that was asked for and can be run.
+
+    Attributes:
+        base: the experiment.
+        spaces: the laws.
+        budget: candidates per law.
+        seed: of the search.
+        objective: what is weighed against effort.
+        knowledge: what every law is told.
+    """
+
+    base: TuningScenario
+    spaces: list[SearchSpace]
+    budget: int
+    seed: int
+    objective: Objective
+    knowledge: ModelInformation
+
+    @property
+    def runs(self) -> int:
+        """How many runs it takes, those with printed gains and twins counted."""
+        return (len(self.spaces) * self.budget + len(self.printed())) * (1 + self.twin)
+
+    @property
+    def informed(self) -> bool:
+        """True where one of the laws is told more than the others."""
+        return any(space.law == "known" for space in self.spaces)
+
+    @property
+    def twin(self) -> bool:
+        """True where the pose is judged on a twin: then every candidate is two runs."""
+        return build_twin(self.base.scenario) is not None
+
+    def printed(self) -> dict[str, TuningScenario]:
+        """Returns the gains that the paper prints, by name: told what all are told, and told nothing."""
+        names = self.base.scenario.names
+        table = {"law": "adaptive", **PAPER_GAINS}
+        prior = {name: self.knowledge.prior(self.base.scenario, name) for name in names}
+        return {
+            "as printed": self.base.with_controls({n: {**table, "theta_hat0": prior[n]} for n in names}),
+            "as printed, told nothing": self.base.with_controls(
+                {n: {**table, "theta_hat0": 0.0} for n in names}
+            ),
+        }
+
+    def estimate_s(self, jobs: int | None = None) -> float:
+        """Returns about how long the search will take, s: by a short run of the experiment."""
+        scenario = self.base.scenario
+        if not is_core_cached():
+            next(virtual.execute_virtual(scenario))  # compiles, once for all processes
+        ticks = sum(map(scenario.ticks, scenario.names))
+        few = min(ticks, _PROBE_TICKS)
+        clock = SystemClock()
+        steps = virtual.execute_virtual(scenario)
+        next(steps)  # loads the compiled core
+        began_ns = clock.monotonic_ns()
+        made = 1 + sum(1 for _ in zip(range(few), steps, strict=False))
+        per_tick_s = (clock.monotonic_ns() - began_ns) * 1e-9 / made
+        return (
+            _MEASURING_FACTOR
+            * per_tick_s
+            * ticks
+            * self.runs
+            / min(jobs or count_cores(), len(self.spaces) * self.budget)
+        )
+
+    def run(
+        self, jobs: int | None = None, progress: TuningProgress = lambda _done, _total: None
+    ) -> "TuningResult":
+        """Searches every law and returns what was found.
+
+        Args:
+            jobs: in how many processes; None for one per core.
+            progress: told how many candidates are done, and how many there are.
+
+        Raises:
+            RunFailed: a process was ended by somebody.
+        """
+        searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
+        printed = self.printed()
+        measured: list[CandidateScore] = []
+        done = 0
+
+        def one_more() -> None:
+            nonlocal done
+            done += 1
+            progress(done, len(searches) * self.budget + len(printed))
+
+        if not is_core_cached():
+            next(virtual.execute_virtual(self.base.scenario))  # compiles, once for all processes
+        with open_candidate_pool(min(jobs or count_cores(), len(searches) * self.budget)) as runners:
+            for number in range(len(searches[0].rounds)):
+                asked = [search.ask(number) for search in searches]
+                tasks = [
+                    self.base.with_gains(search.space, self.knowledge, gains).task
+                    for search, batch in zip(searches, asked, strict=True)
+                    for gains in batch
+                ]
+                if number == 0:
+                    tasks += [candidate.task for candidate in printed.values()]
+                scores = iter(runners.scores(tasks, one_more))
+                for search, batch in zip(searches, asked, strict=True):
+                    search.tell(batch, [next(scores) for _ in batch])
+                measured += scores
+        return TuningResult(
+            self,
+            [self._found(search) for search in searches],
+            [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)],
+        )
+
+    def _found(self, search: CandidateSearch) -> SearchResult:
+        points = [self.objective.point(score) for score in search.scores]
+        return SearchResult(search.space, search.tried, search.scores, find_pareto_front(points))
+
+
+_EDGE = 1.02
+"""A gain within 2 % of the end of its range is at its edge."""
+_PROBE_TICKS = 3000
+_MEASURING_FACTOR = 1.3
+"""What keeping and measuring its records adds to a run."""
+
+
+class TuningResult(NamedTuple):
+    """A comparison that was run.
+
+    Attributes:
+        plan: what was asked.
+        found: per law what was found, in the order in which they were asked for.
+        printed: the gains that the paper prints.
+    """
+
+    plan: TuningPlan
+    found: list[SearchResult]
+    printed: list[PaperGainsResult]
+
+    def candidate(self, found: SearchResult, place: int) -> TuningScenario:
+        """Returns one candidate as an experiment."""
+        return self.plan.base.with_gains(found.space, self.plan.knowledge, found.tried[place])
+
+    def at_edge(self, found: SearchResult) -> list[str]:
+        """Returns which gains of a law's best point stand at an edge of their range: it may lie beyond."""
+        if not found.front:
+            return []
+        best = found.tried[found.front[-1]]
+        return [
+            knob.name
+            for knob in found.space.knobs
+            if not knob.low * _EDGE < best[knob.name] < knob.high / _EDGE
+        ]
+
+    def shared(self, found: SearchResult) -> list[int]:
+        """Returns the places of a law's front that no candidate of any law dominates."""
+        points = [
+            (other.space.law, place, self.plan.objective.point(other.scores[place]))
+            for other in self.found
+            for place in other.front
+        ]
+        kept = [points[n] for n in find_pareto_front([point for _, _, point in points])]
+        return [place for law, place, _ in kept if law == found.space.law]
+
+
+def plan_tuning(
+    source: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    laws: Sequence[str] = (),
+    budget: int = DEFAULT_BUDGET,
+    seed: int = 1,
+    objective: str = "error",
+    gravity_percent: float = 100.0,
+) -> TuningPlan:
+    """Returns a comparison, checked and ready to run.
+
+    Args:
+        source: the name of a shipped scenario, or a path.
+        overrides: what is to be changed of it, as texts KEY=VALUE.
+        laws: which laws; none means all that take any number of sites.
+        budget: candidates per law.
+        seed: of the search; the seed of the scenario is the scenario's own.
+        objective: "error" or "settling".
+        gravity_percent: what all laws are told of gravity, in per cent of the truth.
+
+    Raises:
+        ScenarioError: the scenario is none, or laws cannot be compared in it.
+        UsageError: another argument cannot be right.
+    """
+    if not 1 <= budget <= MAX_BUDGET:
+        raise UsageError(f"--budget is the number of candidates per law, 1 to {MAX_BUDGET}, not {budget}")
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed is from 0 to 2^63 - 1, not {seed}")
+    if objective not in list(Objective):
+        raise UsageError(f"--objective is {' or '.join(Objective)}, not {objective!r}")
+    knowledge = build_model_information(gravity_percent)
+    found = load_tuning_scenario(source, overrides)
+    scenario = found.scenario
+    spaces = select_search_spaces(laws, scenario)
+    ticks = sum(map(scenario.ticks, scenario.names))
+    if ticks > MAX_TICKS:
+        raise ScenarioError(
+            f"a candidate would take {ticks} ticks, at most {MAX_TICKS} are given: shorten it with "
+            "--duration",
+            path="duration_s",
+            source=str(source),
+        )
+    check_comparable(scenario)
+    return TuningPlan(found, spaces, budget, seed, Objective(objective), knowledge)

@@ -1,0 +1,31 @@
+"""The closed loop linearised about its equilibrium: roots, delay margin, stability edges, haptic ports.
+
+Invariant: the equations are written anew in plain NumPy and share nothing with the core's leaves, so that
+roots and runs check each other; the simulation only supplies the pose at which a run settles.
+
+Definitions, equations and sources are in docs/linear.md and docs/ports.md.
+
+    from trilat_net.theory import analyse_linear_loop
+
+    result = analyse_linear_loop("free")
+    result.verdict, result.continuous.rightmost.s, result.margin.words
+"""
+
+from .equilibrium import find_equilibrium
+from .linear_analysis import LinearAnalysis, analyse_linear_loop
+from .linear_edge import LinearEdge, find_linear_edge, iterate_linear_edges
+from .linear_loop import DelayedTerm, LinearLoop, linearise_scenario
+from .operating_point import Equilibrium
+
+__all__ = [
+    "DelayedTerm",
+    "Equilibrium",
+    "LinearAnalysis",
+    "LinearEdge",
+    "LinearLoop",
+    "analyse_linear_loop",
+    "find_equilibrium",
+    "find_linear_edge",
+    "iterate_linear_edges",
+    "linearise_scenario",
+]

@@ -1,0 +1,241 @@
+"""Passivity and absolute stability at the ports: with passive operators coupled, and with independent ones.
+
+Invariant: torques u put in the power 1/4 u^H (Y + Y^H) u; a stable loop is passive if Y + Y^H has no
+negative eigenvalue at any frequency, and positive weights per site prove as much. It is absolutely stable if
+every frequency has weights with D Y + Y^H D >= 0: also necessary for up to three sites, sufficient beyond.
+
+Sources: Colgate and Hogan, "Robust control of dynamically interacting systems", Int. J. Control 48 (1988):
+passive loops are stable with every passive environment. Two scalar ports: Llewellyn, "Some fundamental
+properties of transmission systems", Proc. IRE 40 (1952); the parameter that must not be below 1: Adams and
+Hannaford, "Stable haptic interaction with virtual environments", IEEE Trans. Robotics and Automation 15
+(1999). Several joints and sites: Li, Tavakoli and Huang, "Absolute stability of multi-DOF multilateral haptic
+systems", IEEE Trans. Control Systems Technology (2014), treat some classes; weights here are those of the
+structured singular value, exact for up to three blocks: Packard and Doyle, "The complex structured singular
+value", Automatica 29 (1993).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.vectors import Array
+from .frequency_search import Minima, find_minima
+from .port_response import Complex, PortResponse, invert_response
+
+EIGENVALUE_ROUNDING = 1e-8
+"""Of the answer's size: eigenvalues that are negative by less are zero but for rounding."""
+_FURTHER = 4.0
+
+
+class Passivity(NamedTuple):
+    """The outcome for one set of ports.
+
+    Attributes:
+        dips: the least eigenvalue over frequency, rad/s per N m, and where it is negative.
+        size: the largest singular value of Y there, shape (F,), rad/s per N m: eigenvalues of Y + Y^H lie
+            within twice that.
+        lacking_nm_s_rad: the damping that, added at each of the joints, would make it passive, N m s/rad; inf
+            where what is lacking grows without end towards the lowest frequencies.
+    """
+
+    dips: Minima
+    size: Array
+    lacking_nm_s_rad: float
+
+    @property
+    def passive(self) -> bool:
+        """True where no frequency of the grid has a negative eigenvalue."""
+        return not self.dips.below
+
+
+def weight_response(Y: Complex, weights: Array) -> Complex:
+    """Returns D^1/2 Y D^-1/2 with D = diag(weights): its Hermitian part has the signs of D Y + Y^H D.
+
+    Args:
+        Y: shape (F, p, p).
+        weights: of the ports, positive, shape (p,) or (F, p).
+    """
+    root = np.sqrt(weights)
+    scaled: Complex = root[..., :, np.newaxis] * Y / root[..., np.newaxis, :]
+    return scaled
+
+
+def find_least_eigenvalue(Y: Complex) -> Array:
+    """Returns the least eigenvalue of Y + Y^H, shape (F,), for Y of shape (F, p, p)."""
+    values = np.linalg.eigvalsh(Y + np.conj(np.swapaxes(Y, -1, -2)))
+    return np.asarray(values[..., 0], dtype=np.float64)
+
+
+def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
+    """Returns the least b >= 0 with which (Y^-1 + b)^-1 is passive, N m s/rad.
+
+    A damper b at every port adds b to the impedance Z = Y^-1, and Z + Z^H + 2 b >= 0 is the same question.
+    An integrator in the law can make Z ~ -K / w^2, a damping that is negative and without bound: then no b
+    will do.
+
+    Args:
+        Y: shape (F, p, p), rad/s per N m.
+        w_rad_s: rising frequencies, shape (F,).
+    """
+    lacking = -0.5 * find_least_eigenvalue(invert_response(Y))
+    further = float(np.interp(_FURTHER * w_rad_s[0], w_rad_s, lacking))
+    if lacking[0] > 0.0 and lacking[0] > 2.0 * further:
+        return np.inf
+    return max(0.0, float(lacking.max()))
+
+
+def check_passivity(response: PortResponse, w_rad_s: Array, weights: Array | None = None) -> Passivity:
+    """Returns whether a loop is passive at some ports, as far as a grid of frequencies can tell.
+
+    Args:
+        response: velocities per torque, or another output of as many entries.
+        w_rad_s: frequencies to begin with, shape (F,).
+        weights: of the ports, positive, shape (p,); None: all one, which makes it energy.
+    """
+
+    def scaled(w: Array) -> Complex:
+        Y = response(w)
+        return Y if weights is None else weight_response(Y, weights)
+
+    def tolerance(w: Array) -> Array:
+        size: Array = EIGENVALUE_ROUNDING * np.linalg.norm(response(w), axis=(1, 2))
+        return size
+
+    found = find_minima(lambda w: find_least_eigenvalue(scaled(w)), w_rad_s, tolerance=tolerance)
+    Y = scaled(found.w_rad_s)
+    size = np.asarray(np.linalg.norm(Y, 2, axis=(1, 2)), dtype=np.float64)
+    return Passivity(found, size, find_lacking_damping(Y, found.w_rad_s) if found.below else 0.0)
+
+
+MAX_LLEWELLYN = 1e6
+"""Greatest value of Llewellyn's parameter."""
+_REACH = 12.0
+"""Logarithm of the largest ratio of two weights."""
+_TURNS = 400
+_CLOSE = 1e-3
+
+
+def llewellyn_parameter(Y: Complex) -> Array:
+    """Returns Llewellyn's stability parameter, shape (F,); at least 1 where the criterion holds.
+
+    2 Re y11 Re y22 - Re(y12 y21) over abs(y12 y21), but at most `MOST`, which stands for a two-port through
+    which nothing passes, and at most -1 where Re y11 or Re y22 is negative.
+
+    Args:
+        Y: admittance of two scalar ports, shape (F, 2, 2).
+    """
+    y11, y22, through = Y[:, 0, 0].real, Y[:, 1, 1].real, Y[:, 0, 1] * Y[:, 1, 0]
+    own = np.linalg.norm(Y, axis=(1, 2))
+    size = np.maximum(np.abs(through), 1e-30 * own**2)
+    parameter: Array = np.minimum((2.0 * y11 * y22 - through.real) / size, MAX_LLEWELLYN)
+    active = (y11 < -EIGENVALUE_ROUNDING * own) | (y22 < -EIGENVALUE_ROUNDING * own)
+    return np.where(active, np.minimum(parameter, -1.0), parameter)
+
+
+def llewellyn_rounding(Y: Complex) -> Array:
+    """Returns by how much rounding may change the parameter, shape (F,): much where next to nothing passes.
+
+    Args:
+        Y: as of `llewellyn`.
+    """
+    through, own = np.abs(Y[:, 0, 1] * Y[:, 1, 0]), np.linalg.norm(Y, axis=(1, 2))
+    amount: Array = EIGENVALUE_ROUNDING + 1e-12 * own**2 / np.maximum(through, 1e-30 * own**2)
+    return amount
+
+
+def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
+    """Returns the admittance at some ports while others are clamped, and hands are off the rest.
+
+    Args:
+        Y: shape (F, p, p).
+        keep: ports that hands hold.
+        clamped: ports that cannot move.
+    """
+    kept: Complex = Y[:, keep][:, :, keep]
+    if not clamped:
+        return kept
+    across = np.linalg.solve(Y[:, clamped][:, :, clamped], Y[:, clamped][:, :, keep])
+    left: Complex = kept - Y[:, keep][:, :, clamped] @ across
+    return left
+
+
+class BestWeights(NamedTuple):
+    """The best that weights can do.
+
+    Attributes:
+        margin: least eigenvalue of Y + Y^H, each site's part scaled to size 1, with the best weights,
+            dimensionless, shape (F,); negative where no weights will do.
+        weights: those weights, of the first site 1, shape (F, N).
+    """
+
+    margin: Array
+    weights: Array
+
+
+def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
+    """Returns the weights of the sites that make the least eigenvalue largest, frequency by frequency.
+
+    The least eigenvalue of D^1/2 Y D^-1/2 + its Hermitian is concave in ln D (a limit of what Sezginer and
+    Overton show for norms, IEEE Trans. Automatic Control 35 (1990)), so that the ellipsoid method finds it.
+
+    Args:
+        Y: admittance, shape (F, p, p).
+        owner: the site of each port, from 0 on, shape (p,).
+    """
+    scaled = _sized(Y, owner)
+    count, free = len(Y), int(owner.max())
+    centre, best = np.zeros((count, free)), np.zeros((count, free))
+    shape = np.broadcast_to(_REACH**2 * free * np.eye(free), (count, free, free)).copy()
+    margin = np.full(count, -np.inf)
+    going = np.arange(count)
+    for _ in range(_TURNS):
+        value, slope = _value_and_slope(scaled[going], centre[going], owner)
+        better = value > margin[going]
+        margin[going[better]], best[going[better]] = value[better], centre[going[better]]
+        along = np.einsum("fij,fj->fi", shape[going], slope)
+        reach = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, along), 0.0))
+        # what is left to gain is at most `reach`
+        more = reach > _CLOSE * np.maximum(np.abs(margin[going]), 1e-6)
+        going, along = going[more], (along[more] / reach[more, np.newaxis])
+        if not len(going) or free == 0:
+            break
+        centre[going] += along / (free + 1.0)
+        shape[going] = _halved(shape[going], along, free)
+    logs = np.concatenate([np.zeros((count, 1)), best], axis=1)
+    return BestWeights(margin, np.exp(logs))
+
+
+def _halved(shape: Array, along: Array, free: int) -> Array:
+    """Returns the least ellipsoids about the better halves of some."""
+    if free == 1:
+        return shape / 4.0
+    outer = along[:, :, np.newaxis] * along[:, np.newaxis, :]
+    grown: Array = free**2 / (free**2 - 1.0) * (shape - 2.0 / (free + 1.0) * outer)
+    return grown
+
+
+def _sized(Y: Complex, owner: NDArray[np.int64]) -> Complex:
+    """Returns Y with each site's rows and columns divided by the root of the size of its own part."""
+    size = np.ones(Y.shape[:2])
+    for site in range(int(owner.max()) + 1):
+        own = np.flatnonzero(owner == site)
+        size[:, own] = np.linalg.norm(Y[:, own][:, :, own], axis=(1, 2))[:, np.newaxis]
+    root = np.sqrt(np.maximum(size, 1e-300))
+    scaled: Complex = Y / (root[:, :, np.newaxis] * root[:, np.newaxis, :])
+    return scaled
+
+
+def _value_and_slope(Y: Complex, logs: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Returns the least eigenvalue under weights, and its slope in the logarithm of each but the first.
+
+    d/dx_i of v^H (e^{x/2} Y e^{-x/2} + its Hermitian) v is Re v^H (P_i Y - Y P_i) v, P_i the ports of i.
+    """
+    full = np.concatenate([np.zeros((len(Y), 1)), logs], axis=1)
+    W = weight_response(Y, np.exp(full[:, owner]))
+    values, vectors = np.linalg.eigh(W + np.conj(np.swapaxes(W, -1, -2)))
+    v = vectors[:, :, 0]
+    per_port = (np.conj(v) * (W @ v[:, :, np.newaxis])[:, :, 0]).real
+    per_port -= ((np.conj(v)[:, np.newaxis, :] @ W)[:, 0, :] * v).real
+    member = owner[:, np.newaxis] == np.arange(1, full.shape[1])
+    return values[:, 0], per_port @ member.astype(np.float64)

@@ -1,0 +1,154 @@
+"""Transparency: the impedance that an operator at one site feels of a free and of a clamped other site.
+
+Invariant: an impedance is along one joint, torque over velocity, N m s/rad, with no torque of the operator on
+the other joints. Z-widths are ratios on a logarithmic frequency axis, in dB over a named band.
+
+Source: transmitted impedance after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE
+Trans. Robotics and Automation 9 (1993). Z-width after Colgate and Brown, "Factors affecting the Z-width of a
+haptic display", ICRA (1994), and its use for the impedances that teleoperators transmit after Hashtrudi-Zaad
+and Salcudean, "Analysis and evaluation of stability and performance robustness for teleoperation control
+architectures", ICRA (2000).
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.vectors import Array
+from ..errors import UsageError
+from .linear_loop import LinearLoop
+from .port_response import (
+    CLAMPED,
+    FREE,
+    Complex,
+    PortLoad,
+    apply_loads,
+    build_admittance,
+    find_site_ports,
+    invert_response,
+    list_port_sites,
+)
+
+Z_WIDTH_BAND_HZ = (0.1, 10.0)
+"""The band of Z-widths: below it hands drift, above it they do not move on purpose."""
+_SHOWN_HZ = (0.01, 100.0)
+_PER_DECADE = 100
+
+
+class Transparency(NamedTuple):
+    """What a hand feels along one joint, the other site free and clamped.
+
+    Attributes:
+        at: the site of the hand.
+        of: the site that is free or clamped.
+        joint: which joint of the hand's site, from 1 on.
+        w_rad_s: frequencies, shape (F,).
+        free: impedance with nothing at the other site, shape (F,), N m s/rad.
+        clamped: impedance with the other site clamped, shape (F,), N m s/rad.
+        band_hz: what the means are over, Hz.
+    """
+
+    at: str
+    of: str
+    joint: int
+    w_rad_s: Array
+    free: Complex
+    clamped: Complex
+    band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ
+
+    @property
+    def softest_nm_s_rad(self) -> float:
+        """Mean of the free impedance's size over the band, both on logarithmic axes."""
+        return self._mean(self.free)
+
+    @property
+    def stiffest_nm_s_rad(self) -> float:
+        """Mean of the clamped impedance's size over the band, both on logarithmic axes."""
+        return self._mean(self.clamped)
+
+    @property
+    def width_db(self) -> float:
+        """Z-width: mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, dB."""
+        return 20.0 * float(np.log10(self.stiffest_nm_s_rad / self.softest_nm_s_rad))
+
+    def size_at(self, frequency_hz: float) -> tuple[float, float]:
+        """Returns the sizes of the free and the clamped impedance at a frequency, N m s/rad."""
+        x = np.log(self.w_rad_s)
+        at = np.log(2.0 * np.pi * frequency_hz)
+        free, clamped = (
+            float(np.exp(np.interp(at, x, np.log(np.abs(Z))))) for Z in (self.free, self.clamped)
+        )
+        return free, clamped
+
+    def _mean(self, Z: Complex) -> float:
+        low, high = (2.0 * np.pi * edge for edge in self.band_hz)
+        inside = (self.w_rad_s >= low * (1.0 - 1e-9)) & (self.w_rad_s <= high * (1.0 + 1e-9))
+        logs, x = np.log(np.abs(Z[inside])), np.log(self.w_rad_s[inside])
+        return float(np.exp(np.trapezoid(logs, x) / (x[-1] - x[0])))
+
+
+def compute_transmitted_impedance(
+    loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array
+) -> Complex:
+    """Returns the impedance matrix that a hand at a site feels, shape (F, 2, 2), N m s/rad.
+
+    Z_t(j w) = Y_ii(j w)^{-1}, Y being that of the loop with the loads at the other sites.
+
+    Args:
+        loop: the teleoperator.
+        site: where the hand is.
+        loads: of the other sites; those that are not named are free.
+        w_rad_s: frequencies, shape (F,).
+
+    Raises:
+        UsageError: no such site, or a load that cannot be.
+    """
+    return invert_response(_at_site(loop, site, loads, w_rad_s))
+
+
+def _at_site(loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array) -> Complex:
+    if site not in list_port_sites(loop):
+        raise UsageError(f"no site {site!r} at the ports; there are {', '.join(list_port_sites(loop))}")
+    if site in loads:
+        raise UsageError(f"a load at {site} would stand where the hand is that feels")
+    held = apply_loads(loop, loads)
+    places = find_site_ports(held, site)
+    return build_admittance(held)(w_rad_s)[:, places][:, :, places]
+
+
+def measure_transparency(
+    loop: LinearLoop,
+    at: str,
+    of: str,
+    others: Mapping[str, PortLoad] | None = None,
+    band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ,
+) -> tuple[Transparency, ...]:
+    """Returns what a hand feels along each joint of its site, another site being free and clamped.
+
+    Args:
+        loop: the teleoperator.
+        at: the site of the hand.
+        of: the site that is free or clamped.
+        others: what holds the rest; free where not named.
+        band_hz: what the means are over, Hz.
+
+    Raises:
+        UsageError: no such site, both are one, or the band is empty.
+    """
+    if not 0.0 < band_hz[0] < band_hz[1]:
+        raise UsageError(
+            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
+        )
+    low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
+    points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
+    w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
+    free, clamped = (_at_site(loop, at, {**(others or {}), of: load}, w_rad_s) for load in (FREE, CLAMPED))
+    joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in find_site_ports(loop, at)]
+    return tuple(
+        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)
+        for n, joint in enumerate(joints)
+    )
+
+
+QUOTED_AT_HZ = 1.0

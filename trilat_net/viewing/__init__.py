@@ -1,1 +1,0 @@
-"""A log in Rerun: what is shown where, and the viewer itself."""
