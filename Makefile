@@ -5,12 +5,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo setup test pytest live containers lint bench lock clean
+.PHONY: help demo setup test pytest live containers lint test-long bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
 	@echo "make test    everything that CI checks"
+	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 
 demo: setup
@@ -38,6 +39,10 @@ $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 test: pytest live lint
 
 pytest: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
+	$(BIN)/python -m pytest -q -m "live and not long"
+
+test-long: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
