@@ -11,13 +11,11 @@ from numpy.typing import ArrayLike
 
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
+from ..scenario.expect import END_WINDOW_S
 from . import site_signals
 from .health import summarise_clock
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
 from .timeline import AppliedChange, StatedModel, diverged_at_s, find_mode_intervals, list_changes
-
-FINAL_WINDOW_S = 1.0
-"""Length of the end of a run that `max_error_end_rad` looks at, s."""
 
 JsonObject = dict[str, Any]
 
@@ -95,7 +93,7 @@ def _records(log: Log, part: SiteLog) -> JsonObject:
 
 def _motion(part: SiteLog) -> JsonObject:
     errors = site_signals.joint_errors(part)
-    end = part.t_s > part.t_s[-1] - FINAL_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
+    end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
     angles = site_signals.joint_angles(part)
     return {
         "q_end_rad": angles[-1].tolist() if len(part) else None,

@@ -137,5 +137,11 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
 
 
 def diverged_at_s(part: SiteLog) -> float | None:
-    """Returns when a site left its limits, s; None where it never did."""
+    """Returns when a site left its limits, s; None if it never did."""
     return float(part.t_s[-1]) if len(part) and part.mode[-1] == "diverged" else None
+
+
+def run_diverged_at_s(log: Log) -> float | None:
+    """Returns when the first site of a log left its limits, s; None if none did."""
+    times = [diverged_at_s(log[site]) for site in log.sites]
+    return min((at_s for at_s in times if at_s is not None), default=None)

@@ -53,7 +53,7 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     )
     said = [
         CertificateLine(verdict, found.verdict.text),
-        CertificateLine(_GROWTH[found.growth.grows], f"e and qd: {found.growth.text}"),
+        CertificateLine(_GROWTH[found.growth.behaviour.grows], f"e and qd: {found.growth.text}"),
     ]
     if found.balance is not None:
         said.append(

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S
+from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S, find_end_maxima
 from ..core.site_setup import Law
-from ..core.ticks import BUCKETS_PER_S
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
@@ -73,7 +72,7 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
     look_s = scenario.duration_s
     while True:
         q, theta_hat = _last_quarter(run, look_s)
-        speed_rad_s = max(float(site[-BUCKETS_PER_S:, 1].max()) for site in run.maxima)
+        _, speed_rad_s = find_end_maxima(run.maxima)
         if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * look_s > most_s:
             break
         look_s *= 2.0

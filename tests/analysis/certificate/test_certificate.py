@@ -22,7 +22,7 @@ from trilat_net.scenario import load_scenario
 
 from . import runs
 
-GOLDEN = sorted((Path(__file__).parent.parent / "golden").glob("v*.mcap"))
+GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
@@ -43,7 +43,7 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
     found = certify(trilat_net.simulate(load_scenario("free", law)))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
-    assert found.growth.motion is motion
+    assert found.growth.behaviour is motion
     assert found.passed is passed
 
 
@@ -136,7 +136,7 @@ def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes
 def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
     found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
     assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
-    assert found.growth.motion is EndBehaviour.UNDECIDED
+    assert found.growth.behaviour is EndBehaviour.UNDECIDED
     assert not found.passed
 
 

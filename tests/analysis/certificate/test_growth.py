@@ -50,7 +50,7 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
 )
 def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
     found = classify_log_end(moving(e, qd))
-    assert found.motion is motion
+    assert found.behaviour is motion
     assert says in found.text
 
 
@@ -62,7 +62,8 @@ def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None
 def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> None:
     """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
     assert (
-        classify_log_end(trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 100})).motion is motion
+        classify_log_end(trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 100})).behaviour
+        is motion
     )
 
 
@@ -71,10 +72,10 @@ def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
     held = {"scheme": "digital", "link.delay_ms": 0.0}
     slow = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
     fast = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0}))
-    assert slow.motion is EndBehaviour.BOUNDED
-    assert slow.end.end_speed_rad_s > 0.5
-    assert fast.motion is EndBehaviour.DECAYS
-    assert fast.end.end_speed_rad_s < 0.1
+    assert slow.behaviour is EndBehaviour.BOUNDED
+    assert slow.end_speed_rad_s > 0.5
+    assert fast.behaviour is EndBehaviour.DECAYS
+    assert fast.end_speed_rad_s < 0.1
 
 
 def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:
@@ -82,8 +83,8 @@ def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_show
         classify_log_end(trilat_net.simulate("contact", {"rate_hz": 200, "duration_s": s}))
         for s in (15.0, 30.0)
     )
-    assert short.motion is EndBehaviour.UNDECIDED
-    assert long.motion is EndBehaviour.BOUNDED
+    assert short.behaviour is EndBehaviour.UNDECIDED
+    assert long.behaviour is EndBehaviour.BOUNDED
     assert "bounded oscillation at 0.5 Hz" in long.text
     near = classify_log_end(
         trilat_net.simulate("contact", {"rate_hz": 200, "link.delay_ms": 20.0, "duration_s": 12.0})
@@ -95,30 +96,30 @@ def test_a_site_without_records_leaves_it_undecided() -> None:
     found = classify_log_end(
         logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
     )
-    assert found.motion is EndBehaviour.UNDECIDED
+    assert found.behaviour is EndBehaviour.UNDECIDED
     assert found.text == "undecided: no record of s"
 
 
 def test_only_times_of_which_all_sites_have_records_count() -> None:
     torn = logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300))
-    assert classify_log_end(torn).motion is EndBehaviour.UNDECIDED
+    assert classify_log_end(torn).behaviour is EndBehaviour.UNDECIDED
 
 
 def test_what_came_late_is_undecided() -> None:
     found = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
-    assert found.motion is EndBehaviour.UNDECIDED
-    assert found.grows is None
+    assert found.behaviour is EndBehaviour.UNDECIDED
+    assert found.behaviour.grows is None
     assert "record longer" in found.text
 
 
 def test_a_short_run_is_undecided_and_a_stopped_one_diverged() -> None:
     short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
-    assert classify_log_end(short).motion is EndBehaviour.UNDECIDED
+    assert classify_log_end(short).behaviour is EndBehaviour.UNDECIDED
     stopped = classify_log_end(logs.diverged())
-    assert stopped.motion is EndBehaviour.DIVERGED
+    assert stopped.behaviour is EndBehaviour.DIVERGED
     assert "passed its qd_limit_rad_s" in stopped.text
 
 
 def test_a_log_without_records_is_undecided() -> None:
     empty = logs.rewritten(still(), lambda _: False)
-    assert classify_log_end(empty).motion is EndBehaviour.UNDECIDED
+    assert classify_log_end(empty).behaviour is EndBehaviour.UNDECIDED

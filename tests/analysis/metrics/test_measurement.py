@@ -15,7 +15,7 @@ from trilat_net.log.log_reader import Log
 
 from .written import simulated
 
-GOLDEN = sorted((Path(__file__).parent.parent / "golden").glob("v*.mcap"))
+GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
 def told(log: Log) -> dict[str, Any]:

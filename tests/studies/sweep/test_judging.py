@@ -42,13 +42,13 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
     stream.seek(0)
     log = open_log(stream)
     found, expected = judged(scenario), classify_log_end(log)
-    assert found.motion is expected.motion
-    assert found.verdict is CLASS_OF_MOTION[expected.motion]
+    assert found.motion is expected.behaviour
+    assert found.verdict is CLASS_OF_MOTION[expected.behaviour]
     assert (found.end_error_rad, found.end_speed_rad_s) == (
-        expected.end.end_error_rad,
-        expected.end.end_speed_rad_s,
+        expected.end_error_rad,
+        expected.end_speed_rad_s,
     )
-    rate = expected.end.error.rate_per_s
+    rate = expected.error.rate_per_s
     assert found.error_rate_per_s == (None if math.isnan(rate) else rate)
     assert found.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
 

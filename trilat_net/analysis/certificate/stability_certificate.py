@@ -16,7 +16,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ..lyapunov_weights import find_closed_groups
-from ..run_end import LogEnd, classify_log_end
+from ..run_end import RunEnd, classify_log_end
 from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
@@ -238,7 +238,7 @@ class Certificate(NamedTuple):
 
     premises: list[Premise]
     verdict: StabilityVerdict
-    growth: LogEnd
+    growth: RunEnd
     books: dict[str, SiteEnergy]
     balance: EnergyBalance | None
     ones: EnergyBalance | None = None
@@ -274,9 +274,9 @@ class Certificate(NamedTuple):
 
         Undecided growth is no pass, as for `stable` of `trilat test`.
         """
-        if self.verdict.finding is StabilityFinding.BROKEN or self.growth.grows:
+        if self.verdict.finding is StabilityFinding.BROKEN or self.growth.behaviour.grows:
             return False
-        return self.bounded_by_v or self.growth.grows is False
+        return self.bounded_by_v or self.growth.behaviour.grows is False
 
 
 def certify(log: Log) -> Certificate:
@@ -303,7 +303,7 @@ def certify(log: Log) -> Certificate:
     return Certificate(premises, judge_stability(premises, found, booked), grown, found, booked, ones)
 
 
-def _without(premises: list[Premise], grown: LogEnd, why: str) -> Certificate:
+def _without(premises: list[Premise], grown: RunEnd, why: str) -> Certificate:
     return Certificate(premises, make_undecided_verdict(why), grown, {}, None)
 
 
@@ -342,12 +342,12 @@ def certificate_to_json(certificate: Certificate) -> CertificateJson:
         "closed_groups": [list(group) for group in certificate.groups],
         "premises": [premise._asdict() for premise in certificate.premises],
         "growth": {
-            "motion": grown.motion.name.lower(),
+            "motion": grown.behaviour.name.lower(),
             "text": grown.text,
-            "error_rate_per_s": _known(grown.end.error.rate_per_s),
-            "speed_rate_per_s": _known(grown.end.speed.rate_per_s),
-            "end_error_rad": grown.end.end_error_rad,
-            "end_speed_rad_s": grown.end.end_speed_rad_s,
+            "error_rate_per_s": _known(grown.error.rate_per_s),
+            "speed_rate_per_s": _known(grown.speed.rate_per_s),
+            "end_error_rad": grown.end_error_rad,
+            "end_speed_rad_s": grown.end_speed_rad_s,
         },
         "functional": None if certificate.balance is None else _functional(certificate, certificate.balance),
     }

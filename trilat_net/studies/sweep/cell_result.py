@@ -40,7 +40,7 @@ CLASS_OF_MOTION = {
     EndBehaviour.DIVERGED: CellClass.DIVERGED,
     EndBehaviour.UNDECIDED: CellClass.UNDECIDED,
 }
-"""What is called what, of the motions that `certificate.growth` tells."""
+"""The class of a cell for each end of its run."""
 
 
 class CellResult(msgspec.Struct, frozen=True):
@@ -151,12 +151,10 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
 
 def _cell_result(run: FusedRun, extended: int) -> CellResult:
     maxima = run.maxima
-    end = classify_run_end(maxima, run.ran_s)
-    diverged_s = run.diverged_s
-    motion = end.motion if diverged_s is None else EndBehaviour.DIVERGED
+    end = classify_run_end(maxima, run.ran_s, run.diverged_s)
     return CellResult(
-        verdict=CLASS_OF_MOTION[motion],
-        motion=motion,
+        verdict=CLASS_OF_MOTION[end.behaviour],
+        motion=end.behaviour,
         ran_s=run.ran_s,
         extended=extended,
         end_error_rad=end.end_error_rad,
@@ -165,7 +163,7 @@ def _cell_result(run: FusedRun, extended: int) -> CellResult:
         speed_rate_per_s=_finite(end.speed.rate_per_s),
         peak_error_rad=max(float(values[:, 0].max()) for values in maxima),
         settled_s=run.settled_s,
-        diverged_s=diverged_s,
+        diverged_s=end.diverged_at_s,
     )
 
 

@@ -126,10 +126,10 @@ def confirm_cell(row: CellRow, run: SessionRunner, longest_s: float = MAX_SESSIO
     except LogError as error:
         return ConfirmedCell(row, virtual, None, "; ".join([*session.problems, str(error)]), log)
     if (
-        session.problems and found.motion is not EndBehaviour.DIVERGED
+        session.problems and found.behaviour is not EndBehaviour.DIVERGED
     ):  # one that diverges ends all, as it should
         return ConfirmedCell(row, virtual, None, "; ".join(session.problems), log)
-    return ConfirmedCell(row, virtual, CLASS_OF_MOTION[found.motion], found.text, log)
+    return ConfirmedCell(row, virtual, CLASS_OF_MOTION[found.behaviour], found.text, log)
 
 
 GridIndex = tuple[Any, ...]

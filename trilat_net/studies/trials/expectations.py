@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from ...analysis.run_end import EnvelopeTrend
 from ...scenario import Expect
 from ...scenario.expect import ExpectWindow
 from .measure_run import RunMetrics
@@ -57,7 +56,7 @@ def _stability(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResul
         found: bool | None = False
         text = f"diverged at {figures.diverged_at_s:.4g} s"
     else:
-        found = None if figures.trend is EnvelopeTrend.UNDECIDED else figures.trend is not EnvelopeTrend.GROWS
+        found = None if figures.trend.grows is None else not figures.trend.grows
         rate = figures.rate_per_s
         text = figures.trend.value + ("" if rate is None or found is None else f", {rate:+.3g}/s")
     yield ExpectationResult(

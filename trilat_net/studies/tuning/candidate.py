@@ -28,9 +28,10 @@ from ...execution import virtual
 from ...log.record_columns import Ints
 from ...process import ignore_sigint, worker_pool
 from ...scenario import Scenario, load_scenario, parse_scenario
+from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
 from .consensus_pose import build_twin, compute_consensus_pose
-from .final_posture import END_WINDOW_S, CandidateClass, CandidateEnd, classify_candidate
+from .final_posture import CandidateClass, CandidateEnd, classify_candidate
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 

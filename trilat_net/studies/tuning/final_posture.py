@@ -19,10 +19,9 @@ from ...analysis.run_end import EnvelopeTrend
 from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...log.log_reader import Log
+from ...scenario.expect import END_WINDOW_S
 from .consensus_pose import build_twin, check_comparable, compute_consensus_pose
 
-END_WINDOW_S = 1.0
-"""The end of a run is its last second."""
 STRAYED_RAD = 0.2
 """Arms whose mean is further than this from where they ought to be fell, hang, or were thrown there."""
 TOGETHER_RAD = 0.02
