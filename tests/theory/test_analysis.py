@@ -52,9 +52,9 @@ def test_the_verdict_is_that_of_the_loop_as_it_is_computed(digital: LinearAnalys
 
 
 def test_sampled_roots_stand_beside_where_they_differ(calm: LinearAnalysis, digital: LinearAnalysis) -> None:
-    assert "re as computed" not in tabulate_roots(calm).heads
+    assert "re as computed" not in tabulate_roots(calm).headers
     cells = tabulate_roots(digital)
-    assert cells.heads[5:7] == ("re as computed", "im as computed")
+    assert cells.headers[5:7] == ("re as computed", "im as computed")
     assert any(row[5] == "same" for row in cells.rows)
     assert float(cells.rows[0][5]) > 0.0 > float(cells.rows[0][0])
 

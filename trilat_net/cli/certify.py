@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from ..reporting.terminal_output import open_with_progress, out
+from ..reporting.terminal_output import open_with_progress, out, print_table
+from ..reporting.text_table import TextTable
 from .options import JsonOption, LogsArgument
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_HOLDS = {True: "[green]holds[/green]", False: "[yellow]fails[/yellow]", None: "not told"}
+_HOLDS = {True: "holds", False: "fails", None: "not told"}
 _MARKS = {
     "ok": "[green]ok  [/green]",
     "FAIL": "[red]FAIL[/red]",
@@ -53,16 +53,11 @@ def _show(found: "Certificate") -> None:
 
     for line in describe_certificate(found):
         out.print(f"{_MARKS[line.mark]} {escape(line.text)}", soft_wrap=True)
-    premises = Table("premise", "", "found", box=None, pad_edge=False)
-    for premise in found.premises:
-        premises.add_row(premise.name, _HOLDS[premise.holds], escape(premise.text))
+    rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in found.premises]
     out.print()
-    out.print(premises)
+    print_table(TextTable(("premise", "", "found"), rows), {"holds": "green", "fails": "yellow"})
     if found.balance is None:
         return
-    table = Table("energy", "J", box=None, pad_edge=False)
-    table.columns[1].justify = "right"
-    for name, amount in list_energies(found.balance):
-        table.add_row(escape(name), f"{amount:.4g}")
+    energies = [(name, f"{amount:.4g}") for name, amount in list_energies(found.balance)]
     out.print()
-    out.print(table)
+    print_table(TextTable(("energy", "J"), energies, align="lr"))

@@ -5,12 +5,12 @@ Invariant: numbers are printed and nothing is ranked.
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
 from ..reporting.terminal_output import (
@@ -21,6 +21,7 @@ from ..reporting.terminal_output import (
     progress_bar,
     sanitize,
 )
+from ..reporting.text_table import TextTable
 from .options import DurationOption, ForceOption, JsonOption, SetOption
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from ..log.log_reader import Log
     from ..scenario.describe import ScenarioDifference
     from ..studies.tuning import TuningPlan, TuningResult
-    from ..studies.tuning.tuning_tables import TuningTable as Cells
 
 _MOST_REASONS = 6
 
@@ -51,10 +51,12 @@ def print_log_comparison(
     if len(names) > 1:
         out.print(escape(f"logs of different scenarios: {', '.join(sorted(map(sanitize, names)))}"))
     if different:
-        print_table(_differences(different, found.columns))
+        out.print()
+        print_table(_tabulate_differences(different, found.columns))
     else:
         out.print("one and the same experiment")
-    print_table(_quantities(found))
+    out.print()
+    print_table(_tabulate_quantities(found))
     out.print()
     for name, lines in remarks.items():
         for line in lines:
@@ -62,31 +64,19 @@ def print_log_comparison(
     _print_reasons(found)
 
 
-def _differences(different: Sequence["ScenarioDifference"], columns: Sequence[str]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("differs", overflow="fold")
-    for name in columns:
-        table.add_column(escape(sanitize(name)), overflow="fold")
-    for one in different:
-        table.add_row(escape(sanitize(str(one))), *(escape(sanitize(value)) for value in one.values))
-    return table
+def _tabulate_differences(different: Sequence["ScenarioDifference"], columns: Sequence[str]) -> TextTable:
+    return TextTable(("differs", *columns), [(str(one), *one.values) for one in different])
 
 
-def _quantities(found: "MetricComparison") -> Table:
-    """Returns a row per quantity, with its unit, under the heads of its group."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("")
-    table.add_column("unit")
-    for name in found.columns:
-        table.add_column(escape(sanitize(name)), justify="right")
-    group = ""
-    for row in found.rows:
-        if row.quantity.group != group:
-            group = row.quantity.group
-            table.add_row(f"[bold]{escape(group)}[/bold]")
-        values = ["-" if value is None else f"{value:.4g}" for value in row.values]
-        table.add_row(f"  {escape(row.quantity.name)}", escape(row.quantity.unit or "-"), *values)
-    return table
+def _tabulate_quantities(found: "MetricComparison") -> TextTable:
+    """Returns a row per quantity, with its unit, under the heading of its group."""
+    rows: list[list[str]] = []
+    for group, members in groupby(found.rows, key=lambda row: row.quantity.group):
+        rows.append([group])
+        for row in members:
+            values = ["-" if value is None else f"{value:.4g}" for value in row.values]
+            rows.append([f"  {row.quantity.name}", row.quantity.unit or "-", *values])
+    return TextTable(("", "unit", *found.columns), rows, align="llr")
 
 
 def _print_reasons(found: "MetricComparison") -> None:
@@ -169,16 +159,19 @@ def _print_tuned(found: "TuningResult") -> None:
         tabulate_paper_gains,
     )
 
-    print_cells(tabulate_laws(found))
+    out.print()
+    print_table(tabulate_laws(found))
     for line in list_class_meanings():
         out.print(escape(f"  {line}"), soft_wrap=True)
     for law in found.found:
         if law.front:
-            print_cells(tabulate_front(found, law, _MAX_FRONT_ROWS))
+            out.print()
+            print_table(tabulate_front(found, law, _MAX_FRONT_ROWS))
     out.print(
         f"  * no candidate of any law is better in both; of long fronts {_MAX_FRONT_ROWS} points are shown"
     )
-    print_cells(tabulate_paper_gains(found))
+    out.print()
+    print_table(tabulate_paper_gains(found))
     for law in found.found:
         for gain in found.at_edge(law):
             out.print(
@@ -193,18 +186,6 @@ def _print_tuned(found: "TuningResult") -> None:
     for law in found.found:
         for place in law.front[-1:]:
             out.print(f"  {escape(found.candidate(law, place).command)}", soft_wrap=True)
-
-
-def print_cells(cells: "Cells") -> None:
-    """Prints a table of texts: words to the left, numbers to the right."""
-    from ..studies.tuning.tuning_tables import TEXT_COLUMNS
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for head in cells.heads:
-        table.add_column(escape(head), justify="left" if head in TEXT_COLUMNS else "right", no_wrap=True)
-    for row in cells.rows:
-        table.add_row(*map(escape, row))
-    print_table(table)
 
 
 app = typer.Typer()

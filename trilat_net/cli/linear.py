@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
 from ..reporting.terminal_output import out, print_table
@@ -31,7 +30,6 @@ class LinearFigure(StrEnum):
 
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
-_MODE_COLUMN = "what moves"
 
 
 @app.command("linear", epilog="Example: trilat linear p_d_margin --set control.d=0.9 --over control.d=0.1:3")
@@ -160,13 +158,8 @@ def _show(found: "LinearAnalysis") -> None:
 
     for line in (*linear_text.describe_equilibrium(found), *linear_text.describe_effective_delays(found)):
         out.print(escape(line), soft_wrap=True)
-    cells = linear_text.tabulate_roots(found)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for head in cells.heads:
-        table.add_column(head, justify="left" if head == _MODE_COLUMN else "right", no_wrap=True)
-    for row in cells.rows:
-        table.add_row(*map(escape, row))
-    print_table(table)
+    out.print()
+    print_table(linear_text.tabulate_roots(found))
     out.print(linear_text.describe_zero_roots(found), soft_wrap=True)
     verdict, _, rest = linear_text.describe_linear_verdict(found).partition(":")
     out.print(f"[{_COLOURS[verdict]}]{verdict}[/]:{escape(rest)}", soft_wrap=True)

@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..reporting.overview_tables import print_overview
 from ..reporting.terminal_output import (
     err,
     open_with_progress,
     out,
+    print_table,
     progress_bar,
     sanitize,
     warn_if_unfinished,
 )
+from ..reporting.text_table import TextTable
 from .options import ForceOption, JsonOption, LogArgument, LogsArgument
 
 if TYPE_CHECKING:
@@ -149,18 +150,15 @@ def _recovery_json(result: "Recovery") -> dict[str, object]:
 def _print_recovery(result: "Recovery") -> None:
     how = "was finished" if result.finished else "was not finished"
     out.print(f"{escape(f'{result.output}: made of {result.path}')}, which {how}", soft_wrap=True)
-    table = Table(box=None, pad_edge=False, show_header=False, padding=(0, 2))
-    table.add_column()
-    table.add_column(overflow="fold")
+    rows = []
     if result.sites:
-        table.add_row("records", ", ".join(f"{site} {count}" for site, count in result.sites.items()))
-    table.add_row("messages", f"{result.messages} in {result.duration_s:.3f} s")
-    for name, told in (("lost", result.lost), ("missing", result.missing)):
-        for n, text in enumerate(told[:MAX_LOSSES] or ["nothing"]):
-            table.add_row("" if n else name, escape(text))
-        if len(told) > MAX_LOSSES:
-            table.add_row("", f"and {len(told) - MAX_LOSSES} more; --json tells all")
-    out.print(table)
+        rows.append(("records", ", ".join(f"{site} {count}" for site, count in result.sites.items())))
+    rows.append(("messages", f"{result.messages} in {result.duration_s:.3f} s"))
+    for name, lines in (("lost", result.lost), ("missing", result.missing)):
+        rows += [("" if n else name, text) for n, text in enumerate(lines[:MAX_LOSSES] or ["nothing"])]
+        if len(lines) > MAX_LOSSES:
+            rows.append(("", f"and {len(lines) - MAX_LOSSES} more; --json tells all"))
+    print_table(TextTable(("", ""), [(f"  {name}", text) for name, text in rows]))
 
 
 MAX_LOSSES = 10

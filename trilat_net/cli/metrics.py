@@ -6,11 +6,10 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 import typer
-from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-from ..reporting.terminal_output import open_with_progress, out, sanitize
+from ..reporting.terminal_output import open_with_progress, out, print_table, sanitize
+from ..reporting.text_table import TextTable
 from .options import JsonOption, LogArgument
 
 if TYPE_CHECKING:
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_WIDE = 160
-"""Columns that a pipe has at least."""
 _NO_NUMBER = "–"
 
 
@@ -154,12 +151,6 @@ def _number(value: float) -> str:
 
 def _print(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> None:
     """Prints a table; its first columns hold words, the others numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for n, head in enumerate(heads):
-        last = n == len(heads) - 1 and head == ""
-        table.add_column(escape(sanitize(head)), justify="left" if n < words or last else "right")
-    for row in rows:
-        table.add_row(*(escape(sanitize(cell)) for cell in row))
-    console = out if out.is_terminal else Console(file=out.file, width=max(out.width, _WIDE), highlight=False)
-    console.print(table)
-    console.print()
+    align = "l" * words + "r" * (len(heads) - words - 1) + ("r" if heads[-1] else "l")
+    print_table(TextTable(heads, list(rows), align))
+    out.print()

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out, print_line
+from ..reporting.terminal_output import out, print_line, print_table
+from ..reporting.text_table import TextTable
 from .options import (
     ClockDriftOption,
     ClockOffsetOption,
@@ -181,31 +181,27 @@ def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any
         f"session {escape(session)} {state}; times in us; a clock is the one there minus the one here",
         soft_wrap=True,
     )
-    table = _table("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
+    rows = []
     for member in members:
         rtt = member.get("rtt_us", {})
         numbers = [*(rtt.get(name) for name in ("min", "p50", "p99")), member.get("jitter_us")]
-        table.add_row(
-            member["member"],
-            escape(member["host"]),
-            str(member["answers"]),
-            *("" if number is None else f"{number:.0f}" for number in numbers),
-            _clock(member),
-        )
-    out.print(table)
+        times = ("" if number is None else f"{number:.0f}" for number in numbers)
+        rows.append([member["member"], member["host"], str(member["answers"]), *times, _clock(member)])
+    headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
+    print_table(TextTable(headers, rows, align="llrrrrrl"))
     if links:
-        table = _table("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
-        for link in links:
-            times = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
-            table.add_row(
-                link["from"],
-                link["to"],
-                *("none" if time < 0 else str(time) for time in times),
-                f"{link['offset_us'] / 1e6:.6f}",
-                str(link["bound_us"]),
-            )
         out.print("between the sites, in the last tenth of a second of each:")
-        out.print(table)
+        print_table(_tabulate_links(links))
+
+
+def _tabulate_links(links: list[dict[str, Any]]) -> TextTable:
+    rows = []
+    for link in links:
+        times = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
+        numbers = ["none" if time < 0 else str(time) for time in times]
+        offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
+        rows.append([link["from"], link["to"], *numbers, *offset])
+    return TextTable(("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us"), rows, align="llr")
 
 
 def _clock(member: dict[str, Any]) -> str:
@@ -214,10 +210,3 @@ def _clock(member: dict[str, Any]) -> str:
     if "offset_ns" not in member:
         return "another clock"
     return f"{member['offset_ns'] / 1e9:.6f} s +- {member['bound_us']:.0f}"
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for n, column in enumerate(columns):
-        table.add_column(column, justify="left" if n < 2 or column == columns[-1] else "right")
-    return table

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
-from ..reporting.terminal_output import err, out, print_line, progress_bar
+from ..reporting.terminal_output import err, out, print_line, print_table, progress_bar
+from ..reporting.text_table import TextTable
 from .options import (
     ConnectOption,
     ListenOption,
@@ -210,12 +210,8 @@ def _show(outcome: "PlaybackSummary") -> None:
     """Prints the summary for people."""
     if err.is_interactive:
         err.file.write("\r" + " " * 72 + "\r")
-    table = Table(box=None, pad_edge=False)
-    table.add_column("channel")
-    table.add_column("messages", justify="right")
-    for topic, count in sorted(outcome.counts.items()):
-        table.add_row(escape(topic), str(count))
-    out.print(table)
+    rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
+    print_table(TextTable(("channel", "messages"), rows, align="lr"))
     late = outcome.lateness
     total = f"{sum(outcome.counts.values())} messages in {outcome.took_s:.2f} s"
     rounds = f", {outcome.rounds} rounds" if outcome.rounds > 1 else ""

@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
 from ..reporting.terminal_output import (
     open_with_progress,
     out,
     print_conclusion,
+    print_table,
     progress_bar,
     warn_user_laws,
 )
+from ..reporting.text_table import TextTable
 from .options import ForceOption, LogArgument, LogsArgument
 
 if TYPE_CHECKING:
@@ -83,10 +84,8 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
         rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
         typer.echo(json.dumps(rows, indent=2, ensure_ascii=False))
         return
-    table = Table("figure", "shows", box=None, pad_edge=False)
-    for name in (name for name, why in absent.items() if not why):
-        table.add_row(name, escape(FIGURES[name].about))
-    out.print(table)
+    drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
+    print_table(TextTable(("figure", "shows"), drawable))
     for name, why in absent.items():
         if why:
             out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)

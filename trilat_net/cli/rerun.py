@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
 from ..reporting.terminal_output import (
     open_with_progress,
     out,
     print_line,
+    print_table,
     progress_bar,
     sanitize,
     warn_user_laws,
 )
+from ..reporting.text_table import TextTable
 from .options import ForceOption, JsonOption, LogsArgument, SetOption
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _show(again: "Rerun", output: Path | None) -> None:
     out.print(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}", soft_wrap=True)
     for line in wording(asked) or ["nothing is changed: this is the experiment of the log"]:
         out.print(f"  {escape(sanitize(line))}", soft_wrap=True)
-    out.print(_table(again))
+    print_table(_tabulate_sites(again))
     for line in _lines(again):
         out.print(escape(sanitize(line)), soft_wrap=True)
     for note in again.notes:
@@ -93,17 +94,15 @@ def _show(again: "Rerun", output: Path | None) -> None:
         out.print(f"  {escape(str(output))}", soft_wrap=True)
 
 
-def _table(again: "Rerun") -> Table:
+def _tabulate_sites(again: "Rerun") -> TextTable:
     """Returns a row per site that was executed, each figure in the log and here."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("site")
-    for head in ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here"):
-        table.add_column(head, justify="right")
+    headers = ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here")
+    rows = []
     for effect in again.sites.values():
         figures = (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm)
         cells = [cell for pair in figures for cell in _cells(pair)]
-        table.add_row(effect.site, str(effect.executed), str(effect.identical), *cells)
-    return table
+        rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
+    return TextTable(("site", *headers), rows, align="lr")
 
 
 def _cells(pair: "LogAndRerun | None") -> list[str]:

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from ..reporting.terminal_output import out
+from ..reporting.terminal_output import out, print_table
+from ..reporting.text_table import TextTable
 from .options import (
     DurationOption,
     ForceOption,
@@ -26,13 +26,9 @@ def scenario_list_command() -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario
 
-    table = Table(box=None, pad_edge=False)
-    for column in ("name", "sites", "time", "what it is"):
-        table.add_column(column, justify="right" if column in ("sites", "time") else "left")
-    for name in list_shipped():
-        chosen = load_scenario(name)
-        table.add_row(name, str(len(chosen.names)), f"{chosen.duration_s:g} s", escape(chosen.title))
-    out.print(table)
+    chosen = [(name, load_scenario(name)) for name in list_shipped()]
+    rows = [(name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen]
+    print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
 
 
 @app.command("show", epilog="Example: trilat scenario show paper --set control.Kd=5")

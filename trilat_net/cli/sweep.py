@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from ..errors import UsageError
 from ..reporting.terminal_output import err, out, print_line, print_table, progress_bar
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
     from ..studies.sweep import FinishedSweep
     from ..studies.sweep.live_confirmation import LiveSession
-    from ..studies.sweep.stability_map import SweepTable
     from ..studies.sweep.sweep_cell import CellRun
     from ..studies.sweep.sweep_folder import SweepFolder
     from ..studies.sweep.sweep_plan import SweepPlan
@@ -184,7 +182,8 @@ def print_margins(
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
     with progress_bar("searching") as progress:
         found = search_margins(asked, within, jobs, progress)
-    _print_grid(tabulate_margins(asked, within, found))
+    out.print()
+    print_table(tabulate_margins(asked, within, found))
     data, text = chosen / "margin.json", chosen / "margin.md"
     data.write_text(
         json.dumps(margins_to_json(asked, within, found), indent=2, allow_nan=False) + "\n", "utf-8"
@@ -212,7 +211,8 @@ def confirm_cells_live(results: "SweepResults", count: int) -> None:
     rows = choose_cells_near_edges(results.rows, keys, count)
     run = _live_runner(results.plan.base.name)
     found = [confirm_cell(row, run) for row in rows]
-    _print_grid(tabulate_confirmations(found, keys))
+    out.print()
+    print_table(tabulate_confirmations(found, keys))
     same = sum(one.same for one in found)
     out.print(f"{same} of {len(found)} verdicts are the same")
     if same < len(found):
@@ -238,16 +238,6 @@ def _live_runner(name: str) -> "Callable[[Scenario, str], LiveSession]":
         return LiveSession(outcome.log, outcome.problems)
 
     return run
-
-
-def _print_grid(grid: "SweepTable") -> None:
-    """Prints a table; where nobody looks at a terminal, as wide as it wants to be."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for head in grid.heads:
-        table.add_column(escape(head), overflow="fold")
-    for row in grid.rows:
-        table.add_row(*map(escape, row))
-    print_table(table)
 
 
 _LINES = 10

@@ -18,21 +18,20 @@ from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import ignore_sigint, worker_pool
 from .summary_text import format_run_lines
+from .text_table import TextTable
 
 
 class Conclusion(NamedTuple):
     """A log, judged.
 
     Attributes:
-        columns: heads of the table.
-        rows: a row per site.
+        table: a row per site.
         notes: what links did and what happened, a line each.
         lines: what was checked and how it came out.
         paths: the files that were made.
     """
 
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    table: TextTable
     notes: list[str]
     lines: list[CheckLine]
     paths: list[Path]
@@ -82,8 +81,8 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
         made = write_report(
             log, folder, twin=twin, verdicts=verdicts(), progress=progress, sections=[certified]
         )
-    rows = [_site_row(log, site) for site in log.sites]
-    return Conclusion(_COLUMNS, rows, notes, lines, [*map(Path, log.sources), *made])
+    table = TextTable(_HEADERS, [_site_row(log, site) for site in log.sites], align="lr")
+    return Conclusion(table, notes, lines, [*map(Path, log.sources), *made])
 
 
 def _run_without_operators(log: Log) -> Log | None:
@@ -98,13 +97,13 @@ def _run_without_operators(log: Log) -> Log | None:
         return None
 
 
-_COLUMNS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
+_HEADERS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
 
 
 def _site_row(log: Log, site: str) -> tuple[str, ...]:
     part = log[site]
     if not len(part):
-        return (site, "0", *("",) * (len(_COLUMNS) - 2))
+        return (site, "0", *("",) * (len(_HEADERS) - 2))
     missing = max(find_last_ticks(log)[site], int(part.tick[-1])) + 1 - len(part)
     late = np.percentile(part.late_us, (50, 99, 100))
     busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)

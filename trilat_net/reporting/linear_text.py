@@ -5,27 +5,15 @@ Invariant: numbers have four digits and their units; roots that are zero by stru
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from ..theory.characteristic_roots import CharacteristicRoot
 from ..theory.linear_analysis import LinearAnalysis
+from .text_table import TextTable
 
 ROOT_HEADS = ("re 1/s", "im rad/s", "Hz", "damping", "modes", "what moves")
 SAMPLED_ROOT_HEADS = ("re as computed", "im as computed")
-
-
-class RootTable(NamedTuple):
-    """A table of texts.
-
-    Attributes:
-        heads: of its columns.
-        rows: its rows.
-    """
-
-    heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
 
 
 def describe_equilibrium(found: LinearAnalysis) -> Iterator[str]:
@@ -52,7 +40,7 @@ def describe_effective_delays(found: LinearAnalysis) -> Iterator[str]:
         yield f"delay in use on {names[j]}->{names[i]}: {1e3 * found.now.age_s[i, j]:.4g} ms"
 
 
-def tabulate_roots(found: LinearAnalysis) -> RootTable:
+def tabulate_roots(found: LinearAnalysis) -> TextTable:
     """Returns the rightmost roots, and beside them those of the loop as it is computed where they differ."""
     roots = found.continuous.roots
     others = [found.as_computed(root) for root in roots]
@@ -69,7 +57,7 @@ def tabulate_roots(found: LinearAnalysis) -> RootTable:
         ]
         rows.append((*row[:5], *(_computed(other) if both else ()), row[5]))
     heads = (*ROOT_HEADS[:5], *(SAMPLED_ROOT_HEADS if both else ()), ROOT_HEADS[5])
-    return RootTable(heads, rows)
+    return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
 
 
 def _computed(root: CharacteristicRoot | None) -> tuple[str, str]:

@@ -8,16 +8,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
-from .terminal_output import out, sanitize
+from .terminal_output import out, print_table, sanitize
+from .text_table import TextTable
 
 JsonObject = dict[str, Any]
 
 _MOST_GAPS = 4
 _VIEWS = "/viz/"
-_WIDE = 160
-"""Columns of a table that nobody looks at on a terminal: a pipe loses no digit."""
 _TROUBLE = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
 
 
@@ -77,13 +75,9 @@ def _show_session(facts: JsonObject, session: JsonObject) -> None:
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> None:
     """Prints a table; its first columns hold words, the others numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for n, head in enumerate(heads):
-        table.add_column(head, justify="left" if n < words else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(escape(sanitize(_cell(value))) for value in row))
     out.print()
-    out.print(table, width=out.width if out.is_terminal else max(out.width, _WIDE))
+    cells = [["-" if value is None else str(value) for value in row] for row in rows]
+    print_table(TextTable(heads, cells, "l" * words + "r"))
 
 
 def _show_sites(sites: dict[str, JsonObject]) -> None:
@@ -213,7 +207,3 @@ def _size(count: int) -> str:
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count} B"
-
-
-def _cell(value: object) -> str:
-    return "-" if value is None else str(value)

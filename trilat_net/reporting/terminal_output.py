@@ -6,18 +6,18 @@ knows nothing of the bar; it calls a function with (done, total). Imports only R
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
     from .conclude import Conclusion
+    from .text_table import TextTable
 
 
 def sanitize(text: object, most: int = 300) -> str:
@@ -28,12 +28,7 @@ def sanitize(text: object, most: int = 300) -> str:
 
 def print_conclusion(conclusion: "Conclusion") -> None:
     """Prints what there is to say of a log."""
-    table = Table(box=None, pad_edge=False)
-    for column in conclusion.columns:
-        table.add_column(column, justify="left" if column == "site" else "right")
-    for row in conclusion.rows:
-        table.add_row(*row)
-    out.print(table)
+    print_table(conclusion.table)
     for note in conclusion.notes:
         out.print(escape(note), soft_wrap=True)
     for line in conclusion.lines:
@@ -160,15 +155,14 @@ def warn_if_unfinished(path: Path) -> None:
         err.print(f"note: {escape(text)}trilat log recover {escape(str(path))}", soft_wrap=True)
 
 
-_WIDE = 160
-"""Columns that a pipe has at least."""
+_PIPE_WIDTH = 160
+"""Columns that output has at least where it is no terminal."""
 
 
-def print_table(table: Table) -> None:
-    """Prints a table with a line before it; where nobody looks at a terminal, as wide as it wants to be."""
-    out.print()
-    console = out if out.is_terminal else Console(file=out.file, width=max(out.width, _WIDE), highlight=False)
-    console.print(table)
+def print_table(table: "TextTable", styles: Mapping[str, str] | None = None) -> None:
+    """Prints a table; cells with a text of `styles` in that style."""
+    wide = Console(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
+    (out if out.is_terminal else wide).print(table.rich(styles or {}))
 
 
 out = Console(highlight=False)

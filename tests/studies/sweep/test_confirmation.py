@@ -178,8 +178,8 @@ def test_none_is_no_number_of_cells() -> None:
 def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> None:
     found = [confirm_cell(cell(CALM), runner(tmp_path, instead=one)) for one in (CALM, WILD)]
     grid = tabulate_confirmations(found, KEYS)
-    assert [row[grid.heads.index("virtual")] for row in grid.rows] == ["converged"] * 2
-    assert [row[grid.heads.index("live")] for row in grid.rows] == ["converged", "diverged"]
+    assert [row[grid.headers.index("virtual")] for row in grid.rows] == ["converged"] * 2
+    assert [row[grid.headers.index("live")] for row in grid.rows] == ["converged", "diverged"]
     assert [row[-3] for row in grid.rows] == ["same", "DIFFERS"]
     assert all(row[-1] == str(tmp_path / "cell-3.mcap") for row in grid.rows)
 

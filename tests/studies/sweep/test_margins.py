@@ -102,7 +102,7 @@ def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     grid = tabulate_margins(
         asked(), WITHIN, [found(*edges), found(stable=True), found(stable=False), found()]
     )
-    edge = grid.heads.index("edge of d (N m s/rad)")
+    edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
         "0.49 to 0.492",
         "1.8 to 2.1 (undecided between)",
@@ -111,7 +111,7 @@ def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
         "none: nothing decided",
     ]
     assert [row[edge + 1] for row in grid.rows] == ["above", "below", "-", "-", "-"]
-    linear = grid.heads.index("linear")
+    linear = grid.headers.index("linear")
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
     assert "not monotone in 1 of 2 places" in build_margin_page(

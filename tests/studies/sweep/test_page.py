@@ -58,7 +58,7 @@ def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
     plane = drawn()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
     heads = ["delay (ms)", "edge of d (N m s/rad)", "stable is", "d = 5 T", "difference", "half of it"]
-    assert table.heads == (*heads, "difference")
+    assert table.headers == (*heads, "difference")
     assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
     for row in table.rows:
         low, high = map(float, row[1].split(" to "))

@@ -55,7 +55,7 @@ def test_the_page_tells_procedure_search_and_commands(found: TuningResult, tmp_p
 
 def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
     table = tabulate_laws(found)
-    places = [table.heads.index(outcome.value) for outcome in CandidateClass]
+    places = [table.headers.index(outcome.value) for outcome in CandidateClass]
     for row in table.rows:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 5
 

@@ -24,6 +24,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 from ...core.vectors import Array
 from ...reporting import style
 from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
+from ...reporting.text_table import TextTable
 from .cell_result import CellClass
 from .live_confirmation import ConfirmedCell
 from .map_plane import (
@@ -37,7 +38,7 @@ from .map_plane import (
     find_map_edges,
     label_axis,
 )
-from .stability_map import StabilityMap, SweepTable
+from .stability_map import StabilityMap
 from .theory_lines import TheoryLine
 
 CLASS_COLOURS = {
@@ -319,16 +320,16 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def tabulate_classes(plane: MapPlane) -> SweepTable:
+def tabulate_classes(plane: MapPlane) -> TextTable:
     """Returns how many runs had which verdict, a row per panel."""
     rows = [
         (panel.title or "all", *(str(int(count)) for count in panel.counts.sum(axis=(0, 1))))
         for panel in plane.panels
     ]
-    return SweepTable(("runs", *CELL_CLASSES), rows)
+    return TextTable(("runs", *CELL_CLASSES), rows)
 
 
-def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> SweepTable:
+def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> TextTable:
     """Returns the measured edges beside the lines, a row each; none where only one axis was swept.
 
     The difference is that of a line from the middle of the measured edge; "within" where the line lies in the
@@ -343,7 +344,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]
         for line in lines:
             row += _compare_with_line(plane, edge, line)
         rows.append(tuple(row))
-    return SweepTable(tuple(heads), rows)
+    return TextTable(tuple(heads), rows)
 
 
 def _compare_with_line(plane: MapPlane, edge: MapEdge, line: TheoryLine) -> list[str]:
@@ -363,7 +364,7 @@ def _meanings(chart: StabilityMap) -> list[str]:
     return [f"{text}: {about}" for text, about in told.items()] + list(chart.remarks)
 
 
-def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> SweepTable:
+def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
     """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is.
 
     Args:
@@ -380,4 +381,4 @@ def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) 
         where = "none" if one.log is None else str(one.log)
         cell, seed = str(one.row["cell"]), str(one.row["seed"])
         rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
-    return SweepTable(heads, rows)
+    return TextTable(heads, rows)

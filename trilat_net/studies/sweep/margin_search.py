@@ -16,11 +16,12 @@ import numpy as np
 
 from ...errors import ScenarioError, UsageError
 from ...process import count_cores
+from ...reporting.text_table import TextTable
 from ...scenario import Scenario
 from ..executor import open_worker_pool
 from . import cell_result
 from .map_plane import label_axis
-from .stability_map import SweepTable, build_sweep_command, format_override, format_override_value
+from .stability_map import build_sweep_command, format_override, format_override_value
 from .sweep_cell import SweepCell, SweepSource
 from .sweep_plan import SweepPlan
 from .theory_lines import evaluate_criterion, find_criterion_edge, find_root_crossings
@@ -290,7 +291,7 @@ def _fractions(at: Callable[[float], Scenario], within: SearchRange) -> bool:
     return True
 
 
-def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> SweepTable:
+def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> TextTable:
     """Returns margins as a table, a row per edge, or per place that has none.
 
     Args:
@@ -316,7 +317,7 @@ def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[Grid
             ]
             cells += _theory_cells(span, one.closed) if closed else []
             rows.append((*cells, str(one.margin.runs)))
-    return SweepTable(tuple(heads), rows)
+    return TextTable(tuple(heads), rows)
 
 
 def build_margin_page(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:

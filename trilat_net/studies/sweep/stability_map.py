@@ -17,24 +17,6 @@ from .sweep_plan import MAX_EXTENSION, MAX_SCENARIO_S, SweepPlan
 from .sweep_results import SweepResults
 from .theory_lines import TheoryLine, compute_growth_rates, trace_closed_form, trace_linear_analysis
 
-
-class SweepTable(NamedTuple):
-    """A table.
-
-    Attributes:
-        heads: of its columns.
-        rows: texts, as many as there are heads each.
-    """
-
-    heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-    def markdown(self) -> str:
-        """Returns it in Markdown."""
-        lines = (self.heads, ["---"] * len(self.heads), *self.rows)
-        return "\n".join(f"| {' | '.join(cell or ' ' for cell in line)} |" for line in lines)
-
-
 LAW_AXIS = "law"
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
+from ...reporting.text_table import TextTable
 from .expectations import ExpectationResult
 from .trial import TrialResult
 
@@ -18,7 +19,6 @@ MAX_FAILURES_SHOWN = 5
 """So many failed runs of a scenario are told in full; of the others the seeds."""
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
-_NUMBERS = ("margin", "held")
 
 
 class ExpectationRow(NamedTuple):
@@ -107,15 +107,7 @@ class TrialReport(NamedTuple):
 
     def table(self) -> list[str]:
         """Returns the table as aligned lines; the first holds the heads."""
-        table = [TRIAL_COLUMNS, *(row.cells() for row in self.rows())]
-        widths = [max(len(cells[n]) for cells in table) for n in range(len(TRIAL_COLUMNS))]
-        return [
-            "  ".join(
-                cell.rjust(width) if column in _NUMBERS else cell.ljust(width)
-                for cell, width, column in zip(cells, widths, TRIAL_COLUMNS, strict=True)
-            ).rstrip()
-            for cells in table
-        ]
+        return TextTable(TRIAL_COLUMNS, [row.cells() for row in self.rows()], align="lllllrr").lines()
 
     def text(self) -> str:
         """Returns all of it as plain text."""

@@ -5,44 +5,26 @@ unit, and every run is counted in some column.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from ...reporting.text_table import TextTable
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
 from .pareto_search import REFINEMENT_STEPS, Objective
 from .tuning_plan import MAX_BUDGET, SearchResult, TuningPlan, TuningResult
 
-TEXT_COLUMNS = ("law", "gain", "unit", "told")
-"""Heads of columns that hold words; all others hold numbers."""
 
-
-class TuningTable(NamedTuple):
-    """A table.
-
-    Attributes:
-        heads: of its columns.
-        rows: texts.
-    """
-
-    heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-    def markdown(self) -> str:
-        """Returns it in Markdown."""
-        rule = ["---" if head in TEXT_COLUMNS else "--:" for head in self.heads]
-        return "\n".join(f"| {' | '.join(cells)} |" for cells in (self.heads, rule, *self.rows))
-
-
-def tabulate_laws(tuned: TuningResult) -> TuningTable:
+def tabulate_laws(tuned: TuningResult) -> TextTable:
     """Returns a row per law: what became of its candidates, and the two ends of its front."""
     value = _head(tuned.plan.objective)
     heads = ("law", "tried", *(outcome.value for outcome in reversed(CandidateClass)), "front", "of all")
-    return TuningTable(
+    return TextTable(
         (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}"),
         [_law_row(tuned, found) for found in tuned.found],
+        align="lr",
     )
 
 
@@ -61,9 +43,9 @@ def _law_row(tuned: TuningResult, found: SearchResult) -> tuple[str, ...]:
     )
 
 
-def tabulate_search(plan: TuningPlan) -> TuningTable:
+def tabulate_search(plan: TuningPlan) -> TextTable:
     """Returns a row per law and gain: where it was searched, and what the law is told."""
-    return TuningTable(
+    return TextTable(
         ("law", "gain", "unit", "from", "to", "told"),
         [
             (
@@ -77,10 +59,11 @@ def tabulate_search(plan: TuningPlan) -> TuningTable:
             for space in plan.spaces
             for n, knob in enumerate(space.knobs)
         ],
+        align="lllrrl",
     )
 
 
-def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUDGET) -> TuningTable:
+def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUDGET) -> TextTable:
     """Returns a law's front by rising effort; * marks what no law's candidate dominates.
 
     Args:
@@ -101,13 +84,13 @@ def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUD
         for n, place in enumerate(found.front, 1)
         if n - 1 in kept
     ]
-    return TuningTable(("law", *gains, *_SCORE_HEADS), rows)
+    return TextTable(("law", *gains, *_SCORE_HEADS), rows, align="lr")
 
 
-def tabulate_paper_gains(tuned: TuningResult) -> TuningTable:
+def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     """Returns a row for each way to take the gains that the paper prints."""
     rows = [(one.name, one.score.outcome.value, *_score_cells(one.score)) for one in tuned.printed]
-    return TuningTable(("law", "outcome", *_SCORE_HEADS), rows)
+    return TextTable(("law", "outcome", *_SCORE_HEADS), rows, align="llr")
 
 
 _SCORE_HEADS = (

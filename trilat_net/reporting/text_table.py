@@ -1,0 +1,82 @@
+"""A table of texts, printed on a terminal, as Markdown or as plain lines.
+
+Invariant: every cell is text already, and all three forms show the same cells in the same order.
+"""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+NO_STYLES: Mapping[str, str] = MappingProxyType({})
+
+
+class TextTable(NamedTuple):
+    """A table of texts.
+
+    Attributes:
+        headers: one per column; all empty for a table without a header line.
+        rows: one text per column each. A shorter row leaves its last cells empty; a row of one text in a
+            wider table is the heading of a group of rows.
+        align: a letter per column, "l" for words and "r" for numbers; the last one holds for all columns
+            that follow.
+        units: one per column, appended to its header; "" for none. May be shorter than `headers`.
+    """
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    align: str = "l"
+    units: Sequence[str] = ()
+
+    @property
+    def titles(self) -> list[str]:
+        """The headers with their units."""
+        units = [*self.units, *[""] * len(self.headers)]
+        return [f"{head} {unit}".strip() for head, unit in zip(self.headers, units, strict=False)]
+
+    @property
+    def to_the_right(self) -> list[bool]:
+        """Per column, True if its cells are aligned to the right."""
+        return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
+
+    def rich(self, styles: Mapping[str, str] = NO_STYLES) -> "Table":
+        """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow.
+
+        Args:
+            styles: Rich style of every cell with just this text, as in {"fails": "yellow"}.
+        """
+        from rich.table import Table
+        from rich.text import Text
+
+        from .terminal_output import sanitize
+
+        table = Table(box=None, pad_edge=False, show_header=any(self.titles))
+        for title, right in zip(self.titles, self.to_the_right, strict=True):
+            table.add_column(Text(sanitize(title)), justify="right" if right else "left", overflow="fold")
+        for row in self.rows:
+            heading = "bold" if len(row) == 1 < len(self.headers) else ""
+            table.add_row(*(Text(sanitize(cell), style=styles.get(cell, heading)) for cell in row))
+        return table
+
+    def markdown(self) -> str:
+        """Returns it in Markdown."""
+        rule = ["--:" if right else "---" for right in self.to_the_right]
+        blank = [""] * len(self.headers)
+        cells = (self.titles, rule, *([*row, *blank[len(row) :]] for row in self.rows))
+        return "\n".join(
+            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in cells
+        )
+
+    def lines(self) -> list[str]:
+        """Returns its lines with columns aligned by spaces; the first holds the headers."""
+        table = [self.titles, *self.rows]
+        widths = [max(len(row[n]) for row in table if n < len(row)) for n in range(len(self.headers))]
+        return [
+            "  ".join(
+                cell.rjust(width) if right else cell.ljust(width)
+                for cell, width, right in zip(row, widths, self.to_the_right, strict=False)
+            ).rstrip()
+            for row in table
+        ]
