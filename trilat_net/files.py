@@ -1,157 +1,189 @@
-"""Result folders and optional packages.
+"""Output files and folders: refused where something exists, replaced only by force, written whole.
 
-Invariant: nothing that exists is overwritten unless the caller forces it. An optional package is imported
-where it is used; if it is missing, the error names the pip extra that installs it.
+Invariant: nothing that exists is replaced unless the caller forces it, and an output bears its name only once
+it is complete. An optional package is imported where it is used; if it is missing, the error names the pip
+extra that installs it.
 """
 
 import errno
 import itertools
 import os
 import shutil
-import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from .errors import LogRefused, UsageError
 
+_DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
-def import_extra(module: str, name: str, purpose: str) -> Any:
-    """Returns a module that an extra of this package brings.
 
-    Args:
-        module: which one, as in "scipy.io".
-        name: the extra.
-        purpose: what needs it, in the plural.
+def import_extra(module: str, extra: str, purpose: str) -> Any:
+    """Imports a module of an optional package; `purpose` names the features that need it, in the plural.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: the package is not installed.
     """
     try:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{name}]'") from None
+        raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{extra}]'") from None
+
+
+def make_folder(folder: Path) -> Path:
+    """Makes a folder and its parents, and returns it.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
+    return folder
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
-    """Makes a folder for results.
-
-    Args:
-        folder: which one, or None for the next free `runs/NAME-N`.
-        name: what the run is called.
-        force: whether a folder that holds something may be used.
+    """Makes a folder for results: the given one, or the next free `runs/NAME-N`.
 
     Raises:
-        UsageError: it holds something, or cannot be made.
+        UsageError: it holds something (and `force` is not set), or it cannot be made.
     """
-    chosen = folder if folder is not None else _next_free(Path("runs"), name)
+    if folder is None:
+        numbered = (Path("runs") / f"{name}-{n:03d}" for n in itertools.count(1))
+        folder = next(path for path in numbered if not path.exists())
     try:
-        if not force and chosen.exists() and any(chosen.iterdir()):
-            raise UsageError(f"{chosen}: holds something; choose another folder, or use --force")
-        chosen.mkdir(parents=True, exist_ok=True)
+        occupied = not force and folder.exists() and any(folder.iterdir())
     except OSError as error:
-        raise UsageError(f"{chosen}: cannot be made or read: {error.strerror}") from None
-    return chosen
+        raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
+    if occupied:
+        raise UsageError(f"{folder}: holds something; choose another folder, or use --force")
+    return make_folder(folder)
 
 
-def _next_free(parent: Path, name: str) -> Path:
-    return next(path for n in itertools.count(1) if not (path := parent / f"{name}-{n:03d}").exists())
-
-
-EXPORT_MANIFEST = "about.json"
-"""What tells a folder that was made here from any other."""
-_EXPORT_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-def refuse_existing_export(path: Path, *, folder: bool, force: bool) -> None:
-    """Refuses a name that is taken.
+def refuse_existing(
+    path: Path, *, force: bool, unfinished: Path | None = None, manifest: str | None = None
+) -> None:
+    """Refuses an output whose name is taken.
 
     Args:
-        path: the name.
-        folder: whether a folder is to be made there, or a file.
-        force: whether what was made here before may be replaced.
+        path: the output.
+        force: whether an earlier output of the same kind may be replaced.
+        unfinished: name of the output while it is written, which must be free too.
+        manifest: file that marks a folder as an earlier output; None where the output is a file.
 
     Raises:
-        UsageError: something is there.
+        UsageError: the name is taken.
     """
-    if not os.path.lexists(path) or (folder and _is_empty_folder(path)):
+    if os.path.lexists(path) and not (manifest and path.is_dir() and not any(path.iterdir())):
+        replaceable = (path / manifest).is_file() if manifest else path.is_file()
+        if not replaceable:
+            kind = "folder that was exported" if manifest else "file"
+            raise UsageError(f"{path}: exists, and is no {kind}; choose another name")
+        if not force:
+            raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
+    if unfinished is not None and unfinished.exists() and not force:
+        raise UsageError(
+            f"{unfinished}: exists: it is being written, or was never finished; make it whole with: "
+            f"trilat log recover {unfinished}; or choose another name, or replace it with --force"
+        )
+
+
+def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
+    """Gives a complete file its name; without `force` an existing file of that name stays.
+
+    Raises:
+        UsageError: the name is taken.
+    """
+    if force:
+        unfinished.replace(path)
         return
-    what = "folder" if folder else "file"
-    replaceable = (path / EXPORT_MANIFEST).is_file() if folder else path.is_file()
-    if not replaceable:
-        raise UsageError(f"{path}: exists, and is no {what} that was exported; choose another name with -o")
+    try:
+        os.link(unfinished, path)  # unlike a renaming it never replaces
+        unfinished.unlink()
+    except FileExistsError:
+        raise UsageError(
+            f"{path}: exists by now; the finished file is {unfinished}: give it a name"
+        ) from None
+    except OSError:  # a file system without links
+        refuse_existing(path, force=False)
+        unfinished.rename(path)
+
+
+def write_whole(path: Path, data: bytes | str, *, force: bool = True, remedy: str = "") -> None:
+    """Writes a file so that it exists whole or not at all; a device or pipe is written to directly.
+
+    Args:
+        path: the file.
+        data: its content; text is encoded as UTF-8.
+        force: whether it may replace a file.
+        remedy: what the error of a full disk advises.
+
+    Raises:
+        UsageError: it exists, or cannot be made.
+        LogRefused: the disk refused it.
+    """
+    content = data.encode() if isinstance(data, str) else data
     if not force:
-        raise UsageError(f"{path}: exists; choose another name with -o, or replace it with --force")
-
-
-def _is_empty_folder(path: Path) -> bool:
-    return path.is_dir() and not any(path.iterdir())
+        refuse_existing(path, force=False)
+    try:
+        if path.exists() and not path.is_file():
+            path.write_bytes(content)
+            return
+        target = path.resolve()  # a link stays a link
+        unfinished = target.with_name(f"{target.name}.unfinished")
+        try:
+            with unfinished.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            publish_file(unfinished, target, force=force)
+        except OSError:
+            unfinished.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise describe_write_error(path, error, remedy) from None
 
 
 @contextmanager
-def stage_export(path: Path, *, folder: bool, force: bool) -> Iterator[Path]:
-    """Yields where to write; what was written there bears its name once the block has ended well.
+def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
+    """Yields a scratch path; what is written there gets the output's name when the block ends well.
 
     Args:
-        path: the name.
-        folder: whether it is a folder, or a file.
-        force: whether what was made here before may be replaced.
+        path: the output.
+        force: whether an earlier output of the same kind may be replaced.
+        manifest: see `refuse_existing`; with one, the scratch path is a folder.
 
     Raises:
-        UsageError: something is there, or nothing can be written there.
-        LogRefused: the disk is full.
+        UsageError: the name is taken, or nothing can be written there.
+        LogRefused: the disk refused it.
     """
-    refuse_existing_export(path, folder=folder, force=force)
+    refuse_existing(path, force=force, manifest=manifest)
+    remedy = "nothing is left of it. Make room, or take another disk with -o"
     try:
         scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
-        raise _make_export_refused(path, error) from None
+        raise describe_write_error(path, error, remedy) from None
     try:
-        made = scratch / path.name
-        if folder:
-            made.mkdir()
-        yield made
-        if folder and path.is_dir():
+        staged = scratch / path.name
+        if manifest:
+            staged.mkdir()
+        yield staged
+        if manifest and path.is_dir():
             path.rename(scratch / "before")
-        made.replace(path)
+        staged.replace(path)
     except OSError as error:
-        raise _make_export_refused(path, error) from None
+        raise describe_write_error(path, error, remedy) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _make_export_refused(path: Path, error: OSError) -> LogRefused | UsageError:
-    text = f"{path}: cannot be written: {error.strerror or error}"
-    if error.errno in _EXPORT_FULL_ERRNOS:
-        return LogRefused(f"{text}; nothing is left of it. Make room, or take another disk with -o")
-    return UsageError(text)
-
-
-def refuse_existing_log(path: Path, working: Path, *, force: bool) -> None:
-    """Refuses a name that is taken.
-
-    Raises:
-        UsageError: the log exists, or one that was not finished; or it is no file at all.
-    """
-    if path.exists() and not stat.S_ISREG(path.stat().st_mode):
-        raise UsageError(f"{path}: exists, and is no file; choose another name")
-    if force:
-        return
-    if path.exists():
-        raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
-    if working.exists():
-        raise UsageError(
-            f"{working}: exists: it is being written, or was never finished; make it whole with: trilat log "
-            f"recover {working}; or choose another name, or replace it with --force"
-        )
-
-
 def sync_folder(folder: Path) -> None:
-    """Puts a folder's names onto the disk, where such a thing is possible."""
+    """Syncs the names in a folder to the disk, where the platform can."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -160,33 +192,9 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-@contextmanager
-def open_new_file(path: Path, *, force: bool = False) -> Iterator[BinaryIO]:
-    """Opens a small file for writing that must not exist yet, unless it may be replaced; closes it.
-
-    Args:
-        path: which file.
-        force: whether it may replace one.
-
-    Raises:
-        UsageError: it exists, or cannot be made.
-        LogRefused: the disk refused what was still to be written.
-    """
-    try:
-        stream = path.open("wb" if force else "xb")
-    except FileExistsError:
-        raise UsageError(f"{path}: exists; choose another name, or replace it with --force") from None
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
-    try:
-        yield stream
-    finally:
-        try:
-            stream.close()
-        except OSError as error:  # what a full disk refused is refused once more on closing
-            raise make_log_refused(error) from None
-
-
-def make_log_refused(error: OSError) -> LogRefused:
-    """Returns the error of a log whose disk refused a write."""
-    return LogRefused(f"the log cannot be written: {error.strerror}; what was flushed before is intact")
+def describe_write_error(path: Path, error: OSError, remedy: str = "") -> LogRefused | UsageError:
+    """Returns the error of a failed write: `LogRefused`, with a remedy, if the disk refused it."""
+    text = f"{path}: cannot be written: {error.strerror or error}"
+    if error.errno in _DISK_ERRNOS:
+        return LogRefused(f"{text}; {remedy}" if remedy else text)
+    return UsageError(text)

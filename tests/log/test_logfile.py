@@ -125,7 +125,7 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
             begun(file).finish()
             path.write_bytes(b"precious")
 
-    with pytest.raises(UsageError, match=r"exists by now; the finished log is .*run\.mcap\.active"):
+    with pytest.raises(UsageError, match=r"exists by now; the finished file is .*run\.mcap\.active"):
         write()
     assert path.read_bytes() == b"precious"
     assert messages(active_path(path)) == []

@@ -116,12 +116,12 @@ def _range(text: str) -> tuple[str, float, float]:
 
 
 def _check_picture(path: Path, *, force: bool) -> None:
+    from ..files import refuse_existing
     from ..reporting.style import FIGURE_FORMATS
 
     if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
         raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FIGURE_FORMATS)}")
-    if path.exists() and not force:
-        raise UsageError(f"{path}: exists; choose another name, or use --force")
+    refuse_existing(path, force=force)
     if not path.parent.is_dir():
         raise UsageError(f"{path}: there is no folder {path.parent}")
 

@@ -224,11 +224,11 @@ def log_view_command(
     Of a log without standard channels (--views off), of one that was not finished and of parts it makes them
     first, in a temporary file.
     """
-    from ..errors import UsageError
+    from ..files import refuse_existing
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
-    if save is not None and save.exists() and not force:
-        raise UsageError(f"{save}: exists; choose another name, or replace it with --force")
+    if save is not None:
+        refuse_existing(save, force=force)
     open_rerun(
         files,
         lambda: open_with_progress(*files),

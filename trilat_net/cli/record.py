@@ -81,6 +81,7 @@ def record_command(
     """
     from recorder.record_process import record_session
 
+    from ..files import refuse_existing
     from ..log.log_layout import find_parts, parse_channel_filter
     from ..log.log_writer import make_log_storage
     from ..log.ros2.viz_channels import parse_viz_rate
@@ -102,8 +103,8 @@ def record_command(
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
     page = path.parent / "report.html"
-    if concluded and page.exists() and not force:
-        raise UsageError(f"{page}: exists; give the log a folder of its own, or use --force")
+    if concluded:
+        refuse_existing(page, force=force)
     clock = make_system_clock(clock_offset, clock_drift)
     then = (lambda: _conclude(list(find_parts(path).values()))) if concluded else lambda: None
     code = record_session(

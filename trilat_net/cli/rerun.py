@@ -68,12 +68,12 @@ def rerun_command(
 
 def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
     """Refuses a file that may not be written, before anything is executed."""
-    from ..files import refuse_existing_log
+    from ..files import refuse_existing
     from ..log.log_layout import active_path
 
     if any(output.exists() and file.exists() and output.samefile(file) for file in files):
         raise UsageError(f"{output}: is the log itself; choose another name")
-    refuse_existing_log(output, active_path(output), force=force)
+    refuse_existing(output, force=force, unfinished=active_path(output))
 
 
 def _show(again: "Rerun", output: Path | None) -> None:

@@ -59,9 +59,8 @@ def scenario_new_command(
     file: Annotated[Path, typer.Argument(help="The file to make.")], force: ForceOption = False
 ) -> None:
     """Writes a commented template, with the unit of every key."""
-    from ..files import open_new_file
+    from ..files import write_whole
     from ..scenario import read_template
 
-    with open_new_file(file, force=force) as stream:
-        stream.write(read_template().encode())
+    write_whole(file, read_template(), force=force)
     out.print(f"{escape(str(file))}: a template; check it with: trilat scenario check {escape(str(file))}")

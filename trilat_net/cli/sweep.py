@@ -168,7 +168,7 @@ def print_margins(
         folder: where results go; None for the next free one below runs.
         jobs: in how many processes; None for one per core.
     """
-    from ..files import make_results_folder
+    from ..files import make_results_folder, write_whole
     from ..studies.sweep.margin_search import (
         MARGIN_TOLERANCE,
         build_margin_page,
@@ -185,10 +185,8 @@ def print_margins(
     out.print()
     print_table(tabulate_margins(asked, within, found))
     data, text = chosen / "margin.json", chosen / "margin.md"
-    data.write_text(
-        json.dumps(margins_to_json(asked, within, found), indent=2, allow_nan=False) + "\n", "utf-8"
-    )
-    text.write_text(build_margin_page(asked, within, found), "utf-8")
+    write_whole(data, json.dumps(margins_to_json(asked, within, found), indent=2, allow_nan=False) + "\n")
+    write_whole(text, build_margin_page(asked, within, found))
     for path in (data, text):
         out.print(f"  {escape(str(path))}", soft_wrap=True)
 

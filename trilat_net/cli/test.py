@@ -49,6 +49,7 @@ def test_command(
     overrides: SetOption = None,
 ) -> None:
     r"""Runs scenarios and says which of their \[expect] held, by how much, and how to repeat what did not."""
+    from ..files import write_whole
     from ..net.clock import SystemClock
     from ..studies.trials.trial_report import encode_junit_xml
 
@@ -59,7 +60,7 @@ def test_command(
     report = _run_live(batch) if live else _run_virtual(batch, jobs)
     _show(report)
     if junit is not None:
-        junit.write_bytes(encode_junit_xml(report, began_unix_ns, platform.node()))
+        write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
     if not report.held:
         raise typer.Exit(1)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 from ..errors import LogRefused, UsageError
-from ..files import refuse_existing_log, sync_folder
+from ..files import publish_file, refuse_existing, sync_folder
 from ..net import topics
 from ..net.clock import SystemClock
 from .log_layout import active_path
@@ -203,7 +203,7 @@ class LogFile:
         self.trouble: OSError | None = None
         self._force = force
         try:
-            refuse_existing_log(path, self.working, force=force)
+            refuse_existing(path, force=force, unfinished=self.working)
             self._raw = (opened or _opened)(self.working, "wb" if force else "xb")
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
@@ -292,7 +292,7 @@ class LogFile:
             self._raw.close()
             self._room.release()
         if self.whole:
-            self._publish()
+            publish_file(self.working, self.path, force=self._force)
             self._published = True
         elif not self.size:
             self.working.unlink(missing_ok=True)
@@ -304,21 +304,6 @@ class LogFile:
             self.close()
         self.working.unlink(missing_ok=True)
         self.size = 0
-
-    def _publish(self) -> None:
-        if self._force:
-            self.working.replace(self.path)
-            return
-        try:
-            os.link(self.working, self.path)  # unlike a renaming it never replaces
-            self.working.unlink()
-        except FileExistsError:
-            raise UsageError(
-                f"{self.path}: exists by now; the finished log is {self.working}: give it a name"
-            ) from None
-        except OSError:  # a file system without links
-            refuse_existing_log(self.path, self.path, force=False)
-            self.working.rename(self.path)
 
     def refused(self, error: OSError) -> LogRefused:
         """Returns what to say of a file that the disk refused, once it is closed."""

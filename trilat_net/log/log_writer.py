@@ -15,7 +15,7 @@ from types import TracebackType
 
 from ..core.ticks import TickRecord
 from ..errors import LogRefused, UsageError
-from ..files import make_log_refused, refuse_existing_log
+from ..files import refuse_existing
 from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
@@ -240,7 +240,9 @@ class LogWriter:
             raise self._refused(error) from None
 
     def _refused(self, error: OSError) -> LogRefused:
-        refused = make_log_refused(error)
+        refused = LogRefused(
+            f"the log cannot be written: {error.strerror}; what was flushed before is intact"
+        )
         self._over = self._over or str(refused)
         return refused
 
@@ -292,7 +294,7 @@ class LogStorage:
         if self.carry_on and there:
             last = max(there)
             return last + 1, there[last].name.removesuffix(ACTIVE_SUFFIX)
-        refuse_existing_log(self.path, active_path(self.path), force=self.force)
+        refuse_existing(self.path, force=self.force, unfinished=active_path(self.path))
         if self.splits and there and not self.force:
             raise UsageError(
                 f"{there[max(there)]}: exists; choose another name, carry on behind it with --continue, or "

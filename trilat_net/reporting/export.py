@@ -7,9 +7,16 @@ from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 
-from ..files import refuse_existing_export, stage_export
+from ..files import refuse_existing, stage_output
 from ..log.log_reader import Log
-from .export_tables import WriteExport, make_csv_writer, make_mat_writer, make_npz_writer, make_parquet_writer
+from .export_tables import (
+    EXPORT_MANIFEST,
+    WriteExport,
+    make_csv_writer,
+    make_mat_writer,
+    make_npz_writer,
+    make_parquet_writer,
+)
 from .ros2_bag import export_ros2
 
 ExportProgress = Callable[[int, int], None]
@@ -45,7 +52,8 @@ class Exporter:
 
     def __init__(self, form: ExportFormat, path: Path, *, force: bool = False) -> None:
         self._form, self._path, self._force = form, path, force
-        refuse_existing_export(path, folder=form.is_folder, force=force)
+        self._manifest = EXPORT_MANIFEST if form.is_folder else None
+        refuse_existing(path, force=force, manifest=self._manifest)
         self._write = _WRITES[form]()
 
     def export(self, log: Log, progress: ExportProgress | None = None) -> None:
@@ -69,7 +77,7 @@ class Exporter:
             if progress is not None:
                 progress(done, total)
 
-        with stage_export(self._path, folder=self._form.is_folder, force=self._force) as path:
+        with stage_output(self._path, force=self._force, manifest=self._manifest) as path:
             self._write(log, path, written)
 
 

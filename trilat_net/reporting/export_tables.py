@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UsageError
-from ..files import EXPORT_MANIFEST, import_extra
+from ..files import import_extra
 from ..log.data_tables import Column, Table, iterate_tables, to_data_frame
 from ..log.log_layout import SCENARIO, collect_provenance
 from ..log.log_reader import Log
 
 TableFacts = dict[str, Any]
+
+EXPORT_MANIFEST = "about.json"
+"""File of an exported folder; it distinguishes such a folder from any other."""
 
 
 def describe_table(table: Table) -> TableFacts:

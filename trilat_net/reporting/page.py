@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from ..analysis.run_summary import JsonObject, summarise_run
 from ..execution.log_checks import CheckLine
+from ..files import make_folder, write_whole
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from . import arm_svg, charts, page_tables, style
@@ -124,15 +125,15 @@ def write_report(
         progress: told how many figures are drawn, and how many there are.
         sections: what is shown besides, from elsewhere.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     facts = summarise_run(log, twin)
     figures = [*write_report_figures(log, folder, twin, progress), *write_section_figures(sections, folder)]
     lines = list(verdicts)
     checks = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    page.write_text(render_report(log, twin, lines, facts, sections), encoding="utf-8")
+    write_whole(page, render_report(log, twin, lines, facts, sections))
     more = {section.key: section.facts for section in sections}
-    numbers.write_text(_json({**facts, **more, "checks": checks}, indent=2) + "\n", encoding="utf-8")
+    write_whole(numbers, _json({**facts, **more, "checks": checks}, indent=2) + "\n")
     return [page, numbers, *figures]
 
 

@@ -18,6 +18,7 @@ from ...analysis.certificate.stability_certificate import certify
 from ...analysis.site_signals import sites_with_operator
 from ...errors import UsageError
 from ...execution.virtual_comparison import simulate_without_operators
+from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log
 from ...log.mcap_reader import Progress
 from .. import style
@@ -205,13 +206,9 @@ def _check(log: Log, name: str) -> None:
 
 
 def _prepare(folder: Path, paths: Sequence[Path], *, force: bool) -> None:
-    there = [path for path in paths if path.exists()]
-    if there and not force:
-        raise UsageError(f"{there[0]}: exists; choose another folder, or use --force")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
+    for path in paths:
+        refuse_existing(path, force=force)
+    make_folder(folder)
 
 
 MOST_REPORT_FIGURES = 9

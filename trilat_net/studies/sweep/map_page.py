@@ -22,6 +22,7 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 
 from ...core.vectors import Array
+from ...files import write_whole
 from ...reporting import style
 from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
 from ...reporting.text_table import TextTable
@@ -297,7 +298,7 @@ def write_map(
     paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "md")]
     for path in paths[:2]:
         style.write_figure(figure, path, _DPI)
-    paths[2].write_text(build_map_page(chart, paths[0].name), encoding="utf-8")
+    write_whole(paths[2], build_map_page(chart, paths[0].name))
     return paths
 
 

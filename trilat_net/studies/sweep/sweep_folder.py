@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...core.fingerprint import compute_fingerprint
-from ...errors import LogRefused, UsageError
-from ...files import make_results_folder
+from ...errors import UsageError
+from ...files import describe_write_error, make_results_folder, write_whole
 from ...log.log_layout import collect_provenance
 from .sweep_cell import CellRun
 from .sweep_plan import SweepPlan, plan_from_json
@@ -74,16 +74,16 @@ class SweepJournal:
         try:
             written = self._file.write(data)
         except OSError as error:
-            raise write_refused(self._path, error) from None
+            raise describe_write_error(self._path, error, build_resume_hint(self._path.parent)) from None
         if written != len(data):  # a disk that became full takes a part, and says nothing
-            raise write_refused(self._path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+            full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            raise describe_write_error(self._path, full, build_resume_hint(self._path.parent))
 
 
-def write_refused(path: Path, error: OSError) -> LogRefused:
-    """Returns what is said of a file of a sweep that the disk refused."""
-    return LogRefused(
-        f"{path}: cannot be written: {error.strerror}; what is done is kept: make room, and go on with: "
-        f"trilat sweep --resume {shlex.quote(str(path.parent))}"
+def build_resume_hint(folder: Path) -> str:
+    """Returns how to go on with a sweep that the disk interrupted."""
+    return (
+        f"what is done is kept: make room, and go on with: trilat sweep --resume {shlex.quote(str(folder))}"
     )
 
 
@@ -161,7 +161,7 @@ def prepare_sweep_folder(asked: SweepPlan, path: Path | None) -> SweepFolder:
     if path is not None and (path / PLAN_FILE).exists():
         return _resume_same(path, facts)
     chosen = make_results_folder(path, f"sweep-{asked.base.name}", force=False)
-    write_whole(chosen / PLAN_FILE, _text(facts).encode())
+    write_whole(chosen / PLAN_FILE, _text(facts), remedy=build_resume_hint(chosen))
     return SweepFolder(chosen, asked, facts)
 
 
@@ -232,20 +232,3 @@ def _made_with() -> dict[str, Any]:
 
 def _text(facts: Mapping[str, Any]) -> str:
     return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file that is there whole or not at all.
-
-    Raises:
-        LogRefused: the disk refused it.
-    """
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    try:
-        with unfinished.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        unfinished.replace(path)
-    except OSError as error:
-        raise write_refused(path, error) from None

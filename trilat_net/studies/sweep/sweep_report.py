@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ...errors import ScenarioError
+from ...files import write_whole
 from ...scenario.scenario_reader import read_source
 from .cell_result import CellClass
 from .sweep_cell import SweepSource
@@ -136,7 +137,7 @@ def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path)
         return ReproduceCommand(row["command"])
     name = f"cell-{row['cell']}-seed-{row['seed']}"
     file = folder / f"{name}.toml"
-    file.write_text(row["scenario"], encoding="utf-8")
+    write_whole(file, row["scenario"])
     lasts_s = reproduction_duration_s(results.plan, results.outcome(row))
     words = ["trilat", "sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap"]
     source = results.plan.written.source

@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from ...errors import UsageError
+from ...files import write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ..executor import WorkerPool, open_worker_pool
 from . import cell_result
 from .sweep_cell import CellRun, run_cell
-from .sweep_folder import SweepFolder, SweepJournal, write_whole
+from .sweep_folder import SweepFolder, SweepJournal, build_resume_hint
 from .sweep_plan import SweepPlan
 from .sweep_results import (
     GRID_POINTS_FILE,
@@ -177,8 +178,10 @@ def run_sweep(
         rows = build_result_rows(asked, list(journal.done.values()))
     results = SweepResults(asked, rows)
     if len(asked.seeds) > 1:
-        write_whole(folder.path / GRID_POINTS_FILE, encode_grid_points(asked, collect_grid_points(results)))
-    write_whole(folder.results, encode_results(asked, rows, folder.facts))
+        points = encode_grid_points(asked, collect_grid_points(results))
+        write_whole(folder.path / GRID_POINTS_FILE, points, remedy=build_resume_hint(folder.path))
+    table = encode_results(asked, rows, folder.facts)
+    write_whole(folder.results, table, remedy=build_resume_hint(folder.path))
     speed = SweepSpeed(len(made), sum(entry.outcome.ran_s for entry in made), wall_s, count)
     return FinishedSweep(results, folder, speed)
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from ...files import write_whole
 from ...reporting import style
 from .candidate import CandidateScore
 from .final_posture import CandidateClass
@@ -131,10 +132,8 @@ def _undrawn_reason(score: CandidateScore) -> str:
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     """Writes a comparison into a folder that exists, and returns the paths."""
     data, text = folder / "front.json", folder / "front.md"
-    data.write_text(
-        json.dumps(tuning_to_json(tuned), indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
-    )
-    text.write_text(build_tuning_page(tuned), "utf-8")
+    write_whole(data, json.dumps(tuning_to_json(tuned), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_whole(text, build_tuning_page(tuned))
     figure = draw_front(tuned)
     pictures = [folder / "front.png", folder / "front.pdf"]
     for path in pictures:

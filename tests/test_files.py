@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.files import EXPORT_MANIFEST, refuse_existing_export, stage_export
+from trilat_net.files import refuse_existing, stage_output, write_whole
+from trilat_net.reporting.export_tables import EXPORT_MANIFEST
 
 
 def everything(folder: Path) -> dict[str, str]:
@@ -17,7 +18,7 @@ def everything(folder: Path) -> dict[str, str]:
 
 
 def make(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
-    with stage_export(path, folder=folder, force=force) as made:
+    with stage_output(path, force=force, manifest=EXPORT_MANIFEST if folder else None) as made:
         (made / EXPORT_MANIFEST if folder else made).write_text(text)
 
 
@@ -26,7 +27,7 @@ def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) ->
     make(tmp_path / "out", "1", folder=folder)
     there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
     assert everything(tmp_path) == there
-    with pytest.raises(UsageError, match="exists; choose another name with -o, or replace it with --force"):
+    with pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"):
         make(tmp_path / "out", "2", folder=folder)
     assert everything(tmp_path) == there
     make(tmp_path / "out", "3", folder=folder, force=True)
@@ -34,7 +35,7 @@ def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) ->
 
 
 def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
-    with stage_export(path, folder=folder, force=True) as made:
+    with stage_output(path, force=True, manifest=EXPORT_MANIFEST if folder else None) as made:
         (made / "half" if folder else made).write_text("half")
         raise error
 
@@ -65,11 +66,11 @@ def test_a_folder_that_was_not_made_here_is_never_replaced(tmp_path: Path) -> No
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(UsageError, match="is no folder that was exported"):
         make(tmp_path / "mine", "1", folder=True, force=True)
-    with pytest.raises(UsageError, match="is no file that was exported"):
+    with pytest.raises(UsageError, match="is no file;"):
         make(tmp_path / "mine", "1", folder=False, force=True)
     (tmp_path / "notes").write_text("notes")
     with pytest.raises(UsageError, match="is no folder that was exported"):
-        refuse_existing_export(tmp_path / "notes", folder=True, force=True)
+        refuse_existing(tmp_path / "notes", force=True, manifest=EXPORT_MANIFEST)
     assert everything(tmp_path)["mine/thesis.tex"] == "years"
 
 
@@ -82,3 +83,30 @@ def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"out: cannot be written: No such file"):
         make(tmp_path / "none" / "out", "1", folder=False)
+
+
+def test_a_file_is_written_whole_or_what_was_there_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "report.json"
+    write_whole(path, "1")
+    with pytest.raises(UsageError, match="exists"):
+        write_whole(path, "2", force=False)
+
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(LogRefused, match="No space left on device; make room") as raised:
+        write_whole(path, "3", remedy="make room")
+    assert raised.value.exit_code == 5
+    assert everything(tmp_path) == {"report.json": "1"}
+
+
+def test_a_link_stays_a_link_and_a_device_is_written_to(tmp_path: Path) -> None:
+    (tmp_path / "linked").symlink_to(tmp_path / "real")
+    write_whole(tmp_path / "linked", b"1")
+    write_whole(Path("/dev/null"), b"1")
+    assert (tmp_path / "linked").is_symlink()
+    assert (tmp_path / "real").read_text() == "1"
+    assert not Path("/dev/null").is_file()
