@@ -1,0 +1,80 @@
+"""The program's own sources: files, rooms, definitions, and which room imports which."""
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TOPS = ("trilat_net", "sites", "recorder")
+BELOW_ALL = {"errors", "process", "files", "deprecated"}
+
+
+def files() -> list[Path]:
+    """Returns every source file, tests aside."""
+    return sorted(path for top in (*TOPS, "containers") for path in (ROOT / top).rglob("*.py"))
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    """Returns the syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def room(path: Path) -> str:
+    """Returns the room of a file: its top-level folder, or one of those of `trilat_net`."""
+    top, *below = path.relative_to(ROOT).with_suffix("").parts
+    return below[0] if top == "trilat_net" else top
+
+
+def _imported(path: Path) -> Iterator[Path]:
+    """Yields the files of this program that a file imports, wherever in it the import stands."""
+    package = path.relative_to(ROOT).parent.parts
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            parts = (*base, *(node.module or "").split(".")) if node.module else base
+            names = [(*parts, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+        else:
+            continue
+        for name in names:
+            for parts in (name, name[:-1]):
+                at = ROOT.joinpath(*parts)
+                if parts and parts[0] in TOPS and (found := _module(at)) is not None:
+                    yield found
+                    break
+
+
+def _module(at: Path) -> Path | None:
+    if at.with_suffix(".py").is_file():
+        return at.with_suffix(".py")
+    return at / "__init__.py" if (at / "__init__.py").is_file() else None
+
+
+def room_imports() -> set[tuple[str, str]]:
+    """Returns which room imports which; those that lie below all others are left out."""
+    pairs = {(room(path), room(other)) for path in files() for other in _imported(path)}
+    return {(a, b) for a, b in pairs if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})}
+
+
+def definitions(path: Path) -> set[str]:
+    """Returns the classes and functions of a file, those of classes as `Class.method`."""
+    found = set()
+    for node in tree(path).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {
+                f"{node.name}.{below.name}" for below in node.body if isinstance(below, ast.FunctionDef)
+            }
+    return found
+
+
+def bodies(path: Path) -> Iterator[tuple[str, int]]:
+    """Yields every function with the lines of its body, docstring aside."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) is not None else node.body
+            yield node.name, body[-1].end_lineno - body[0].lineno + 1 if body else 0

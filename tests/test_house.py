@@ -1,0 +1,64 @@
+"""How the house is built: names, sizes, rooms (docs/design.md, section 2), and the tour through it."""
+
+import re
+from collections import defaultdict
+from pathlib import Path
+
+from . import house
+
+PLUG_INS = {"main"}
+"""Names that an interface asks of several modules: the entry point of a program."""
+DESIGN = (house.ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
+
+
+def test_a_class_or_public_function_has_one_module() -> None:
+    homes = defaultdict(set)
+    for path in house.files():
+        for name in house.definitions(path):
+            if "." not in name and not name.startswith("_") and name not in PLUG_INS:
+                homes[name].add(str(path.relative_to(house.ROOT)))
+    assert not {name: places for name, places in homes.items() if len(places) > 1}
+
+
+def test_a_module_name_is_used_once() -> None:
+    homes = defaultdict(set)
+    for path in house.files():
+        if path.stem != "__init__" and house.room(path) != "cli":  # a command's module bears its name
+            homes[path.stem].add(str(path.relative_to(house.ROOT)))
+    assert not {name: places for name, places in homes.items() if len(places) > 1}
+
+
+def test_the_house_is_no_larger_than_it_may_be() -> None:
+    lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
+    assert len(lines) <= 260
+    assert sum(lines) <= 49_300
+
+
+def test_no_body_is_longer_than_forty_lines() -> None:
+    assert not [
+        (path.name, *found) for path in house.files() for found in house.bodies(path) if found[1] > 60
+    ]
+
+
+def test_every_import_between_rooms_has_its_reason() -> None:
+    """The table of docs/design.md names each pair, and no pair that is not there."""
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", DESIGN, re.MULTILINE)
+    told = {(above, below) for above, cell in rows for below in re.findall(r"`(\w+)`: ", cell)}
+    assert told == house.room_imports()
+    assert len(told) <= 60
+
+
+def test_the_tour_names_what_exists() -> None:
+    stops = re.findall(r"`([\w/]+\.py)`(?:: ((?:`[\w.]+`(?:, )?)+))?", TOUR)
+    assert len(stops) > 25
+    for file, names in stops:
+        path = house.ROOT / file
+        assert path.is_file(), file
+        missing = set(re.findall(r"`([\w.]+)`", names)) - house.definitions(path)
+        assert not missing, (file, missing)
+
+
+def test_the_tour_is_short() -> None:
+    assert TOUR.count("\n") <= 120
+    assert (Path(house.ROOT) / "README.md").read_text(encoding="utf-8").count("\n") < 120
