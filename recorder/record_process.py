@@ -8,79 +8,30 @@ end of the process.
 import platform
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from trilat_net import process
 from trilat_net.core.fingerprint import compute_fingerprint
-from trilat_net.errors import LogRefused, RunFailed, ScenarioError, SessionError, WireError
+from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection, default_endpoint, default_endpoints, open_bus
-from trilat_net.net.membership import ASK_EVERY_NS, EventPublisher, liveliness_token, new_boot
+from trilat_net.net.connection import Connection
+from trilat_net.net.discovery import connect_to_session
+from trilat_net.net.membership import EventPublisher, new_boot
 from trilat_net.net.messages import Info
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import Epoch, SessionJoin
-from trilat_net.net.wire import decode
-from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .inbound_queue import InboundQueue
 from .session_recording import RecorderReport, Recording
-
-
-class FirstSiteQuery:
-    """Asks the first site of a session, on this machine, where the others are.
-
-    It announces the recorder meanwhile, so that the session does not begin without it.
-
-    Args:
-        session: the session's name.
-        boot: the recorder's boot.
-        own: settings of a person's own for Zenoh.
-    """
-
-    def __init__(self, session: str, boot: int, own: Mapping[str, Any] | None = None) -> None:
-        self._session = session
-        self._first = default_endpoint(session, 0)
-        self._bus = ZenohBus([], [self._first], own=own)
-        self._bus.announce(liveliness_token(session, topics.RECORDER, boot))
-
-    def endpoints(self, clock: Clock, stopped: Callable[[], bool], timeout_s: float | None) -> list[str]:
-        """Returns the default endpoints of the session's sites, once the first has said who they are.
-
-        Raises:
-            SessionError: it did not answer in time.
-        """
-        begun_ns = clock.monotonic_ns()
-        while not stopped():
-            replies = self._bus.ask(topics.key(self._session, "*", topics.INFO))
-            clock.sleep_until(clock.monotonic_ns() + ASK_EVERY_NS)
-            while (reply := replies.poll()) is not None:
-                try:
-                    names = parse_embedded(decode(reply[1], Info).scenario, self._session).names
-                except (WireError, ScenarioError):
-                    continue  # no site of ours
-                return list(default_endpoints(self._session, names).values())
-            if timeout_s is not None and clock.monotonic_ns() - begun_ns > timeout_s * 1e9:
-                raise SessionError(
-                    f"the recorder waited {timeout_s:g} s for the first site of session {self._session!r} "
-                    f"at {self._first}; name other endpoints with --connect"
-                )
-        return [self._first]
-
-    def close(self) -> None:
-        """Leaves; by then the recorder has announced itself to all sites."""
-        self._bus.close()
-
 
 POLL_NS = 10_000_000
 FLUSH_NS = 80_000_000
@@ -116,7 +67,7 @@ class Recorder:
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._tap.take)
         self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
-        self._voice = EventPublisher(
+        self._publisher = EventPublisher(
             bus,
             session,
             Info(
@@ -130,7 +81,7 @@ class Recorder:
             ),
             partial(self._tap.take, topics.key(session, topics.RECORDER, topics.EVENT)),
         )
-        self._joining = SessionJoin(bus, clock, session, self._voice, ())
+        self._joining = SessionJoin(bus, clock, session, self._publisher, ())
 
     def join(self, timeout_s: float | None) -> Epoch | None:
         """Waits for a session to begin.
@@ -151,7 +102,7 @@ class Recorder:
                 return epoch
             now_ns = self._clock.monotonic_ns()
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                met = ", ".join(self._joining.meeting.met) or "nobody"
+                met = ", ".join(self._joining.membership.met) or "nobody"
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
                     f"it met {met}"
@@ -177,9 +128,9 @@ class Recorder:
             )
 
         with LogParts(self._storage, begin) as log:
-            recording = Recording(log, scenario, self._session, epoch, self._bus, self._voice)
+            recording = Recording(log, scenario, self._session, epoch, self._bus, self._publisher)
             log.so_far = partial(recording.account_texts, self._tap)
-            boot = self._voice.info.boot
+            boot = self._publisher.info.boot
             report = RecorderReport(
                 *(self._bus, self._clock, self._session, boot, epoch, recording, self._tap),
                 lambda: log.written_bytes,
@@ -214,14 +165,14 @@ class Recorder:
         """Returns the scenario, as a member of the session has it."""
         return next(
             parse_embedded(info.scenario, info.member)
-            for info in self._joining.meeting.met.values()
+            for info in self._joining.membership.met.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )
 
     def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
         """Says that it is one of the session's members, or that it comes late."""
-        own, now_ns = self._voice.info, self._clock.monotonic_ns()
-        self._voice.info = msgspec.structs.replace(own, running=True)
+        own, now_ns = self._publisher.info, self._clock.monotonic_ns()
+        self._publisher.info = msgspec.structs.replace(own, running=True)
         how = "the session begins"
         if epoch.boots.get(own.member) != own.boot:
             how = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
@@ -241,7 +192,7 @@ class Recorder:
         """Takes and writes until the session is over."""
         flushed_ns = self._clock.monotonic_ns()
         while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
-            self._voice.answer()
+            self._publisher.answer_queries()
             recording.write(self._tap, self._clock.monotonic_ns())
             self._attend(recording)
             report.poll()
@@ -285,17 +236,20 @@ def record_session(
     say(f"recorder: waiting for session {session!r} to begin")
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
-        if connection.connect is None:
-            discovery = FirstSiteQuery(session, boot, connection.own)
-            stack.callback(discovery.close)
-            found = discovery.endpoints(clock, interrupt.requested, join_timeout_s)
-            connection = replace(connection, connect=found)
-        bus = open_bus(
-            connection, clock, interrupt.requested, join_timeout_s, lambda text: say(f"recorder: {text}")
+        bus = stack.enter_context(
+            connect_to_session(
+                connection,
+                clock,
+                session,
+                lambda text: parse_embedded(text, session).names,
+                stopped=interrupt.requested,
+                timeout_s=join_timeout_s,
+                say=lambda text: say(f"recorder: {text}"),
+                recorder_boot=boot,
+            )
         )
         if bus is None:
             return interrupt.exit_code
-        stack.callback(bus.close)
         recorder = Recorder(bus, clock, session, boot, storage, interrupt.requested, say)
         process.freeze_gc()  # in a session its pauses would be time that a crash can lose
         epoch = recorder.join(join_timeout_s)

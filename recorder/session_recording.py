@@ -64,7 +64,7 @@ class Recording:
         session: the session's name.
         epoch: its tick 0, and who its members are.
         bus: the connection, over which sites are asked for what is missing.
-        voice: the recorder's own events; it keeps them in the same tap as what comes from others.
+        publisher: the recorder's own events; it keeps them in the same tap as what comes from others.
 
     Attributes:
         dropped: messages that were none of the session's, by reason.
@@ -78,11 +78,11 @@ class Recording:
         session: str,
         epoch: Epoch,
         bus: Bus,
-        voice: EventPublisher,
+        publisher: EventPublisher,
     ) -> None:
         self.dropped: Counter[str] = Counter()
         self._writer = writer
-        self._session, self._epoch, self._voice = session, epoch, voice
+        self._session, self._epoch, self._publisher = session, epoch, publisher
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._senders = {
             name: SiteReception(scenario, name, epoch.boots.get(name)) for name in scenario.names
@@ -116,13 +116,13 @@ class Recording:
         """
         at_ns = now_ns - self._epoch.mono_ns
         there = [name for name in self._senders if name not in self._gone]
-        self._voice.say(
+        self._publisher.publish(
             "late",
             f"the recorder joins at t = {at_ns / 1e9:.3f} s; what was before is asked of {', '.join(there)}",
             t_ns=at_ns,
         )
         for name in self._gone:
-            self._voice.say("lost", f"{name} is gone", about=name, t_ns=at_ns)
+            self._publisher.publish("lost", f"{name} is gone", about=name, t_ns=at_ns)
         for filling in self._fillings.values():
             filling.probe()
 
@@ -168,7 +168,7 @@ class Recording:
 
     def _take_own(self, arrived: InboundMessage, since_ns: int, log_time_ns: int) -> None:
         """Takes what this recorder says itself."""
-        account, own = self._own[arrived.key], self._voice.info.boot
+        account, own = self._own[arrived.key], self._publisher.info.boot
         if arrived.key.endswith(topics.STATS):
             stats = decode(arrived.payload, RecorderStats)
             boot, number, content = stats.boot, account.expected, None
@@ -190,7 +190,7 @@ class Recording:
         text = f"every record of {sender.name} is stored"
         if shortage:
             text = f"all that can be had of {sender.name} is stored; missing for good: {shortage}"
-        self._voice.say(
+        self._publisher.publish(
             "stored", text, t_ns=now_ns - self._epoch.mono_ns, about=sender.name, ticks=sender.made
         )
 

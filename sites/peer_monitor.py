@@ -40,11 +40,11 @@ class PeerMonitor:
         """Says which start of each member belongs to the session."""
         self._boots = boots
 
-    def watch(self, voice: EventPublisher, t_ns: int) -> None:
+    def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Takes what has come, and says who has come or is gone without having said its end.
 
         Args:
-            voice: the site's own events.
+            publisher: the site's own events.
             t_ns: nominal time, ns since the epoch.
         """
         self._hear()
@@ -56,11 +56,11 @@ class PeerMonitor:
             if where.member == topics.RECORDER:
                 (self.recorders.add if change[1] else self.recorders.discard)(where.boot)
                 if change[1] and not known:  # in the middle, or once more after another one died
-                    voice.say("back", "a recorder has come", about=where.member, t_ns=t_ns)
+                    publisher.publish("back", "a recorder has come", about=where.member, t_ns=t_ns)
             elif not known:
                 continue
             if not change[1] and where.member not in self._ended:
-                voice.say("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
+                publisher.publish("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
 
     def _hear(self) -> None:
         """Takes what the peers say of their own end."""

@@ -4,18 +4,19 @@ Invariant: read-only. It announces no token; a session neither waits for it nor 
 """
 
 from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection, default_endpoint, default_endpoints, open_bus
-from trilat_net.net.membership import ASK_EVERY_NS
+from trilat_net.net.connection import Connection, default_endpoint
+from trilat_net.net.discovery import connect_to_session
+from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Info, LinkStats
 from trilat_net.net.offset import OffsetEstimate, exact_offset
-from trilat_net.net.pinging import PING_PACE_NS, Pinger, RepeatedQuery
+from trilat_net.net.pinging import PING_PACE_NS, Pinger
 from trilat_net.net.wire import decode
 from trilat_net.scenario import parse_embedded
 
@@ -61,24 +62,14 @@ class SessionPing:
         self.infos: dict[str, Info] = {}
         self.links: dict[str, LinkStats] = {}
         self._clock, self._count = clock, count
-        self._asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
+        self._members = MemberQuery(bus, clock, session)
         self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self.pinger = Pinger(bus, clock, session, count)
-        self._asked_ns = clock.monotonic_ns() - ASK_EVERY_NS
         self._first_ns: int | None = None
 
     def poll(self) -> None:
         """Takes what has come, and asks on."""
-        if self._clock.monotonic_ns() - self._asked_ns >= ASK_EVERY_NS:
-            self._asked_ns = self._asking.ask()
-        while (answer := self._asking.poll()) is not None:
-            try:
-                info = decode(answer.payload, Info)
-            except WireError:
-                continue  # a stranger's, or of another version of us
-            where = topics.parse_key(answer.key)
-            if where is None or where.member != info.member:
-                continue
+        for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
         while (message := self._stats.poll()) is not None:
@@ -135,55 +126,34 @@ def ping_session(
     Raises:
         RunFailed: nobody answered.
     """
-    timeout_ns = int(timeout_s * 1e9)
-    if connection.connect is None:
-        first = replace(connection, connect=[default_endpoint(session, 0)])
-        infos = _poll_session(first, clock, session, 1, timeout_ns, stopped, gather=False)
-        if infos is None:
+
+    def site_names(text: str) -> tuple[str, ...]:
+        try:
+            return parse_embedded(text, session).names
+        except ScenarioError:  # of another version: the first site's endpoint is all that is known
+            return ()
+
+    with ExitStack() as stack:
+        try:
+            bus = stack.enter_context(
+                connect_to_session(
+                    connection, clock, session, site_names, stopped=stopped, timeout_s=timeout_s
+                )
+            )
+        except SessionError as error:
+            raise RunFailed(str(error)) from None
+        if bus is None:
             return None
-        connection = replace(connection, connect=_site_endpoints(infos, session))
-    return _poll_session(connection, clock, session, count, timeout_ns, stopped, gather=True)
-
-
-def _poll_session(
-    connection: Connection,
-    clock: Clock,
-    session: str,
-    count: int,
-    timeout_ns: int,
-    stopped: Callable[[], bool],
-    *,
-    gather: bool,
-) -> SessionPing | None:
-    """Looks until all have answered, or without `gather` until one has said who the sites are."""
-    begun_ns = clock.monotonic_ns()
-    try:
-        bus = open_bus(connection, clock, stopped, timeout_ns / 1e9, lambda _: None)
-    except SessionError as error:
-        raise RunFailed(str(error)) from None
-    if bus is None:
-        return None
-    with closing(bus):
-        probe = SessionPing(bus, clock, session, count)
-        while not (probe.over(timeout_ns, begun_ns) or (probe.infos and not gather)):
+        ping, begun_ns = SessionPing(bus, clock, session, count), clock.monotonic_ns()
+        while not ping.over(int(timeout_s * 1e9), begun_ns):
             if stopped():
                 return None
-            probe.poll()
-            clock.sleep_until(clock.monotonic_ns() + probe.pinger.pause_ns(POLL_NS))
-    if not probe.infos:
-        places = ", ".join(map(str, connection.connect or ()))
+            ping.poll()
+            clock.sleep_until(clock.monotonic_ns() + ping.pinger.pause_ns(POLL_NS))
+    if not ping.infos:
+        places = ", ".join(map(str, connection.connect or [default_endpoint(session, 0)]))
         raise RunFailed(
-            f"nobody of session {session!r} answered at {places} within {timeout_ns / 1e9:g} s; is that its "
+            f"no member of session {session!r} answered at {places} within {timeout_s:g} s; is that its "
             "name, and has it not ended? name other endpoints with --connect"
         )
-    return probe
-
-
-def _site_endpoints(probe: SessionPing, session: str) -> list[str]:
-    """Returns the default endpoints of the sites that a member's scenario names."""
-    for info in probe.infos.values():
-        try:
-            return list(default_endpoints(session, parse_embedded(info.scenario, session).names).values())
-        except ScenarioError:
-            continue  # the recorder's, which has none
-    return [default_endpoint(session, 0)]
+    return ping

@@ -178,8 +178,8 @@ class SiteProcess:
             needs_recorder=options.needs_recorder,
         )
         keep = self._history.rings[topics.EVENT].keep
-        self._voice = EventPublisher(self._bus, options.session, info, keep)
-        self._joining = SessionJoin(self._bus, self._clock, options.session, self._voice, scenario.names)
+        self._publisher = EventPublisher(self._bus, options.session, info, keep)
+        self._joining = SessionJoin(self._bus, self._clock, options.session, self._publisher, scenario.names)
 
     def _kept(self, channel: str) -> Callable[[bytes], None]:
         """Returns what publishes on a channel of this site and keeps it for a while."""
@@ -207,15 +207,15 @@ class SiteProcess:
         self._timing = SiteTiming(epoch.mono_ns, self._site.rate_hz, peers, self._scenario.names[0])
         clocks = describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns)
         self._intake.admit([epoch.boots[peer] for peer in self._site.peers], self._timing.meters)
-        self._voice.info = msgspec.structs.replace(
-            self._voice.info,
+        self._publisher.info = msgspec.structs.replace(
+            self._publisher.info,
             running=True,
             epoch_mono_ns=epoch.mono_ns,
             epoch_unix_ns=epoch.unix_ns,
             boots=epoch.boots,
         )
         obtained = realtime.prepare(self._options.cpu)
-        self._voice.say(
+        self._publisher.publish(
             "setup",
             ", ".join([*(f"{key}: {value}" for key, value in obtained.items()), *clocks]),
             epoch_mono_ns=epoch.mono_ns,
@@ -224,7 +224,7 @@ class SiteProcess:
         self._say(f"{self._name}: the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
         self._report(self._timing.opening(), 0)
         if self._arm is not None and (text := self._arm.bind(self._scenario.sites[self._name].q0_rad)):
-            self._voice.say("arm", f"{self._name}: {text}")
+            self._publisher.publish("arm", f"{self._name}: {text}")
             clocks.append(text)
         for sentence in clocks:
             self._say(f"{self._name}: {sentence}")
@@ -262,7 +262,7 @@ class SiteProcess:
     def _join(self, give_up_ns: int) -> Epoch | None:
         """Waits for the others; None where a signal came first."""
         clock = self._clock
-        meeting = self._joining.meeting
+        meeting = self._joining.membership
         self._say(f"{self._name}: waiting for {', '.join(meeting.missing()) or 'the epoch'}")
         while not self._interrupt.requested():
             epoch = self._joining.poll()
@@ -283,24 +283,26 @@ class SiteProcess:
 
     def _slack(self, k: int, t_ns: int) -> None:
         """Ten times a second: answers questions, follows the leader's grid, and says who is gone."""
-        self._voice.info = msgspec.structs.replace(self._voice.info, ticks=k + 1)
-        self._voice.answer()
+        self._publisher.info = msgspec.structs.replace(self._publisher.info, ticks=k + 1)
+        self._publisher.answer_queries()
         self._report(self._timing.settle(k + 1, self._clock.monotonic_ns()), t_ns)
-        self._company.watch(self._voice, t_ns)
+        self._company.watch(self._publisher, t_ns)
 
     def _report(self, clocks: Iterable[ClockNotice], t_ns: int) -> None:
         """Says what is new of the peers' clocks."""
         for news in clocks:
-            self._voice.say(news.kind, news.text, t_ns=t_ns, **news.facts)
+            self._publisher.publish(news.kind, news.text, t_ns=t_ns, **news.facts)
 
     def _tell(self, output: TickRecord) -> None:
         """Says what a tick changed."""
         for text in output.cmd:
             said = f"{self._name} takes in {text}"
-            self._voice.say("change", said, t_ns=output.t_ns, ticks=output.tick, command=text)
+            self._publisher.publish("change", said, t_ns=output.t_ns, ticks=output.tick, command=text)
         if output.mode is not self._mode:
             self._mode = output.mode
-            self._voice.say("mode", describe_mode(self._name, output), t_ns=output.t_ns, ticks=output.tick)
+            self._publisher.publish(
+                "mode", describe_mode(self._name, output), t_ns=output.t_ns, ticks=output.tick
+            )
 
     def _leave(self, output: TickRecord | None) -> int:
         """Says how the run ended, and stays until the recorder has all of it."""
@@ -308,15 +310,15 @@ class SiteProcess:
         t_ns = -1 if output is None else output.t_ns
         if output is not None and output.mode is Mode.DIVERGED:
             self._failure = RunFailed(describe_divergence(self._name, output))
-            self._voice.say("diverged", str(self._failure), t_ns=t_ns, ticks=ticks)
+            self._publisher.publish("diverged", str(self._failure), t_ns=t_ns, ticks=ticks)
         elif self._failure is not None:
-            self._voice.say("failed", str(self._failure), t_ns=t_ns, ticks=ticks)
+            self._publisher.publish("failed", str(self._failure), t_ns=t_ns, ticks=ticks)
         if self._overtime is not None and (told := self._overtime.told()):
-            self._voice.say("law", told, t_ns=t_ns, ticks=ticks)
+            self._publisher.publish("law", told, t_ns=t_ns, ticks=ticks)
             self._say(f"{self._name}: {told}")
-        self._voice.say("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
+        self._publisher.publish("end", f"{self._name} made {ticks} ticks", t_ns=t_ns, ticks=ticks)
         code = self._interrupt.exit_code if self._interrupt.requested() else 0  # later signals end the wait
-        self._company.watch(self._voice, t_ns)
+        self._company.watch(self._publisher, t_ns)
         if topics.RECORDER in self._epoch.boots or self._company.recorders:
             self._await_recorders(ticks, t_ns)
         dropped = ", ".join(f"{count} {reason}" for reason, count in self._stats.dropped.items())
@@ -334,8 +336,8 @@ class SiteProcess:
         """Waits for the recorders; meanwhile answers them."""
 
         def attend() -> None:
-            self._voice.answer()
-            self._company.watch(self._voice, t_ns)
+            self._publisher.answer_queries()
+            self._company.watch(self._publisher, t_ns)
 
         stopped, stay_ns = self._interrupt.requested, int(self._options.stay_s * 1e9)
         await_recorders(self._company, self._history.answer, attend, self._clock, stopped, ticks, stay_ns)

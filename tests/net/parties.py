@@ -44,15 +44,15 @@ class Member:
         self.info = info
         self.bus = bus
         self.epoch: Epoch | None = None
-        self.voice = EventPublisher(bus, SESSION, info)
-        self.joining = SessionJoin(bus, clock, SESSION, self.voice, sites)
+        self.publisher = EventPublisher(bus, SESSION, info)
+        self.joining = SessionJoin(bus, clock, SESSION, self.publisher, sites)
 
     def poll(self) -> None:
         """One round of what a process does: join, and once it has the epoch, answer."""
         if self.epoch is None:
             self.epoch = self.joining.poll()
             if self.epoch is not None:
-                self.voice.info = msgspec.structs.replace(
+                self.publisher.info = msgspec.structs.replace(
                     self.info,
                     running=True,
                     epoch_mono_ns=self.epoch.mono_ns,
@@ -60,7 +60,7 @@ class Member:
                     boots=self.epoch.boots,
                 )
         else:
-            self.voice.answer()
+            self.publisher.answer_queries()
 
 
 class Party:

@@ -80,7 +80,7 @@ def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
     session.start(RECORDER)
     assert joined(session, LATE_GATHER_NS - 5 * STEP_NS) is None
     assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
-    assert set(session.members[RECORDER].joining.meeting.met) == {"m1", "m2"}
+    assert set(session.members[RECORDER].joining.membership.met) == {"m1", "m2"}
 
 
 def test_of_two_recorders_at_the_start_one_is_a_member_and_one_comes_late() -> None:
@@ -133,8 +133,8 @@ def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
 def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> None:
     session, _ = running()
     for name in SITES:
-        voice = session.members[name].voice
-        voice.info = msgspec.structs.replace(voice.info, **forged)
+        publisher = session.members[name].publisher
+        publisher.info = msgspec.structs.replace(publisher.info, **forged)
     session.start(RECORDER)
     with suppress(SessionError):  # a session that runs and does not say since when takes nobody in
         joined(session, 3 * LATE_GATHER_NS)
@@ -147,7 +147,7 @@ def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
     session.members["other"] = other
     session.start(RECORDER)
     assert joined(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
-    assert RECORDER not in session.members[RECORDER].joining.meeting.met
+    assert RECORDER not in session.members[RECORDER].joining.membership.met
 
 
 def test_a_site_still_does_not_come_late() -> None:

@@ -40,7 +40,7 @@ class Answering:
             fingerprint="f",
             running=running,
         )
-        self._voice = EventPublisher(self._bus, SESSION, info)
+        self._publisher = EventPublisher(self._bus, SESSION, info)
         questions = self._bus.questions(topics.key(SESSION, "s" if not deaf else "x", topics.SET))
         self._changes = ChangeServer(scenario, "s", questions)
         self._done = threading.Event()
@@ -49,7 +49,7 @@ class Answering:
 
     def _answer(self) -> None:
         while not self._done.wait(0.002):
-            self._voice.answer()
+            self._publisher.answer_queries()
             self._changes.take(100)
 
     def close(self) -> None:

@@ -100,7 +100,7 @@ def test_nobody_starts_without_start() -> None:
     while "epoch" not in session.kinds():
         session.round("m1")
         session.round("s")
-        session.members["m2"].voice.answer()
+        session.members["m2"].publisher.answer_queries()
     session.round("m2", "s")  # all are ready, and the leader says nothing
     assert session.kinds().count("ready") == 2
     for _ in range(10):
@@ -115,7 +115,7 @@ def test_who_is_not_ready_in_time_gets_another_attempt() -> None:
     session = party(*SITES)
     while "epoch" not in session.kinds():
         session.round("m1", "m2")
-        session.members["s"].voice.answer()  # s is there, and then hangs
+        session.members["s"].publisher.answer_queries()  # s is there, and then hangs
     for _ in range(EPOCH_AHEAD_NS // STEP_NS):
         session.round("m1", "m2")
     assert session.members["m1"].epoch is None
@@ -140,7 +140,7 @@ def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
     session.kill("s")
     session.rounds(100)
     assert [member.epoch for member in session.members.values()] == [None, None]
-    assert session.members["m1"].joining.meeting.missing() == ["s"]
+    assert session.members["m1"].joining.membership.missing() == ["s"]
     session.start("s")
     session.agreed()
 
@@ -160,7 +160,7 @@ def test_a_recorder_that_announces_itself_is_waited_for() -> None:
     session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")  # there, and not joining yet
     session.rounds(100)
     assert session.kinds() == []
-    assert session.members["m1"].joining.meeting.missing() == [RECORDER]
+    assert session.members["m1"].joining.membership.missing() == [RECORDER]
     session.stranger.close()
     session.agreed()
 
@@ -178,10 +178,10 @@ def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
 
 def test_missing_names_who_is_missing() -> None:
     session = party("m2")
-    assert session.members["m2"].joining.meeting.missing() == ["m1", "s"]
+    assert session.members["m2"].joining.membership.missing() == ["m1", "s"]
     session.start("s")
     session.rounds(30)
-    assert session.members["m2"].joining.meeting.missing() == ["m1"]
+    assert session.members["m2"].joining.membership.missing() == ["m1"]
 
 
 def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
@@ -205,7 +205,7 @@ def test_a_refusal_is_said_once_for_each_start() -> None:
     stubborn = session.member("s", scenario_sha256="a1" * 32)
     for _ in range(100):
         session.round()
-        stubborn.voice.answer()
+        stubborn.publisher.answer_queries()
     assert session.kinds() == ["refused"]
 
 
@@ -244,8 +244,8 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
     twins = [session.member("m1", boot=boot) for boot in (7, 9)]
     others = [session.member(name) for name in ("m2", "s")]
     for twin in twins:
-        take = twin.joining.meeting.take
-        twin.joining.meeting.take = lambda info, invited, take=take: (
+        take = twin.joining.membership.take
+        twin.joining.membership.take = lambda info, invited, take=take: (
             None if info.member == "m1" else take(info, invited=invited)
         )
     reasons = polled_until_refused(*twins, *others, clock=session.clock)
@@ -437,7 +437,7 @@ def test_an_answer_under_the_key_of_another_counts_for_nobody() -> None:
         while (question := asked.poll()) is not None:
             question.answer(encode(told("s", 1)))
         session.round()
-    assert session.members["m1"].joining.meeting.missing() == ["s"]
+    assert session.members["m1"].joining.membership.missing() == ["s"]
 
 
 def test_what_another_version_answers_is_remembered_for_the_error() -> None:
@@ -448,8 +448,8 @@ def test_what_another_version_answers_is_remembered_for_the_error() -> None:
         while (question := asked.poll()) is not None:
             question.answer(encode(newer))
         session.round()
-    assert session.members["m1"].joining.meeting.missing() == ["s"]
-    assert f"version {VERSION + 1}" in session.members["m1"].joining.meeting.unreadable["s"]
+    assert session.members["m1"].joining.membership.missing() == ["s"]
+    assert f"version {VERSION + 1}" in session.members["m1"].joining.membership.unreadable["s"]
 
 
 def test_boots_are_random_64_bit_numbers() -> None:

@@ -134,9 +134,9 @@ class Desk:
         self.tap = InboundQueue(self.clock)
         own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
         info = told(topics.RECORDER, scenario="", scenario_sha256="")
-        voice = EventPublisher(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
+        publisher = EventPublisher(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
         writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
-        self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, voice)
+        self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, publisher)
         self.report = RecorderReport(
             self.bus, self.clock, SESSION, info.boot, epoch, self.recording, self.tap, self.stream.tell
         )

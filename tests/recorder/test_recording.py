@@ -298,10 +298,10 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
             str,
         )
         site = told("m")
-        recorder._joining.meeting.met["x"] = msgspec.structs.replace(
+        recorder._joining.membership.met["x"] = msgspec.structs.replace(
             site, member="x", boot=5, scenario="garbage"
         )
-        recorder._joining.meeting.met["m"] = site
+        recorder._joining.membership.met["m"] = site
         recorder.record(EPOCH)
 
     def publish(clock: RelayClock) -> None:

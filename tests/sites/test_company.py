@@ -20,7 +20,7 @@ class Desk:
         self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
         bus = self.network.join()
         info = Info(member="m1", boot=1, scenario_sha256="", scenario="", host="", clock="", fingerprint="")
-        self._voice = EventPublisher(bus, "t", info)
+        self._publisher = EventPublisher(bus, "t", info)
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
         self.company.admit(BOOTS)
 
@@ -34,7 +34,7 @@ class Desk:
         self.network.join().publisher(topics.key("t", member, topics.EVENT))(encode(event))
 
     def told(self) -> Sequence[tuple[str, str]]:
-        self.company.watch(self._voice, 0)
+        self.company.watch(self._publisher, 0)
         return [(event.kind, event.about) for event in read_events(self._heard)]
 
 

@@ -38,7 +38,7 @@ def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
     assert [reach.info.member for reach in reached] == ["m", "recorder"]
     assert all(len(reach.rtts_ns) >= 10 for reach in reached)
     assert all(reach.shared and reach.estimate.bound_at(10**15, 0) == 0 for reach in reached)
-    assert party.members["m"].joining.meeting.missing() == ["s"]
+    assert party.members["m"].joining.membership.missing() == ["s"]
     party.start("s")
     party.agreed()
 

@@ -1,30 +1,184 @@
-"""Discovery of a session from outside.
+"""Discovery of a session from outside: find its members, connect to it, request a change.
 
-Connect to it, find its members, refuse a taken name, request a change.
-
-Invariant: a session name belongs to one session; a playback under a name that a site answers to is
-refused. A change is requested once, and the caller gets a reply or an error that names the member without
-one.
+Invariant: one way of asking who is present (`find_members`). A session name belongs to one session: a
+playback under a name that a site answers to is refused. A change is requested once, and the caller gets a
+reply or an error that names the member without one.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 
-from ..errors import SessionError, UsageError, WireError
+from ..errors import ScenarioError, SessionError, UsageError, WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock
 from .connection import Connection, default_endpoint, default_endpoints, open_bus
-from .membership import ASK_EVERY_NS
+from .membership import MemberQuery, liveliness_token
 from .messages import Info
-from .pinging import RepeatedQuery
 from .requests import ChangeReply, ChangeRequest
 from .wire import decode, encode
 
 POLL_NS = 5_000_000
-NAME_CHECK_NS = 700_000_000
-"""How long to look for others before anything is played: they try to connect every half a second."""
+REPLY_TIMEOUT_S = 3.0
+NAME_CHECK_S = 0.7
+"""Time to look for other sites before a playback: they try to connect every half a second."""
+
+SiteNamesOf = Callable[[str], tuple[str, ...]]
+"""Returns the sites that a scenario's text names, in order; raises ScenarioError if it is none."""
+
+
+def find_members(
+    bus: Bus, clock: Clock, session: str, *, stopped: Callable[[], bool], timeout_s: float | None
+) -> Iterator[Info]:
+    """Yields identities of members as they arrive, each again and again, until the time is over.
+
+    Args:
+        bus: a connection to the session.
+        clock: the time.
+        session: its name.
+        stopped: True once the caller should end.
+        timeout_s: how long to ask, s; None for as long as it takes.
+
+    Raises:
+        SessionError: the time is over, and all answers that arrived are unreadable.
+    """
+    query, found = MemberQuery(bus, clock, session), False
+    begun_ns = clock.monotonic_ns()
+    while not stopped() and (timeout_s is None or clock.monotonic_ns() - begun_ns < timeout_s * 1e9):
+        for info in query.poll():
+            found = True
+            yield info
+        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+    if query.unreadable and not found and not stopped():
+        member, reason = next(iter(query.unreadable.items()))
+        raise SessionError(f"the answer of {member} cannot be read: {reason}")
+
+
+@contextmanager
+def connect_to_session(
+    connection: Connection,
+    clock: Clock,
+    session: str,
+    names: SiteNamesOf,
+    *,
+    stopped: Callable[[], bool],
+    timeout_s: float | None,
+    say: Callable[[str], None] = lambda _: None,
+    recorder_boot: int | None = None,
+) -> Iterator[Bus | None]:
+    """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
+
+    Without endpoints to connect to, it asks the session's first site, on this machine, for the others.
+
+    Args:
+        connection: how to reach the session; its `connect` is None without endpoints.
+        clock: the time.
+        session: the session's name.
+        names: reads the sites from a scenario's text; if it returns none, the first site's endpoint remains.
+        stopped: True once the caller should end.
+        timeout_s: how long to wait for the first site, or for a router, s; None for as long as it takes.
+        say: prints a line for the user.
+        recorder_boot: boot of a recorder to announce meanwhile, so that the session waits for it.
+
+    Raises:
+        SessionError: no site or no router answers in time.
+        UsageError: an endpoint cannot be used.
+    """
+    with ExitStack() as stack:
+
+        def connect(there: Connection) -> Bus | None:
+            bus = open_bus(there, clock, stopped, timeout_s, say)
+            return None if bus is None else stack.enter_context(closing(bus))
+
+        if connection.connect is None:
+            first = default_endpoint(session, 0)
+            visitor = connect(replace(connection, listen=(), connect=[first]))
+            sites = None
+            if visitor is not None:
+                if recorder_boot is not None:
+                    visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
+                sites = _ask_for_sites(visitor, clock, session, names, stopped, timeout_s)
+            if sites is None:
+                yield None
+                return
+            connection = replace(
+                connection, connect=list(default_endpoints(session, sites).values()) or [first]
+            )
+        yield connect(connection)
+
+
+def _ask_for_sites(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    names: SiteNamesOf,
+    stopped: Callable[[], bool],
+    timeout_s: float | None,
+) -> tuple[str, ...] | None:
+    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=timeout_s):
+        try:
+            if info.scenario:
+                return names(info.scenario)
+        except ScenarioError:  # not a scenario of this program
+            continue
+    if stopped():
+        return None
+    raise SessionError(
+        f"no site of session {session!r} answered at {default_endpoint(session, 0)} within {timeout_s:g} s; "
+        "is that its name? name other endpoints with --connect"
+    )
+
+
+def request_change(
+    connection: Connection, clock: Clock, session: str, site: str, request: ChangeRequest, names: SiteNamesOf
+) -> ChangeReply:
+    """Requests a change from a site and returns its reply.
+
+    Args:
+        connection: how to reach the session, see `connect_to_session`.
+        clock: the time.
+        session: the session's name.
+        site: the site that carries the change out.
+        request: the change.
+        names: reads the sites from a scenario's text.
+
+    Raises:
+        SessionError: the session has no such site, has not begun, or the site does not reply.
+    """
+    with connect_to_session(
+        connection, clock, session, names, stopped=_never, timeout_s=REPLY_TIMEOUT_S
+    ) as bus:
+        assert bus is not None  # nothing stops it
+        info = _find_site(bus, clock, session, site, names)
+        if not info.running:
+            raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
+        replies = bus.ask(topics.key(session, site, topics.SET), encode(request))
+        give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+        while clock.monotonic_ns() < give_up_ns:
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+            if (reply := replies.poll()) is not None:
+                try:
+                    return decode(reply[1], ChangeReply)
+                except WireError as error:
+                    raise SessionError(f"the answer of {site} cannot be read: {error}") from None
+    raise SessionError(f"{site} gave no answer; its records show whether it made the change")
+
+
+def _never() -> bool:
+    return False
+
+
+def _find_site(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
+    for info in find_members(bus, clock, session, stopped=_never, timeout_s=REPLY_TIMEOUT_S):
+        if info.member == site:
+            return info
+        sites = names(info.scenario) if info.scenario else ()
+        if sites and site not in sites:
+            raise SessionError(f"session {session!r} has no site {site!r}; its sites are {', '.join(sites)}")
+    raise SessionError(
+        f"site {site!r} of session {session!r} does not answer; other endpoints are named with --connect"
+    )
 
 
 def open_playback_bus(
@@ -34,7 +188,12 @@ def open_playback_bus(
     stopped: Callable[[], bool],
     say: Callable[[str], None],
 ) -> Bus | None:
-    """Returns the connection; who has its port may be the session whose name is taken."""
+    """Returns the bus of a playback; None if `stopped`.
+
+    Raises:
+        SessionError: the session of that name is running and holds the port.
+        UsageError: an endpoint cannot be used.
+    """
     try:
         return open_bus(connection, clock, stopped, None, say)
     except UsageError:
@@ -49,124 +208,15 @@ def open_playback_bus(
 
 
 def refuse_running_session(bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]) -> None:
-    """Looks for sites that answer to a session's name.
+    """Refuses a session name that a site answers to.
 
     Raises:
-        SessionError: there are.
+        SessionError: a site of that session answers.
     """
-    asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
-    until_ns, asked_ns = clock.monotonic_ns() + NAME_CHECK_NS, clock.monotonic_ns() - ASK_EVERY_NS
-    while clock.monotonic_ns() < until_ns and not stopped():
-        if clock.monotonic_ns() - asked_ns >= ASK_EVERY_NS:
-            asked_ns = asking.ask()
-        info = _answering_site(asking)
-        if info is not None:
-            doing = f"runs; {info.member} is at tick {info.ticks}" if info.running else "waits to begin"
+    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
+        if info.member != topics.RECORDER:
+            state = f"runs; {info.member} is at tick {info.ticks}" if info.running else "waits to begin"
             raise SessionError(
-                f"session {session!r} is there already and {doing}; play under another name with "
+                f"session {session!r} is there already and {state}; play under another name with "
                 "--prefix or --session"
             )
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-
-
-def _answering_site(replies: RepeatedQuery) -> Info | None:
-    """Returns a site of a running or waiting session that has answered, or None."""
-    while (answer := replies.poll()) is not None:
-        try:
-            info = decode(answer.payload, Info)
-        except WireError:
-            continue  # a stranger's
-        if info.member != topics.RECORDER:
-            return info
-    return None
-
-
-REPLY_TIMEOUT_S = 3.0
-
-SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Gives the sites that a scenario's text names, in order."""
-
-
-def request_change(
-    connection: Connection, clock: Clock, session: str, site: str, order: ChangeRequest, names: SiteNamesOf
-) -> ChangeReply:
-    """Asks a site for a change and returns its answer.
-
-    Args:
-        connection: how to reach the session; without endpoints to connect to, on this machine.
-        clock: the time.
-        session: the session's name.
-        site: who is to do it.
-        order: the change.
-        names: reads a scenario's text.
-
-    Raises:
-        SessionError: the session has no such site, has not begun, or nobody answers.
-    """
-    if connection.connect is None:
-        with closing(
-            _open_client(replace(connection, connect=[default_endpoint(session, 0)]), clock)
-        ) as first:
-            members = names(_any_site_info(first, clock, session).scenario)
-        connection = replace(connection, connect=list(default_endpoints(session, members).values()))
-    with closing(_open_client(connection, clock)) as bus:
-        info = _site_info(bus, clock, session, site, names)
-        if not info.running:
-            raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
-        return _send_change(bus, clock, topics.key(session, site, topics.SET), site, order)
-
-
-def _open_client(connection: Connection, clock: Clock) -> Bus:
-    bus = open_bus(connection, clock, lambda: False, REPLY_TIMEOUT_S, lambda _: None)
-    assert bus is not None  # nothing stops it
-    return bus
-
-
-def _member_infos(bus: Bus, clock: Clock, session: str) -> Iterator[Info]:
-    """Yields what members say of themselves, for `PATIENCE_S`."""
-    asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
-    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-    while clock.monotonic_ns() < give_up_ns:
-        again_ns = asking.ask() + ASK_EVERY_NS
-        while clock.monotonic_ns() < again_ns:
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-            while (answer := asking.poll()) is not None:
-                try:
-                    yield decode(answer.payload, Info)
-                except WireError as error:
-                    raise SessionError(f"the answer of {answer.key} cannot be understood: {error}") from None
-
-
-def _any_site_info(bus: Bus, clock: Clock, session: str) -> Info:
-    """Returns what any site says of itself."""
-    for info in _member_infos(bus, clock, session):
-        if info.scenario:
-            return info
-    raise SessionError(
-        f"no site of session {session!r} answers; is that its name? name endpoints with --connect"
-    )
-
-
-def _site_info(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
-    """Returns what a site says of itself."""
-    sites: tuple[str, ...] = ()
-    for info in _member_infos(bus, clock, session):
-        if info.member == site:
-            return info
-        sites = names(info.scenario) if info.scenario else sites
-        if sites and site not in sites:
-            raise SessionError(f"session {session!r} has no site {site!r}; its sites are {', '.join(sites)}")
-    raise SessionError(f"site {site!r} of session {session!r} does not answer")
-
-
-def _send_change(bus: Bus, clock: Clock, key: str, site: str, order: ChangeRequest) -> ChangeReply:
-    replies = bus.ask(key, encode(order))
-    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-    while clock.monotonic_ns() < give_up_ns:
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-        if (reply := replies.poll()) is not None:
-            try:
-                return decode(reply[1], ChangeReply)
-            except WireError as error:
-                raise SessionError(f"the answer of {site} cannot be understood: {error}") from None
-    raise SessionError(f"{site} gave no answer; whether it took the change in, its records tell")

@@ -1,6 +1,4 @@
-"""Session membership.
-
-Boots, liveliness tokens, event publishers, who is present, and late join of a recorder.
+"""Session membership: boots, liveliness tokens, events, who is present, and late join of a recorder.
 
 Invariant: a different scenario, a running session and a second start of the same member are refused at
 the first exchange; replies of strangers are ignored and kept for the error message. A recorder may join a
@@ -10,7 +8,7 @@ not join late: their arm would be in the wrong place.
 """
 
 import secrets
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -20,22 +18,22 @@ from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info
-from .pinging import Pinger, RepeatedQuery
+from .pinging import QUERY_EVERY_NS, Pinger, RepeatedQuery
 from .wire import decode, encode
 
 
 def new_boot() -> int:
-    """Returns a random number that names one start of one process."""
+    """Returns a random 64-bit number that names one start of one process."""
     return secrets.randbits(64)
 
 
 def liveliness_token(session: str, member: str, boot: int) -> str:
-    """Returns the liveliness token of one start of a member."""
+    """Returns the key of the liveliness token of one start of a member."""
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
 
 def read_events(inbox: Inbox) -> Iterator[Event]:
-    """Yields the events that wait in a ring; what is none of ours is passed over."""
+    """Yields the events that wait in a ring; skips other payloads."""
     while (message := inbox.poll()) is not None:
         try:
             yield decode(message[1], Event)
@@ -44,88 +42,122 @@ def read_events(inbox: Inbox) -> Iterator[Event]:
 
 
 class EventPublisher:
-    """A member's own events and answers.
+    """Publishes a member's events and answers queries for its identity.
 
     Args:
-        bus: its connection.
+        bus: the member's connection.
         session: the session's name.
-        info: what it answers when asked who it is.
-        keep: takes every event as it is published.
+        info: the member's identity.
+        keep: takes the payload of every event.
 
     Attributes:
-        info: what it answers when asked who it is.
-        said: how many events it has published.
+        info: the identity that it answers with.
+        published: number of events so far.
     """
 
     def __init__(
         self, bus: Bus, session: str, info: Info, keep: Callable[[bytes], None] = lambda _: None
     ) -> None:
         self.info = info
-        self.said = 0
+        self.published = 0
         self._keep = keep
         self._publish = bus.publisher(topics.key(session, info.member, topics.EVENT))
-        self._questions = bus.questions(topics.key(session, info.member, topics.INFO))
+        self._queries = bus.questions(topics.key(session, info.member, topics.INFO))
 
-    def say(self, kind: str, text: str, **facts: object) -> Event:
-        """Publishes an event, numbered, and returns it."""
-        own = {"member": self.info.member, "boot": self.info.boot, "n": self.said}
-        event = msgspec.convert({**own, "kind": kind, "text": text, **facts}, Event)
-        self.said += 1
+    def publish(self, kind: str, text: str, **fields: object) -> Event:
+        """Publishes a numbered event and returns it."""
+        own = {"member": self.info.member, "boot": self.info.boot, "n": self.published}
+        event = msgspec.convert({**own, "kind": kind, "text": text, **fields}, Event)
+        self.published += 1
         payload = encode(event)
         self._keep(payload)
         self._publish(payload)
         return event
 
-    def answer(self) -> None:
-        """Answers who asks who this is."""
-        while (question := self._questions.poll()) is not None:
-            question.answer(encode(self.info))
+    def update(self, **fields: object) -> None:
+        """Changes fields of the identity."""
+        self.info = msgspec.structs.replace(self.info, **fields)
+
+    def answer_queries(self) -> None:
+        """Answers every query for the identity that waits."""
+        while (query := self._queries.poll()) is not None:
+            query.answer(encode(self.info))
 
 
-ASK_EVERY_NS = 200_000_000
+ASK_EVERY_NS = QUERY_EVERY_NS
+
+
+class MemberQuery:
+    """Asks the members of a session for their identities, again and again.
+
+    Attributes:
+        unreadable: by member, why its answer cannot be read.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+        self.unreadable: dict[str, str] = {}
+        self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
+
+    def poll(self) -> Iterator[Info]:
+        """Yields the answers that have arrived; repeats the query when it is due."""
+        while (reply := self._query.poll()) is not None:
+            parts = topics.parse_key(reply.key)
+            if parts is None:
+                continue
+            try:
+                info = decode(reply.payload, Info)
+            except WireError as error:  # another version of this program, or a stranger
+                self.unreadable[parts.member] = str(error)
+                continue
+            if parts.member == info.member:
+                yield info
+        self._query.repeat()
 
 
 class Membership:
-    """What one member knows of the others.
+    """The other members of a session, as one member knows them.
 
     Args:
-        bus: its connection.
+        bus: the member's connection.
         clock: the time.
         session: the session's name.
-        voice: its own events and answers.
-        sites: the sites of the scenario, in order; empty for a member that learns them (the recorder).
+        publisher: the member's own events and identity.
+        sites: the sites of the scenario, in order; empty for a recorder, which learns them.
 
     Attributes:
-        met: what the others said of themselves, by name.
-        unreadable: whose answer could not be understood, and why.
+        met: identities of the others, by name.
         gone: boots of the members that have disappeared.
     """
 
     def __init__(
-        self, bus: Bus, clock: Clock, session: str, voice: EventPublisher, sites: Sequence[str]
+        self, bus: Bus, clock: Clock, session: str, publisher: EventPublisher, sites: Sequence[str]
     ) -> None:
         self.met: dict[str, Info] = {}
-        self.unreadable: dict[str, str] = {}
         self.gone: set[str] = set()
-        self._clock, self._session, self._voice, self._sites = clock, session, voice, tuple(sites)
+        self._session, self._publisher, self._sites = session, publisher, tuple(sites)
         self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
-        self._asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
-        self._asked_ns = -ASK_EVERY_NS
+        self._query = MemberQuery(bus, clock, session)
         self._refused: set[int] = set()
         self._recorders: set[str] = set()
 
     @property
     def own(self) -> Info:
-        """What this member says of itself."""
-        return self._voice.info
+        """The member's own identity."""
+        return self._publisher.info
 
     @property
     def leads(self) -> bool:
-        """True where this member is the first site of the scenario."""
+        """True if this member is the first site of the scenario."""
         return self._sites[:1] == (self.own.member,)
 
+    @property
+    def unreadable(self) -> dict[str, str]:
+        """By name of a member of the session, why its answer cannot be read."""
+        members = (*self._sites, topics.RECORDER)
+        return {name: reason for name, reason in self._query.unreadable.items() if name in members}
+
     def boots(self) -> dict[str, int]:
-        """Returns the boots of all who are there, oneself among them."""
+        """Returns the boots of all members present, including its own."""
         return {name: info.boot for name, info in self.met.items()} | {self.own.member: self.own.boot}
 
     def clocks(self) -> dict[str, str]:
@@ -135,39 +167,38 @@ class Membership:
     def missing(self) -> list[str]:
         """Returns the members that have not been met."""
         needed = any(info.needs_recorder for info in (self.own, *self.met.values()))
-        recorder = needed or bool(self._recorders)
-        wanted = [*self._sites, *([topics.RECORDER] if recorder else [])]
-        return [name for name in wanted if name != self.own.member and name not in self.met]
+        recorder = [topics.RECORDER] if needed or self._recorders else []
+        return [
+            name for name in (*self._sites, *recorder) if name != self.own.member and name not in self.met
+        ]
 
     def poll(self, *, invited: bool) -> None:
-        """Asks again and again who is there, takes the answers, and forgets who is gone.
+        """Takes answers, repeats the query, and forgets members that are gone.
 
         Args:
-            invited: whether this member has said ready: then others may begin before it knows.
+            invited: whether this member has sent `ready`: then others may begin before it knows.
 
         Raises:
-            SessionError: this member cannot be part of the session, and why.
+            SessionError: this member cannot be part of the session.
         """
-        now_ns = self._clock.monotonic_ns()
-        while (answer := self._asking.poll()) is not None:
-            where = topics.parse_key(answer.key)
-            try:
-                info = decode(answer.payload, Info)
-            except WireError as error:  # another version of us, or a stranger: no reason to leave
-                if where is not None and where.member in (*self._sites, topics.RECORDER):
-                    self.unreadable[where.member] = str(error)
+        for info in self._query.poll():
+            self.take(info, invited=invited)
+        while (change := self._presence.poll()) is not None:
+            parts, alive = topics.parse_key(change[0]), change[1]
+            if parts is None:
                 continue
-            if where is not None and where.member == info.member:
-                self.take(info, invited=invited)
-        if now_ns - self._asked_ns >= ASK_EVERY_NS:
-            self._asked_ns = self._asking.ask()
-        self._watch()
+            if parts.member == topics.RECORDER:
+                (self._recorders.add if alive else self._recorders.discard)(parts.boot)
+            (self.gone.discard if alive else self.gone.add)(parts.boot)
+            met = self.met.get(parts.member)
+            if not alive and met is not None and str(met.boot) == parts.boot:
+                del self.met[parts.member]
 
     def take(self, info: Info, *, invited: bool) -> None:
-        """Takes what a member says of itself.
+        """Takes the identity of a member.
 
         Raises:
-            SessionError: this member cannot be part of the session, and why.
+            SessionError: this member cannot be part of the session.
         """
         own = self.own
         if info.boot == own.boot or (not self._sites and info.member == topics.RECORDER):
@@ -181,18 +212,13 @@ class Membership:
         if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
             self._refuse(info)
             return
-        if info.member == topics.RECORDER and self._has_recorder(info):
-            return
+        if info.member == topics.RECORDER and self.met.get(info.member, info).boot != info.boot:
+            return  # of several recorders the first one met is the member
         if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
             self.met[info.member] = info
 
-    def _has_recorder(self, info: Info) -> bool:
-        """True where another recorder was met before, which is still there: the first one is the member."""
-        met = self.met.get(topics.RECORDER)
-        return met is not None and met.boot != info.boot
-
     def _refuse(self, info: Info) -> None:
-        """The leader's scenario is the session's: others leave, and the leader says why."""
+        """Leaves the session of a leader with another scenario; as the leader, publishes a refusal."""
         own = self.own
         text = (
             f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
@@ -202,56 +228,40 @@ class Membership:
             raise SessionError(f"{text}; the one of {info.member}, who leads, counts")
         if self.leads and info.boot not in self._refused:
             self._refused.add(info.boot)
-            self._voice.say("refused", text, about=info.member)
-
-    def _watch(self) -> None:
-        """Notes recorders that announce themselves, and forgets members that are gone."""
-        while (change := self._presence.poll()) is not None:
-            key, alive = change
-            where = topics.parse_key(key)
-            if where is None:
-                continue
-            if where.member == topics.RECORDER:
-                (self._recorders.add if alive else self._recorders.discard)(where.boot)
-            (self.gone.discard if alive else self.gone.add)(where.boot)
-            if alive:
-                continue
-            met = self.met.get(where.member)
-            if met is not None and str(met.boot) == where.boot:
-                del self.met[where.member]
+            self._publisher.publish("refused", text, about=info.member)
 
 
 LATE_GATHER_NS = 1_500_000_000
-"""How long to wait for the other members of a session whose first has been met."""
+"""Time to wait for the other members of a running session after the first one is met."""
 
 
 class RunningSession(NamedTuple):
-    """Tick 0 of a running session, on the own clock as it stands now against the member's, and the boots."""
+    """Tick 0 of a running session, on the own clock and in Unix time, and its boots."""
 
     mono_ns: int
     unix_ns: int
-    boots: dict[str, int]
+    boots: Mapping[str, int]
 
 
 class LateJoin:
-    """A recorder's eye for sessions that run.
+    """Finds the epoch of a session that is already running, for a recorder."""
 
-    Args:
-        meeting: who has been met.
-        pinger: where clocks stand.
-    """
-
-    def __init__(self, meeting: Membership, pinger: Pinger) -> None:
-        self._meeting, self._pinger = meeting, pinger
+    def __init__(self, membership: Membership, pinger: Pinger) -> None:
+        self._membership, self._pinger = membership, pinger
         self._first_ns: int | None = None
 
     def poll(self, now_ns: int) -> RunningSession | None:
-        """Returns the session's beginning, once all its members that are there have been met.
+        """Returns the session once all its members that are present have been met.
 
         Args:
             now_ns: the own clock.
         """
-        running = self._running()
+        infos = [
+            info
+            for _, info in sorted(self._membership.met.items())
+            if info.running and info.scenario and info.boots.get(info.member) == info.boot
+        ]
+        running = [info for info in infos if info.boots == infos[0].boots]
         if not running:
             self._first_ns = None
             return None
@@ -260,27 +270,10 @@ class LateJoin:
         sites = set(running[0].boots) - {topics.RECORDER}
         if {info.member for info in running} < sites and now_ns - self._first_ns < LATE_GATHER_NS:
             return None
-        return self._beginning(running, now_ns)
-
-    def _running(self) -> list[Info]:
-        """Returns what the members of one running session say of themselves."""
-        infos = [
-            info
-            for _, info in sorted(self._meeting.met.items())
-            if info.running and info.scenario and info.boots.get(info.member) == info.boot
-        ]
-        return [info for info in infos if info.boots == infos[0].boots]
-
-    def _beginning(self, running: Collection[Info], now_ns: int) -> RunningSession | None:
-        """Returns the epoch by a clock that is the own one, or else by one that is known."""
-        own = self._meeting.own.clock
+        own = self._membership.own.clock
         for info in sorted(running, key=lambda info: info.clock != own):
-            if info.clock == own:
-                offset_ns = 0
-            elif self._pinger.know([info.boot]):
-                # as the clocks stand now: what they drifted apart since the epoch is nobody's to know
-                offset_ns = self._pinger.estimate(info.boot).offset_at(now_ns)
-            else:
-                continue
-            return RunningSession(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, dict(info.boots))
+            if info.clock == own or self._pinger.know([info.boot]):
+                # as the clocks stand now: their drift apart since the epoch is unknown
+                offset_ns = 0 if info.clock == own else self._pinger.estimate(info.boot).offset_at(now_ns)
+                return RunningSession(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
         return None

@@ -20,6 +20,8 @@ from .requests import Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
+QUERY_EVERY_NS = 200_000_000
+"""Between two queries for identities."""
 
 
 class QueryReply(NamedTuple):
@@ -31,26 +33,27 @@ class QueryReply(NamedTuple):
 
 
 class RepeatedQuery:
-    """All that is asked under one key expression.
-
-    Args:
-        bus: the asker's connection.
-        clock: its time.
-        key: the key expression.
-    """
+    """A query that is sent again and again; answers to the last QUERIES_KEPT of them count."""
 
     def __init__(self, bus: Bus, clock: Clock, key: str) -> None:
         self._bus, self._clock, self._key = bus, clock, key
         self._open: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def ask(self) -> int:
-        """Asks once more, and returns when, ns."""
+        """Sends the query and returns the time, ns."""
         asked_ns = self._clock.monotonic_ns()
         self._open.append((asked_ns, self._bus.ask(self._key)))
         return asked_ns
 
+    def repeat(self, every_ns: int = QUERY_EVERY_NS) -> bool:
+        """Sends the query if the last one is that long ago; True if so."""
+        due = not self._open or self._clock.monotonic_ns() - self._open[-1][0] >= every_ns
+        if due:
+            self.ask()
+        return due
+
     def poll(self) -> QueryReply | None:
-        """Returns an answer that has come, or None; never waits."""
+        """Returns an answer that has arrived, or None; never waits."""
         for asked_ns, inbox in self._open:
             if (reply := inbox.poll()) is not None:
                 return QueryReply(asked_ns, *reply)
