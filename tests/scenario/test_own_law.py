@@ -118,7 +118,7 @@ def test_a_file_that_was_edited_while_the_program_runs_is_taken_as_it_is_now(fol
     for value in ("1", "2.5"):
         file.write_text(text.format(value))
         site = Site(load_scenario("two_sites", {"control.law": "edited_law:Law"}).setup("s"))
-        made.append(site._own.theta_hat0)
+        made.append(site._user_law.theta_hat0)
     assert made == [1, 2.5]
 
 

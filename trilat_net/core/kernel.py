@@ -5,13 +5,14 @@ as well. The arm advances one period by the classical Runge-Kutta method of four
 stages evaluates operators and environments, and what is held over the period is constant.
 """
 
-import math
+from math import isfinite
 
 from . import control
 from .dominance import update_reference
 from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .jit import leaf
-from .link import accept_sample, recall_sample
+from .link import LinkArrays, accept_sample, recall_sample, release_tick
+from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme
 from .ticks import Mode, tick_ns
 from .two_link_arm import forward_dynamics, regressor
@@ -36,7 +37,7 @@ def _acceleration(
     acts: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
-    """Returns qdd at one stage, under the held u and what acts at that stage's time and state."""
+    """Returns qdd at one stage: under the held u, and the actors at that stage's time and state."""
     on_arm = torque_on_arm(t_s, q, qd, lengths, acts, table, 0)
     return forward_dynamics(theta, g, q, qd, (on_arm[0] + u[0], on_arm[1] + u[1]))
 
@@ -54,19 +55,9 @@ def rk4_step(
     acts: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Returns q and qd one period later, Eq. (8).
+    """Returns q and qd one period of h_s later, Eq. (8).
 
-    Args:
-        t_s: time at the start of the period, s since the epoch.
-        h_s: the period, s.
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        u: torque held over the period, control and sampled actors, shape (2,), N m.
-        theta: the arm's parameters, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        lengths: of the two links, m.
-        acts: operators and environments, see `exogenous`.
-        table: their recorded torques.
+    u, shape (2,), N m, is the torque that is held over the period: control and sampled actors.
     """
     half, sixth = 0.5 * h_s, h_s / 6.0
     q1, v1 = (q[0], q[1]), (qd[0], qd[1])
@@ -88,7 +79,7 @@ _ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
 
 
 @leaf
-def _estimate(k: int, site: Row) -> None:
+def _update_estimate(k: int, site: Row) -> None:
     """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
     if site.scheme == _DIGITAL or k == 0 or site.mode == _DIVERGED or site.law != _ADAPTIVE:
         return
@@ -100,7 +91,7 @@ def _estimate(k: int, site: Row) -> None:
 
 @leaf
 def torque_stage(site: RowArray) -> None:
-    """Stage 6 of a tick: the torque of the site's law, unless that is somebody's own."""
+    """Stage 6 of a tick: the torque of the site's law; a user's law runs in Python instead."""
     s: Row = site[0]
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
@@ -115,7 +106,7 @@ def torque_stage(site: RowArray) -> None:
 
 
 @leaf
-def _errors_and_regressor(site: Row) -> None:
+def _update_errors(site: Row) -> None:
     """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
     q, qd, Lambda = pair(site.q), pair(site.qd), pair(site.Lambda)
     e, ed, r = control.control_errors(q, qd, site.q_des, site.qd_des, Lambda)
@@ -131,24 +122,8 @@ def _errors_and_regressor(site: Row) -> None:
 
 
 @leaf
-def _finite(q: Pair, qd: Pair) -> bool:
-    """True while the arm's state is made of numbers that a record can hold."""
-    return math.isfinite(q[0]) and math.isfinite(q[1]) and math.isfinite(qd[0]) and math.isfinite(qd[1])
-
-
-@leaf
-def _within_limits(site: Row) -> bool:
-    """True while every joint speed is within the divergence stop."""
-    within: bool = abs(site.qd[0]) <= site.qd_limit and abs(site.qd[1]) <= site.qd_limit
-    return within
-
-
-@leaf
-def _emit(site: Row, row: Array) -> None:
-    """Writes the record's floats in the order of EMITTED.
-
-    A record holds finite numbers: where the arithmetic has left them, the run has diverged, and 0 stands.
-    """
+def _write_record(site: Row, row: Array) -> None:
+    """Writes the record's floats, see `ROW_FLOATS`; a number that is not finite diverges the run and is 0."""
     n = site.q.shape[0]
     for i in range(n):
         row[i] = site.q[i]
@@ -160,14 +135,14 @@ def _emit(site: Row, row: Array) -> None:
     for p in range(site.theta_hat.shape[0]):
         row[6 * n + p] = site.theta_hat[p]
     for i in range(row.shape[0]):
-        if not math.isfinite(row[i]):
+        if not isfinite(row[i]):
             row[i] = 0.0
             site.mode = _DIVERGED
 
 
 @leaf
-def _feel(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
-    """Writes what acts on the arm now, and what of it is held over the tick."""
+def _update_external_torque(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
+    """Writes the torque of operators and environments now, and the part of it that is held over the tick."""
     t_s, q, qd, lengths = t_ns * 1e-9, pair(site.q), pair(site.qd), pair(site.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
     now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
@@ -177,7 +152,7 @@ def _feel(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) ->
 
 @leaf
 def _held_torque(k: int, site: Row, i: int) -> float:
-    """Returns what pushes a joint through the period: the torque at its middle, and what is held."""
+    """Returns the constant torque on a joint over the period: control at mid-period, and sampled sources."""
     torque: float = site.tau[i]
     if site.scheme != _DIGITAL and k > 0:
         torque = control.limit_torque(1.5 * site.tau[i] - 0.5 * site.tau_before[i], site.tau_limit)
@@ -187,7 +162,7 @@ def _held_torque(k: int, site: Row, i: int) -> float:
 
 @leaf
 def _advance(k: int, t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
-    """Stage 8: carries the state from t_k to t_{k+1} and remembers what tick k+1 needs of tick k."""
+    """Stage 8: advances the state from t_k to t_{k+1} and keeps what tick k+1 needs of tick k."""
     s = site
     h_s = 1.0 / s.rate_hz
     if s.external == 0:
@@ -195,7 +170,7 @@ def _advance(k: int, t_ns: int, site: Row, actors: TorqueSourceRows, table: Torq
         q, qd = rk4_step(
             t_ns * 1e-9, h_s, pair(s.q), pair(s.qd), u, five(s.theta), s.g, pair(s.lengths), actors, table
         )
-        if _finite(q, qd):
+        if isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1]):
             put_pair(s.q, q)
             put_pair(s.qd, qd)
         else:
@@ -208,82 +183,56 @@ def _advance(k: int, t_ns: int, site: Row, actors: TorqueSourceRows, table: Torq
 
 
 @leaf
-def accept_stage(
-    k: int,
-    count: int,
-    site: RowArray,
-    links: RowArray,
-    models: RowArray,
-    samples: RowArray,
-    calendars: IntArray,
-    points: Points,
-    arrivals: RowArray,
-    forces: Array,
-) -> None:
-    """Stage 1: takes the first `count` arrivals into their links; arguments as in `site_tick`."""
-    rate_hz = site[0].rate_hz
+def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
+    """Returns the arrays of the link from one peer."""
+    state = arrays.links[peer : peer + 1]
+    return LinkArrays(state, arrays.models[peer], arrays.samples[peer], arrays.calendars[peer], arrays.points)
+
+
+@leaf
+def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
+    """Returns the site's tick that releases a peer's sample, or LOST; see `release_tick`."""
+    return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
+
+
+@leaf
+def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
+    """Stage 1: files the first `count` arrivals in their links."""
+    rate_hz = arrays.site[0].rate_hz
     for n in range(count):
-        arrival: Row = arrivals[n]
-        j = arrival.peer
-        tick, q, qd = arrival.tick, arrival.q, arrival.qd
-        accept_sample(
-            k, rate_hz, tick, q, qd, forces[n], links[j], models[j], samples[j], calendars[j], points
-        )
+        arrival: Row = buffers.arrivals[n]
+        link = link_arrays(arrays, arrival.peer)
+        accept_sample(k, rate_hz, arrival.tick, arrival.q, arrival.qd, buffers.forces[n], link)
 
 
 @leaf
-def follow_stages(
-    k: int,
-    t_ns: int,
-    site: RowArray,
-    links: RowArray,
-    models: RowArray,
-    samples: RowArray,
-    calendars: IntArray,
-    points: Points,
-    ramps: Array,
-) -> None:
-    """Stages 2 to 5 of a tick, with its arrivals in their links; arguments as in `site_tick`."""
-    s: Row = site[0]
-    for j in range(links.shape[0]):  # 2 recall
-        recall_sample(k, s.rate_hz, links[j], models[j], samples[j], calendars[j], points)
-    update_reference(t_ns, s, links, ramps)  # 3 reference
-    _errors_and_regressor(s)  # 4 errors
-    _estimate(k, s)  # 5 estimate
+def follow_stages(k: int, t_ns: int, arrays: SiteArrays) -> None:
+    """Stages 2 to 5 of a tick, with its arrivals in their links."""
+    s: Row = arrays.site[0]
+    for j in range(arrays.links.shape[0]):  # 2 recall
+        recall_sample(k, s.rate_hz, link_arrays(arrays, j))
+    update_reference(t_ns, s, arrays.links, arrays.ramps)  # 3 reference
+    _update_errors(s)  # 4 errors
+    _update_estimate(k, s)  # 5 estimate
 
 
 @leaf
-def sense_stages(
-    k: int,
-    t_ns: int,
-    count: int,
-    site: RowArray,
-    links: RowArray,
-    models: RowArray,
-    samples: RowArray,
-    calendars: IntArray,
-    points: Points,
-    ramps: Array,
-    arrivals: RowArray,
-    forces: Array,
-) -> None:
-    """Stages 1 to 5 of a tick: what came in, the reference, the errors, the estimate; see `site_tick`."""
-    accept_stage(k, count, site, links, models, samples, calendars, points, arrivals, forces)
-    follow_stages(k, t_ns, site, links, models, samples, calendars, points, ramps)
+def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
+    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate."""
+    accept_stage(k, count, arrays, buffers)
+    follow_stages(k, t_ns, arrays)
 
 
 @leaf
-def act_stages(
-    k: int, t_ns: int, site: RowArray, actors: TorqueSourceRows, table: TorqueTable, row: Array
-) -> None:
-    """Stages 7 and 8 of a tick, with the torque in place: the record, and the way to the next tick."""
-    s: Row = site[0]
-    _feel(t_ns, s, actors, table)
-    if not _within_limits(s):
+def act_stages(k: int, t_ns: int, arrays: SiteArrays, record: Array) -> None:
+    """Stages 7 and 8 of a tick, with the torque in place: the record, and the step to the next tick."""
+    s: Row = arrays.site[0]
+    _update_external_torque(t_ns, s, arrays.actors, arrays.table)
+    if not (abs(s.qd[0]) <= s.qd_limit and abs(s.qd[1]) <= s.qd_limit):
         s.mode = _DIVERGED
-    _emit(s, row)  # 7 emit
+    _write_record(s, record)  # 7 emit
     if s.mode != _DIVERGED:  # 8 advance
-        _advance(k, t_ns, s, actors, table)
+        _advance(k, t_ns, s, arrays.actors, arrays.table)
 
 
 @leaf
@@ -298,42 +247,29 @@ def site_tick(
     calendars: IntArray,
     points: Points,
     ramps: Array,
-    arrivals: RowArray,
-    forces: Array,
     actors: TorqueSourceRows,
     table: TorqueTable,
-    row: Array,
+    arrivals: RowArray,
+    forces: Array,
+    record: Array,
 ) -> None:
-    """Computes one tick of one site; what `Site.step` and the virtual-time kernel both call.
+    """Computes tick k of one site at t_ns, ns since the epoch, with its first `count` arrivals.
 
-    Args:
-        k: the tick.
-        t_ns: its time, ns since the epoch.
-        count: how many rows of `arrivals` are filled.
-        site: the site's state and constants, one row of dtype SITE, shape (1,).
-        links: one row per peer, shape (P,), dtype LINK.
-        models: what the links' channels do, shape (P, M), dtype MODEL.
-        samples: where samples wait, shape (P, pages), dtype SAMPLE.
-        calendars: the links' calendars, shape (P, pages).
-        points: traces and outages, shape (n, 2).
-        ramps: how shares change, shape (R, 2 + P), see `shares`.
-        arrivals: what came in, shape (MAX_ARRIVALS,), dtype ARRIVAL.
-        forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, n), N m.
-        actors: operators and environments, shape (A,), dtype ACTOR.
-        table: their recorded torques.
-        row: the record's floats in the order of EMITTED, shape (ROW_FLOATS,); written.
+    It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as tuples they would
+    cost more than a microsecond.
     """
-    sense_stages(k, t_ns, count, site, links, models, samples, calendars, points, ramps, arrivals, forces)
+    arrays = SiteArrays(site, links, models, samples, calendars, points, ramps, actors, table)
+    sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, record))
     torque_stage(site)  # 6 torque
-    act_stages(k, t_ns, site, actors, table, row)
+    act_stages(k, t_ns, arrays, record)
 
 
 @leaf
-def resume_stages(k: int, site: RowArray, actors: TorqueSourceRows, table: TorqueTable) -> None:
+def resume_stages(k: int, arrays: SiteArrays) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
-    s: Row = site[0]
+    s: Row = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
-    _errors_and_regressor(s)
-    _feel(t_ns, s, actors, table)
+    _update_errors(s)
+    _update_external_torque(t_ns, s, arrays.actors, arrays.table)
     if s.mode != _DIVERGED:
-        _advance(k, t_ns, s, actors, table)
+        _advance(k, t_ns, s, arrays.actors, arrays.table)

@@ -10,6 +10,8 @@ tick that releases it which sample is newest there; `recall_sample` reads the pa
 Both cost the same at any delay. Newest wins: an older sample never replaces a newer one.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from .channel import LOST, schedule_deliveries
@@ -19,8 +21,6 @@ from .ticks import NS_PER_S, first_tick_at, tick_ns
 from .two_link_arm import JOINTS
 from .vectors import Array, IntArray, Points, Row, RowArray, pair, put_pair
 
-# One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and
-# qd are the peer's start pose, at rest (L7).
 LINK_DTYPE = np.dtype(
     (
         np.record,
@@ -53,8 +53,8 @@ LINK_DTYPE = np.dtype(
         ],
     )
 )
-# One page per sample, a power of two of them: when the sample of that index is due, and the sample that waits
-# there with its own tick (-1: none) and the peer's joint state.
+"""One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and qd
+are the peer's start pose, at rest (L7)."""
 SAMPLE_DTYPE = np.dtype(
     (
         np.record,
@@ -67,6 +67,27 @@ SAMPLE_DTYPE = np.dtype(
         ],
     )
 )
+"""One page per sample, a power of two of them: when the sample of that index is due, and the sample that
+waits there with its own tick (-1: none) and the peer's joint state."""
+
+
+class LinkArrays(NamedTuple):
+    """The arrays of one link.
+
+    Attributes:
+        state: shape (1,), LINK_DTYPE.
+        models: what its channel does, shape (M,), LINK_MODEL_DTYPE.
+        samples: where samples wait, shape (pages,), SAMPLE_DTYPE.
+        calendar: the newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
+        points: the site's traces and outages, shape (n, 2).
+    """
+
+    state: RowArray
+    models: RowArray
+    samples: RowArray
+    calendar: IntArray
+    points: Points
+
 
 AHEAD_LIMIT_S = 10
 AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
@@ -82,24 +103,24 @@ def calendar_pages(rate_hz: int) -> int:
 
 
 @leaf
-def release_tick(
-    tick: int, link: Row, models: RowArray, samples: RowArray, points: Points, rate_hz: int
-) -> int:
+def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by then.
 
-    LOST where it never does, or where it is so old that its page has been turned.
+    LOST if it never does, or if it is so old that its page has been turned.
     """
-    schedule_deliveries(tick, link, models, samples, points)
+    row: Row = link.state[0]
+    samples = link.samples
+    schedule_deliveries(tick, row, link.models, samples, link.points)
     pages = samples.shape[0]
     page: Row = samples[tick & (pages - 1)]
-    if page.due_ns == LOST or tick <= link.foreseen - pages:
+    if page.due_ns == LOST or tick <= row.foreseen - pages:
         return LOST
-    return first_tick_at(max(page.due_ns, tick_ns(tick, link.rate_hz) + 1), rate_hz)
+    return first_tick_at(max(page.due_ns, tick_ns(tick, row.rate_hz) + 1), rate_hz)
 
 
 @leaf
 def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
-    """True where a sample's stamp lies further ahead of tick k than any may; none such is ever foreseen."""
+    """True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k."""
     if tick // peer_rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1:  # a hostile tick must not overflow the rest
         return True
     return tick_ns(tick, peer_rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS
@@ -107,95 +128,65 @@ def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def accept_sample(
-    k: int,
-    rate_hz: int,
-    tick: int,
-    q: Array,
-    qd: Array,
-    tau_x: Array,
-    link: Row,
-    models: RowArray,
-    samples: RowArray,
-    calendar: IntArray,
-    points: Points,
+    k: int, rate_hz: int, tick: int, q: Array, qd: Array, tau_x: Array, link: LinkArrays
 ) -> None:
-    """Takes one arrival into a link; what it cannot use it counts.
-
-    Args:
-        k: the receiver's present tick.
-        rate_hz: the receiver's rate, Hz.
-        tick: the sample's own tick, at the peer's rate.
-        q: the peer's joint angles, shape (n,), rad.
-        qd: the peer's joint velocities, shape (n,), rad/s.
-        tau_x: the exogenous torque of its record, shape (n,), N m.
-        link: the link's row, dtype LINK.
-        models: what its channel does, shape (M,), dtype MODEL.
-        samples: where samples wait, shape (pages,), dtype SAMPLE.
-        calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
-        points: the site's traces and outages.
-    """
-    link.accepted += 1
-    if tick < 0 or (tick > link.foreseen and _far_ahead(k, rate_hz, tick, link.rate_hz)):
-        link.refused += 1
+    """Files one arrival of a peer's tick in a link at the receiver's tick k; counts what it cannot use."""
+    row: Row = link.state[0]
+    samples, calendar = link.samples, link.calendar
+    row.accepted += 1
+    if tick < 0 or (tick > row.foreseen and _far_ahead(k, rate_hz, tick, row.rate_hz)):
+        row.refused += 1
         return
     slot: Row = samples[tick & (samples.shape[0] - 1)]
     if slot.tick == tick:
-        link.duplicate += 1
+        row.duplicate += 1
         return
-    release = release_tick(tick, link, models, samples, points, rate_hz)
+    release = release_tick(tick, rate_hz, link)
     if release == LOST:
-        link.lost += 1
+        row.lost += 1
         return
     if release < k:
-        model: Row = models[link.model]
+        model: Row = link.models[row.model]
         if model.kind != _MEASURED:
-            link.late += 1
+            row.late += 1
         release = k
     if slot.tick > tick:
-        link.superseded += 1
+        row.superseded += 1
         return
     slot.tick = tick
     put_pair(slot.q, pair(q))
     put_pair(slot.qd, pair(qd))
     put_pair(slot.tau_x, pair(tau_x))
-    if tick <= link.used:  # filed all the same: so that it is known when it comes again
-        link.superseded += 1
+    if tick <= row.used:  # filed all the same: a duplicate of it is recognised
+        row.superseded += 1
         return
     page = release & (calendar.shape[0] - 1)
     if calendar[page] >= 0:
-        link.superseded += 1
+        row.superseded += 1
     calendar[page] = max(calendar[page], tick)
 
 
 @leaf
-def recall_sample(
-    k: int, rate_hz: int, link: Row, models: RowArray, samples: RowArray, calendar: IntArray, points: Points
-) -> None:
+def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Brings into use the newest sample that tick k releases, if there is one; else the last one stays.
 
-    It also foresees the channel up to t_k, so that a long silence of the peer costs nothing at its end.
-
-    Args:
-        k: the receiver's present tick; every tick must be recalled once, in order.
-        rate_hz: the receiver's rate, Hz.
-        link: the link's row, dtype LINK.
-        models: what its channel does, shape (M,), dtype MODEL.
-        samples: where samples wait, shape (pages,), dtype SAMPLE.
-        calendar: newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
-        points: the site's traces and outages.
+    Every tick must be recalled once, in order. The channel is advanced to t_k here, so that a long silence of
+    the peer costs nothing at its end.
     """
-    same = link.rate_hz == rate_hz
-    schedule_deliveries(k if same else k * link.rate_hz // rate_hz, link, models, samples, points)
+    row: Row = link.state[0]
+    calendar = link.calendar
+    sample = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
+    schedule_deliveries(sample, row, link.models, link.samples, link.points)
     page = k & (calendar.shape[0] - 1)
     newest = calendar[page]
     if newest < 0:
         return
     calendar[page] = -1
-    slot: Row = samples[newest & (samples.shape[0] - 1)]
-    if newest > link.used and slot.tick == newest:
-        link.used = newest
-        put_pair(link.q, pair(slot.q))
-        put_pair(link.qd, pair(slot.qd))
-        put_pair(link.tau_x, pair(slot.tau_x))
+    slot: Row = link.samples[newest & (link.samples.shape[0] - 1)]
+    if newest > row.used and slot.tick == newest:
+        row.used = newest
+        put_pair(row.q, pair(slot.q))
+        put_pair(row.qd, pair(slot.qd))
+        put_pair(row.tau_x, pair(slot.tau_x))
     else:
-        link.superseded += 1
+        row.superseded += 1

@@ -14,10 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from .channel import LOST
-from .delay import DelayKind, LinkModel
-from .kernel import accept_stage, act_stages, resume_stages, sense_stages, site_tick
-from .link import release_tick
-from .site_arrays import ARRIVAL_DTYPE, ROW_FLOATS, add_ramp, build_site_arrays
+from .delay import DelayKind
+from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
+from .site_arrays import ARRIVAL_DTYPE, ROW_FLOATS, TickBuffers, add_model, add_ramp, build_site_arrays
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
 from .two_link_arm import JOINTS
@@ -30,7 +29,7 @@ _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
 
 MAX_CHANGES = 256
-"""Most changes of one link, or of the shares, that a site takes in a run besides its scenario's."""
+"""Most changes of one link, or of the dominance factors, that a site takes besides its scenario's."""
 
 
 class Site:
@@ -51,43 +50,35 @@ class Site:
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
         self._external = setup.external
-        tables = build_site_arrays(setup, MAX_CHANGES)
-        self._tables = tables
-        self._site, self._links, self._models = tables.site, tables.links, tables.models
-        self._samples, self._calendars, self._points = tables.samples, tables.calendars, tables.points
-        self._ramps, self._actors, self._table = tables.ramps, tables.actors, tables.table
-        self._row = np.zeros(ROW_FLOATS)
-        self._arrivals = np.zeros(MAX_ARRIVALS, ARRIVAL_DTYPE)
-        self._arrival_bytes = self._arrivals.view(np.uint8).data
-        self._forces = np.zeros((MAX_ARRIVALS, JOINTS))
-        self._force_bytes = self._forces.view(np.uint8).reshape(-1).data
-        self._own = None if setup.own is None else setup.own(_facts(setup))
-        self._reflects = any(setup.gains.k_f) or self._own is not None
-
-    def _add_model(self, peer: int, model: LinkModel) -> None:
-        link: Row = self._links[peer]
-        models, count = self._models[peer], int(link.models)
-        place = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
-        models[place + 1 : count + 1] = models[place:count].copy()
-        models[place] = model
-        link.models = count + 1
-        if link.model >= place:  # samples from ahead have been foreseen already: they stay as they are
-            link.model += 1
+        self._arrays = build_site_arrays(setup, MAX_CHANGES)
+        self._buffers = TickBuffers(
+            np.zeros(MAX_ARRIVALS, ARRIVAL_DTYPE), np.zeros((MAX_ARRIVALS, JOINTS)), np.zeros(ROW_FLOATS)
+        )
+        self._tick_arrays = (*self._arrays, *self._buffers)
+        self._site, self._links = self._arrays.site, self._arrays.links
+        self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
+        self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
+        self._user_law = None
+        if setup.own is not None:
+            theta = tuple(map(float, setup.theta)) if setup.theta_known else ()
+            g, lengths, limit = setup.g_m_s2, setup.lengths_m, setup.tau_limit_nm
+            self._user_law = setup.own(LawContext(setup.name, setup.rate_hz, g, lengths, theta, limit))
+        self._reflects = any(setup.gains.k_f) or self._user_law is not None
 
     def order(self, command: CoreChange) -> None:
-        """Takes in a change; one that its scenario or an earlier command plans for later still comes then.
+        """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
 
         Raises:
-            ValueError: the site has taken `MAX_COMMANDS` of them.
+            ValueError: the site has taken `MAX_CHANGES` of them.
         """
         if command.model is not None:
-            if self._links[command.peer].models >= self._models.shape[1]:
+            if self._links[command.peer].models >= self._arrays.models.shape[1]:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
-            self._add_model(command.peer, command.model)
+            add_model(self._arrays, command.peer, command.model)
         if command.ramp is not None:
-            if self._site[0].ramps >= len(self._ramps):
+            if self._site[0].ramps >= len(self._arrays.ramps):
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of its shares")
-            add_ramp(self._tables, command.ramp)
+            add_ramp(self._arrays, command.ramp)
 
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one tick and returns its record.
@@ -96,38 +87,24 @@ class Site:
             tick: its number, one more than the last one's, and what came in since then.
 
         Raises:
-            ValueError: more than MAX_ARRIVALS arrivals, or MAX_COMMANDS commands.
-            LawFailed: a law of somebody's own did.
+            ValueError: more than MAX_ARRIVALS arrivals, or MAX_CHANGES changes.
+            LawFailed: a user's law did.
         """
-        taken = self._pack(tick.arrivals)
+        packed, count = self._pack(tick.arrivals), len(tick.arrivals)
         for command in tick.commands:
             self.order(command)
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
             s.q, s.qd = tick.measured
         t_ns = tick.k * NS_PER_S // self.rate_hz
-        looked = (
-            tick.k,
-            t_ns,
-            len(tick.arrivals),
-            self._site,
-            self._links,
-            self._models,
-            self._samples,
-            self._calendars,
-            self._points,
-            self._ramps,
-            self._arrivals,
-            self._forces,
-        )
-        own: list[float] = []
-        if self._own is None:
-            site_tick(*looked, self._actors, self._table, self._row)
+        memory: list[float] = []
+        if self._user_law is None:
+            site_tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
-            sense_stages(*looked)
-            own = self._ask(self._own, tick.k)
-            act_stages(tick.k, t_ns, self._site, self._actors, self._table, self._row)
-        row = self._row.tolist()
+            sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
+            memory = self._call_user_law(self._user_law, tick.k)
+            act_stages(tick.k, t_ns, self._arrays, self._buffers.record)
+        row = self._buffers.record.tolist()
         n = JOINTS
         mode = self._site["mode"].item()
         return TickRecord(
@@ -142,13 +119,13 @@ class Site:
             row[5 * n : 6 * n],
             row[6 * n :],
             self._links["used"].tolist(),
-            self._crc(taken, len(tick.arrivals)),
+            self._crc(packed, count),
             [command.text for command in tick.commands],
-            [] if mode in (_RUN, _DIVERGED) and self._own is None else self._memory() + own,
+            [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
         )
 
-    def _ask(self, law: UserLaw, k: int) -> list[float]:
-        """Stage 6 of a law of somebody's own: takes its torque and estimate in, and returns its memory."""
+    def _call_user_law(self, law: UserLaw, k: int) -> list[float]:
+        """Stage 6 of a user's law: takes its torque and estimate in, and returns its memory."""
         s: Row = self._site[0]
         vectors = (s.q, s.qd, s.q_des, s.qd_des, s.felt)
         now = LawInput(k, k / self.rate_hz, 1.0 / self.rate_hz, *(vector.tolist() for vector in vectors))
@@ -158,13 +135,13 @@ class Site:
         s.theta_hat = estimate
         return memory
 
-    def _crc(self, taken: int, arrivals: int) -> int:
-        """Returns `Output.rx_crc`."""
-        crc = zlib.crc32(self._arrival_bytes[:taken])
+    def _crc(self, packed: int, arrivals: int) -> int:
+        """Returns `TickRecord.rx_crc`."""
+        crc = zlib.crc32(self._arrival_bytes[:packed])
         return zlib.crc32(self._force_bytes[: arrivals * 8 * JOINTS], crc) if self._reflects else crc
 
-    def _memory(self) -> list[float]:
-        """Returns `Output.mem` of a site that holds, brakes or returns."""
+    def _held_memory(self) -> list[float]:
+        """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
         s: Row = self._site[0]
         return [*s.q_held.tolist(), float(s.return_from_ns)]
 
@@ -173,18 +150,17 @@ class Site:
         return tuple(LinkCounts(*(int(link[field]) for field in LinkCounts._fields)) for link in self._links)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Returns the tick of this site at which a peer's sample comes into use if it is there by then.
+        """Returns the tick of this site at which a peer's sample comes into use if it has arrived by then.
 
-        None where it never does: its link loses it, or forgot it long ago.
+        None if it never does: its link loses it, or has turned its page.
         """
-        channel = self._links[peer], self._models[peer], self._samples[peer], self._points
-        release = int(release_tick(tick, *channel, self.rate_hz))
+        release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
     def measures(self, peer: int) -> bool:
-        """True where a peer's samples are in use as soon as they have come: then none is late."""
+        """True if the link to this peer injects no delay: then no sample of it is late."""
         link: Row = self._links[peer]
-        return bool(self._models[peer, link.model]["kind"] == DelayKind.MEASURED)
+        return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
         """Returns the tick rate of a peer, Hz."""
@@ -205,12 +181,12 @@ class Site:
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:JOINTS], int(last.mem[JOINTS])
-        if self._own is not None:
-            restore_law(self._own, self.name, last.mem[JOINTS + 1 :])
-        resume_stages(last.tick, self._site, self._actors, self._table)
+        if self._user_law is not None:
+            restore_law(self._user_law, self.name, last.mem[JOINTS + 1 :])
+        resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
-        """Puts the links where they were before tick k: what is in use, and what waits to be.
+        """Puts the links where they were before tick k.
 
         Args:
             k: the tick that will be stepped next.
@@ -220,8 +196,8 @@ class Site:
         Raises:
             ValueError: more than MAX_ARRIVALS of them wait.
         """
-        self._samples["tick"] = -1
-        self._calendars[:] = -1
+        self._arrays.samples["tick"] = -1
+        self._arrays.calendars[:] = -1
         link: Row
         for link, start, sample in zip(self._links, self._starts, in_use, strict=True):
             # the channel's memory is a function of what went before
@@ -229,24 +205,12 @@ class Site:
             if sample is None:
                 link.used, link.q, link.qd, link.tau_x = -1, start, 0.0, 0.0
             else:
-                link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
-                link.tau_x = sample.tau_x
+                link.used, link.q, link.qd, link.tau_x = sample.tick, sample.q, sample.qd, sample.tau_x
         self._pack(waiting)
-        accept_stage(
-            k,
-            len(waiting),
-            self._site,
-            self._links,
-            self._models,
-            self._samples,
-            self._calendars,
-            self._points,
-            self._arrivals,
-            self._forces,
-        )
+        accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _pack(self, arrivals: Sequence[Arrival]) -> int:
-        """Writes arrivals into their table; returns the bytes that they take."""
+        """Writes arrivals into their buffers; returns the bytes that they take."""
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
         offset = 0
@@ -255,11 +219,5 @@ class Site:
             offset += _PACK_ARRIVAL_SIZE
         if self._reflects:
             for n, arrival in enumerate(arrivals):
-                self._forces[n] = arrival.tau_x
+                self._buffers.forces[n] = arrival.tau_x
         return offset
-
-
-def _facts(setup: SiteSetup) -> LawContext:
-    """Returns what a law may know of its site."""
-    theta = tuple(float(value) for value in setup.theta) if setup.theta_known else ()
-    return LawContext(setup.name, setup.rate_hz, setup.g_m_s2, setup.lengths_m, theta, setup.tau_limit_nm)

@@ -99,9 +99,7 @@ class FusedRun:
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
-        run_until(
-            last_ns, self._apart_rad, self._courses, self._taken, self._sent, self._peaks, *self._tables
-        )
+        run_until(last_ns, self._apart_rad, self._courses, self._taken, self._sent, self._peaks, self._tables)
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     @property
