@@ -40,7 +40,7 @@ def run() -> list[str]:
 
     def stamps() -> None:
         k = next(counter)
-        timing.grid.deadline(k)
+        timing.schedule.deadline(k)
         arrivals(samples)
         timing.sent(k, AT_NS)
         timing.echo()
@@ -53,7 +53,7 @@ def run() -> list[str]:
 
     def whole() -> bytes:
         k = next(counter)
-        timing.grid.deadline(k)
+        timing.schedule.deadline(k)
         taken = arrivals(decoded())
         done = site.step(TickInput(k, taken))
         sent_ns, echoed = timing.sent(k, AT_NS), timing.echo()

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from trilat_net.core.site_step import MAX_CHANGES
 from trilat_net.core.ticks import CoreChange, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
-from trilat_net.net.bus import Query, QueryInbox
+from trilat_net.net.bus import QueryInbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import (
@@ -26,63 +26,59 @@ AHEAD_MS = 100
 
 
 class ChangeServer:
-    """A site's ear for changes.
+    """The change requests to one site.
 
     Args:
         scenario: the experiment.
         site: the site's name.
-        questions: the ring of what it is asked.
+        queries: where the requests arrive.
     """
 
-    def __init__(self, scenario: Scenario, site: str, questions: QueryInbox) -> None:
-        self._scenario, self._site, self._questions = scenario, site, questions
+    def __init__(self, scenario: Scenario, site: str, queries: QueryInbox) -> None:
+        self._scenario, self._site, self._queries = scenario, site, queries
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
         self._links = initial_link_tables(scenario)
         self._planned = scheduled_link_tables(scenario)
-        self._taken = 0
+        self._accepted = 0
 
     def take(self, k: int) -> Sequence[CoreChange]:
-        """Returns what has been asked for and is accepted, for tick k; answers every question.
+        """Replies to every request; returns the accepted changes, for tick k.
 
         Args:
-            k: the tick that is about to be stepped.
+            k: the next tick.
         """
-        question = self._questions.poll()
-        if question is None:
+        query = self._queries.poll()
+        if query is None:
             return ()
-        commands = []
-        while question is not None:
-            commands += self._consider(k, question)
-            question = self._questions.poll()
-        return commands
-
-    def _consider(self, k: int, question: Query) -> list[CoreChange]:
+        changes: list[CoreChange] = []
         first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
-        try:
-            taken = self._command(decode(question.payload, ChangeRequest), first)
-        except (WireError, ScenarioError) as error:
-            question.answer(encode(ChangeReply(member=self._site, accepted=False, text=str(error))))
-            return []
-        text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
-        question.answer(encode(ChangeReply(member=self._site, accepted=True, text=text, tick=first)))
-        return [taken]
+        while query is not None:
+            try:
+                changes.append(self._resolve(decode(query.payload, ChangeRequest), first))
+                text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+                reply = ChangeReply(member=self._site, accepted=True, text=text, tick=first)
+            except (WireError, ScenarioError) as error:
+                reply = ChangeReply(member=self._site, accepted=False, text=str(error))
+            query.answer(encode(reply))
+            query = self._queries.poll()
+        return changes
 
-    def _command(self, order: ChangeRequest, first: int) -> CoreChange:
+    def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)
         for planned_ns, name, table in list(self._planned):
-            if planned_ns <= from_ns:  # what the scenario has changed by then is the present
+            if planned_ns <= from_ns:  # the scenario has changed this link by then
                 self._links[name] = table
                 self._planned.remove((planned_ns, name, table))
         if first >= self._ticks:
             raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
-        if self._taken >= MAX_CHANGES:
+        if self._accepted >= MAX_CHANGES:
             raise ScenarioError(f"a run takes at most {MAX_CHANGES} changes")
-        written = {key: value for key in ("link", "dominance", "ramp_s") if (value := getattr(order, key))}
-        change = resolve_change(self._scenario, self._links, {**written, "to": order.to}, from_ns)
+        written = {key: value for key in ("link", "dominance", "ramp_s") if (value := getattr(request, key))}
+        change = resolve_change(self._scenario, self._links, {**written, "to": request.to}, from_ns)
         if find_owner(change) != self._site:
             raise ScenarioError(f"{self._site} cannot do that; ask {find_owner(change)}")
-        self._taken += 1
+        self._accepted += 1
         if change.link:
             self._links[change.link] = change.to
         return to_core_change(self._scenario, change)

@@ -15,64 +15,61 @@ from trilat_net.net.requests import ArmMeasurement
 from trilat_net.net.wire import decode
 
 MEASUREMENTS_KEPT = 64
-"""Measurements that wait, at most: older ones are of no use."""
+"""Capacity of the inbox: older measurements are useless."""
 SILENCE_LIMIT_NS = 500_000_000
-"""An arm that says nothing for longer than this is gone."""
+"""A longer silence ends the run."""
 START_POSE_TOLERANCE_RAD = 0.01
-"""An arm that begins farther from its `q0_rad` than this is told of."""
+"""A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000
-_MOST_NS = 20_000_000
-"""How much of its silence a single look can show: a site that slept cannot know what it would have heard."""
+_MAX_POLL_GAP_NS = 20_000_000
+"""Silence that one poll can add: a site that slept cannot know what it would have received."""
 
 
 class ExternalArm:
     """The measurements of one arm.
 
     Args:
-        site: whose arm it is.
-        ring: where they arrive.
+        site: the site of the arm.
+        ring: where its measurements arrive.
         clock: the time.
-        dropped: where what is dropped is counted, by reason.
-        where: what to call the place where they arrive.
+        dropped: counts what is dropped, by reason.
+        place: key and endpoint where they arrive, for messages to the user.
 
     Attributes:
         newest: the newest measurement, None before the first.
-        taken: how many were taken in.
+        taken: number of measurements taken.
     """
 
     def __init__(
-        self, site: str, ring: StampedInbox, clock: Clock, dropped: Counter[str], where: str
+        self, site: str, ring: StampedInbox, clock: Clock, dropped: Counter[str], place: str
     ) -> None:
         self.newest: PlantState | None = None
         self.taken = 0
         self._site, self._ring, self._dropped = site, ring, dropped
-        self._clock, self._where = clock, where
+        self._clock, self._place = clock, place
         self._boot = self._n = -1
         self._bound = self._counting = False
         self._silent_ns = 0
-        self._looked_ns: int | None = None
+        self._polled_ns: int | None = None
 
-    def speaks(self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]) -> bool:
-        """Waits for the first measurement; False where the site was asked to end before.
-
-        Args:
-            stopped: True once the site was asked to end.
-            give_up_ns: when to give up.
-            say: tells a person what happens.
+    def wait_for_first(
+        self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
+    ) -> bool:
+        """Waits for the first measurement; False if `stopped` comes first.
 
         Raises:
-            SessionError: none came in time.
+            SessionError: none arrived in time.
         """
-        say(f"{self._site}: waiting for its arm on {self._where}")
+        say(f"waiting for its arm on {self._place}")
         while not stopped():
-            self.look()
+            self.poll()
             if self.newest is not None:
                 return True
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
                 dropped = ", ".join(f"{count} {reason}" for reason, count in self._dropped.items())
                 raise SessionError(
-                    f"{self._site} waited in vain for its arm: no measurement came on {self._where}"
+                    f"{self._site} waited in vain for its arm: no measurement came on {self._place}"
                     + (f"; dropped: {dropped}" if dropped else "")
                     + "; see docs/external-arm.md"
                 )
@@ -80,19 +77,16 @@ class ExternalArm:
         return False
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """From now on only the program counts that speaks now; one that is started anew is a stranger.
+        """Accepts from now on only the program that sends now; returns a warning about the pose, or "".
 
         Args:
-            q0_rad: where the peers take the arm to start.
-
-        Returns:
-            What to say of where it stands; "" where it stands there.
+            q0_rad: the start pose that the peers assume.
         """
-        self.look()
+        self.poll()
         self._bound = True
         self._silent_ns = 0
-        off = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
-        off_rad = max(abs(a - b) for a, b in off)
+        pairs = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
+        off_rad = max(abs(a - b) for a, b in pairs)
         if off_rad <= START_POSE_TOLERANCE_RAD:
             return ""
         return (
@@ -100,19 +94,19 @@ class ExternalArm:
             "references will jump"
         )
 
-    def look(self) -> None:
-        """Takes in what has come."""
+    def poll(self) -> None:
+        """Takes the measurements that have arrived."""
         now_ns = self._clock.monotonic_ns()
         before = self.taken
         while (message := self._ring.poll()) is not None:
             self._take(message[0])
-        passed_ns = 0 if self._looked_ns is None else min(now_ns - self._looked_ns, _MOST_NS)
+        passed_ns = 0 if self._polled_ns is None else min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
         self._silent_ns = 0 if self.taken > before else self._silent_ns + passed_ns
-        self._looked_ns = now_ns
+        self._polled_ns = now_ns
 
     @property
     def failure(self) -> RunFailed | None:
-        """Why the run cannot go on: it has said nothing for too long; else None."""
+        """The error of an arm that has been silent for too long, else None."""
         if self._silent_ns <= SILENCE_LIMIT_NS:
             return None
         return RunFailed(f"the arm of {self._site} was silent for {SILENCE_LIMIT_NS * 1e-9:g} s")

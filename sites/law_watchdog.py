@@ -23,75 +23,75 @@ from trilat_net.net.clock import Clock
 try:
     import resource
 
-    _WHO: int | None = getattr(resource, "RUSAGE_THREAD", None)
-except ImportError:  # not on this platform: there the time that passed counts
-    _WHO = None
+    _THREAD: int | None = getattr(resource, "RUSAGE_THREAD", None)
+except ImportError:  # not on this platform: elapsed time counts
+    _THREAD = None
 
 SHARE = 0.75
 MOST_NS = 500_000_000
 HICCUP_NS = 50_000_000
-LOOK_S = 1.0
-LOOKS = 3
-"""A law that is in the same tick at so many looks in a row, one every `LOOK_S`, does not come back."""
+CHECK_S = 1.0
+CHECKS = 3
+"""A law in the same tick at so many checks in a row, one every `CHECK_S`, hangs."""
 
 
 def read_thread_usage() -> tuple[int, int]:
-    """Returns what this thread has computed, ns, and how often it lost its processor; (0, -1) if unknown."""
-    if _WHO is None:
+    """Returns this thread's computing time, ns, and its involuntary switches; (0, -1) if unknown."""
+    if _THREAD is None:
         return 0, -1
-    usage = resource.getrusage(_WHO)
+    usage = resource.getrusage(_THREAD)
     return round((usage.ru_utime + usage.ru_stime) * NS_PER_S), usage.ru_nivcsw
 
 
 class LawWatchdog:
-    """Steps a site with a law from outside; a context, within which one that hangs is stopped.
+    """Steps a site under a user's law; a context within which a law that hangs is stopped.
 
     Args:
         site: the site.
         law: the law, as in "package.module:Law".
         clock: the time.
-        use: what the thread has computed, see `thread_use`.
+        usage: the thread's usage, see `read_thread_usage`.
 
     Attributes:
-        hiccups: ticks in which the law took longer than there is from one tick to the next.
-        longest_ns: the longest of all.
-        longest_tick: which tick that was.
+        hiccups: number of ticks at which the law took longer than a tick period.
+        longest_ns: the longest of all ticks.
+        longest_tick: its number.
     """
 
     def __init__(
-        self, site: Site, law: str, clock: Clock, use: Callable[[], tuple[int, int]] = read_thread_usage
+        self, site: Site, law: str, clock: Clock, usage: Callable[[], tuple[int, int]] = read_thread_usage
     ) -> None:
         self.hiccups = self.longest_ns = 0
         self.longest_tick = -1
-        self._site, self._law, self._clock, self._use = site, law, clock, use
+        self._site, self._law, self._clock, self._usage = site, law, clock, usage
         self._period_ns = NS_PER_S // site.rate_hz
         self._owed_ns = self._sum_ns = self._count = 0
-        self._within = -1  # the tick that is being stepped
-        self._seen, self._looks = -1, 0
-        self._before: Any = None
+        self._stepping = -1  # the tick that is being stepped
+        self._checked, self._checks = -1, 0
+        self._handler_before: Any = None
 
     def step(self, tick: TickInput) -> TickRecord:
         """Steps the site.
 
         Raises:
-            LawFailed: the law did, or is too slow.
+            LawFailed: the law failed, or is too slow.
         """
-        computed_ns, lost = self._use()
+        computed_ns, switches = self._usage()
         began_ns = self._clock.monotonic_ns()
-        self._within = tick.k
+        self._stepping = tick.k
         try:
             output = self._site.step(tick)
         finally:
-            self._within = -1
+            self._stepping = -1
         took_ns = self._clock.monotonic_ns() - began_ns
-        if took_ns > SHARE * self._period_ns:  # else nothing is to be told apart
-            computed_after_ns, lost_after = self._use()
-            if lost_after != lost:
+        if took_ns > SHARE * self._period_ns:  # else the reason does not matter
+            computed_after_ns, switches_after = self._usage()
+            if switches_after != switches:
                 took_ns = min(took_ns, computed_after_ns - computed_ns)
-        self._book(tick.k, took_ns)
+        self._account(tick.k, took_ns)
         return output
 
-    def _book(self, k: int, took_ns: int) -> None:
+    def _account(self, k: int, took_ns: int) -> None:
         self.hiccups += took_ns > self._period_ns
         self._sum_ns += took_ns
         self._count += 1
@@ -107,8 +107,8 @@ class LawWatchdog:
                 f"take {SHARE:.0%}; make it faster, or lower rate_hz",
             )
 
-    def told(self) -> str:
-        """Says how often the law was late for the next tick; "" where it never was."""
+    def describe_hiccups(self) -> str:
+        """Returns a sentence about the ticks at which the law was late for the next one; "" without any."""
         if not self.hiccups:
             return ""
         return (
@@ -118,25 +118,25 @@ class LawWatchdog:
 
     def __enter__(self) -> "LawWatchdog":
         if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGALRM, self._look)
-            signal.setitimer(signal.ITIMER_REAL, LOOK_S, LOOK_S)
+            self._handler_before = signal.signal(signal.SIGALRM, self._check)
+            signal.setitimer(signal.ITIMER_REAL, CHECK_S, CHECK_S)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._before is not None:
+        if self._handler_before is not None:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self._before)
-            self._before = None
+            signal.signal(signal.SIGALRM, self._handler_before)
+            self._handler_before = None
 
-    def _look(self, _number: int, _frame: FrameType | None) -> None:
-        """Stops a law that is in the same tick as at the looks before; a process that slept had none."""
-        within = self._within
-        self._looks = self._looks + 1 if within >= 0 and within == self._seen else 0
-        self._seen = within
-        if self._looks >= LOOKS - 1:
-            raise self._failed(within, f"it did not come back within {(LOOKS - 1) * LOOK_S:g} s")
+    def _check(self, _number: int, _frame: FrameType | None) -> None:
+        """Stops a law that is in the same tick as at the checks before; a process that slept had none."""
+        stepping = self._stepping
+        self._checks = self._checks + 1 if stepping >= 0 and stepping == self._checked else 0
+        self._checked = stepping
+        if self._checks >= CHECKS - 1:
+            raise self._failed(stepping, f"it did not come back within {(CHECKS - 1) * CHECK_S:g} s")
 
     def _failed(self, k: int, problem: str) -> LawFailed:
         return LawFailed(problem, site=self._site.name, law=self._law, tick=k)

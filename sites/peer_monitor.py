@@ -13,16 +13,10 @@ from trilat_net.net.membership import EventPublisher, read_events
 class PeerMonitor:
     """The other members, as one site sees them.
 
-    Args:
-        bus: the site's connection.
-        session: the session's name.
-        site: the site's name.
-        peers: its peers, in scenario order.
-
     Attributes:
-        recorders: boots of the recorders that are there.
-        stored: boots of those that have said that they have all of this site.
-        ended_by: why a peer has ended the run for all; "" while none has.
+        recorders: boots of the recorders that are present.
+        stored: boots of the recorders that have stored all messages of this site.
+        ended_by: text of the event with which a peer ended the run for all; "" while none has.
     """
 
     def __init__(self, bus: Bus, session: str, site: str, peers: Sequence[str]) -> None:
@@ -37,33 +31,16 @@ class PeerMonitor:
         self._ended: set[str] = set()
 
     def admit(self, boots: Mapping[str, int]) -> None:
-        """Says which start of each member belongs to the session."""
+        """Sets the boots that belong to the session."""
         self._boots = boots
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Takes what has come, and says who has come or is gone without having said its end.
+        """Takes events and presence; publishes who is back, and who is lost without an end event.
 
         Args:
             publisher: the site's own events.
             t_ns: nominal time, ns since the epoch.
         """
-        self._hear()
-        while (change := self._presence.poll()) is not None:
-            where = topics.parse_key(change[0])
-            if where is None:
-                continue
-            known = str(self._boots.get(where.member)) == where.boot
-            if where.member == topics.RECORDER:
-                (self.recorders.add if change[1] else self.recorders.discard)(where.boot)
-                if change[1] and not known:  # in the middle, or once more after another one died
-                    publisher.publish("back", "a recorder has come", about=where.member, t_ns=t_ns)
-            elif not known:
-                continue
-            if not change[1] and where.member not in self._ended:
-                publisher.publish("lost", f"{where.member} is gone", about=where.member, t_ns=t_ns)
-
-    def _hear(self) -> None:
-        """Takes what the peers say of their own end."""
         for peer, inbox in self._events.items():
             for event in read_events(inbox):
                 if event.boot != self._boots.get(peer):
@@ -72,12 +49,25 @@ class PeerMonitor:
                     self.ended_by = event.text
                 elif event.kind == "end":
                     self._ended.add(peer)
+        while (change := self._presence.poll()) is not None:
+            parts, alive = topics.parse_key(change[0]), change[1]
+            if parts is None:
+                continue
+            known = str(self._boots.get(parts.member)) == parts.boot
+            if parts.member == topics.RECORDER:
+                (self.recorders.add if alive else self.recorders.discard)(parts.boot)
+                if alive and not known:  # in the middle, or again after another one died
+                    publisher.publish("back", "a recorder has come", about=parts.member, t_ns=t_ns)
+            elif not known:
+                continue
+            if not alive and parts.member not in self._ended:
+                publisher.publish("lost", f"{parts.member} is gone", about=parts.member, t_ns=t_ns)
 
-    def hear_recorders(self, ticks: int) -> bool:
-        """Takes what the recorders say; True where one of them just said that it has all of this site.
+    def read_stored(self, ticks: int) -> bool:
+        """Takes the recorders' events; True if one has just stored all messages of this site.
 
         Args:
-            ticks: how many ticks the site has made.
+            ticks: number of the site's ticks.
         """
         before = len(self.stored)
         for event in read_events(self._recorder_events):

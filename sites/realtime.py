@@ -19,60 +19,55 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def prepare(cpu: int | None) -> dict[str, str]:
-    """Asks for all that helps a loop, and returns what was obtained, by name.
+    """Requests every setting that helps a loop; returns the settings obtained, by name.
 
     Args:
         cpu: the processor to stay on, or None for any.
     """
     steps: dict[str, Callable[[], str]] = {
-        "affinity": lambda: _affinity(cpu),
-        "timer_slack": _timer_slack,
+        "affinity": lambda: _set_affinity(cpu),
+        "timer_slack": _set_timer_slack,
         "memory": _lock_memory,
-        "scheduling": _schedule,
+        "scheduling": _set_scheduling,
         "collector": _stop_collector,
     }
-    return {name: _attempt(step) for name, step in steps.items()}
+    obtained = {}
+    for name, step in steps.items():
+        try:
+            obtained[name] = step()
+        except (OSError, AttributeError, ValueError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or "not on this platform"
+            obtained[name] = f"not obtained ({reason})"
+    return obtained
 
 
-def _attempt(step: Callable[[], str]) -> str:
-    try:
-        return step()
-    except (OSError, AttributeError, ValueError, OverflowError) as error:
-        return f"not obtained ({getattr(error, 'strerror', None) or 'not on this platform'})"
-
-
-def _affinity(cpu: int | None) -> str:
+def _set_affinity(cpu: int | None) -> str:
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 
 def _libc_call(function: str, *arguments: int) -> None:
+    if not sys.platform.startswith("linux"):
+        raise AttributeError
     libc = ctypes.CDLL(None, use_errno=True)
     if getattr(libc, function)(*arguments) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
 
 
-def _linux_only() -> None:
-    if not sys.platform.startswith("linux"):
-        raise AttributeError
-
-
-def _timer_slack() -> str:
-    _linux_only()
+def _set_timer_slack() -> str:
     _libc_call("prctl", _PR_SET_TIMERSLACK, 1)
     return "1 ns"
 
 
 def _lock_memory() -> str:
-    _linux_only()
     _libc_call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     return "locked"
 
 
-def _schedule() -> str:
-    """SCHED_FIFO for this thread, else a better nice value, else as it is."""
+def _set_scheduling() -> str:
+    """Requests SCHED_FIFO for this thread, else a better nice value."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError):

@@ -1,55 +1,98 @@
-"""Shutdown linger of a site: wait for the recorders after the last tick.
+"""The end of a site: it reports how its run ended and waits for the recorders.
 
 Invariant: the wait ends when every recorder present has all messages that it can have, and it is bounded.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
-from trilat_net.net.clock import Clock
+from trilat_net.core.ticks import NS_PER_S, Mode, TickRecord, describe_divergence
+from trilat_net.errors import RunFailed
+from trilat_net.net import topics
+from trilat_net.net.membership import EventPublisher
 
-from .peer_monitor import PeerMonitor
+from .site_parts import SiteParts
 
-LINGER_S = 5
+LINGER_NS = 5 * NS_PER_S
+"""Longest wait after the last query of a recorder."""
 POLL_NS = 5_000_000
 LAST_EVENT_NS = 100_000_000
-LEAVE_TIMEOUT_NS = 2_000_000_000
-ASKED_NS = 1_000_000_000
-"""A recorder that has asked within this time is there, whatever its token says."""
+"""Wait for the last event of a recorder that is gone."""
+LEAVE_TIMEOUT_NS = 2 * NS_PER_S
+"""Wait after a recorder that has everything is gone: its process ends."""
+QUERIED_NS = NS_PER_S
+"""A recorder that has sent a query within this time is present, whatever its token says."""
 
 
-def await_recorders(
-    company: PeerMonitor,
-    answer: Callable[[], bool],
-    attend: Callable[[], None],
-    clock: Clock,
-    stopped: Callable[[], bool],
-    ticks: int,
-    stay_ns: int,
-) -> None:
-    """Waits for the word of every recorder that is there that it has all that it can have.
-
-    At most `LINGER_S` after the last question of one of them, and `stay_ns` after their word.
+class LeavingSite:
+    """A site after its last tick.
 
     Args:
-        company: the others.
-        answer: answers the oldest question of a recorder; False where there is none.
-        attend: does what else is to be done meanwhile.
-        clock: the time.
-        stopped: True once the site was asked to end.
-        ticks: how many ticks the site has made.
-        stay_ns: how long to stay after their word, until they are gone.
+        parts: the site.
+        publisher: its events and identity.
+        boots: the members of the session.
+        output: its last record; None without one.
+        failure: the reason for which this site ended the run, if it did.
     """
-    give_up_ns = clock.monotonic_ns() + LINGER_S * 1_000_000_000
-    asked_ns = 0
-    while clock.monotonic_ns() < give_up_ns and not (company.stored and stopped()):
-        while answer():
-            asked_ns = clock.monotonic_ns()
-            give_up_ns = max(give_up_ns, asked_ns + LINGER_S * 1_000_000_000)
-        attend()
-        away = not company.recorders and clock.monotonic_ns() - asked_ns > ASKED_NS
-        if away:  # its last word may still be under way; or its process ends
-            patience_ns = LEAVE_TIMEOUT_NS if company.stored else LAST_EVENT_NS
-            give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
-        if company.hear_recorders(ticks) and company.recorders <= company.stored:
-            give_up_ns = clock.monotonic_ns() + stay_ns
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+
+    def __init__(
+        self,
+        parts: SiteParts,
+        publisher: EventPublisher,
+        boots: Mapping[str, int],
+        output: TickRecord | None,
+        failure: RunFailed | None,
+    ) -> None:
+        self._parts, self._publisher, self._boots = parts, publisher, boots
+        self._ticks = 0 if output is None else output.tick + 1
+        self._t_ns = -1 if output is None else output.t_ns
+        self._end_kind, self._failure = "failed", failure
+        if output is not None and output.mode is Mode.DIVERGED:
+            self._end_kind, self._failure = "diverged", RunFailed(describe_divergence(parts.name, output))
+
+    def leave(self) -> int:
+        """Publishes the end, waits for the recorders, and returns the exit code.
+
+        Raises:
+            RunFailed: the run ended badly, here or at a peer.
+        """
+        parts, interrupt = self._parts, self._parts.interrupt
+        if self._failure is not None:
+            self._publish(self._end_kind, str(self._failure))
+        if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
+            self._publish("law", hiccups)
+            parts.say(hiccups)
+        self._publish("end", f"{parts.name} made {self._ticks} ticks")
+        code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
+        parts.monitor.watch(self._publisher, self._t_ns)
+        if topics.RECORDER in self._boots or parts.monitor.recorders:
+            self._await_recorders()
+        dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
+        parts.say(
+            f"{self._ticks} ticks, {parts.stats.overruns} of them late by a period or more"
+            + (f"; dropped: {dropped}" if dropped else "")
+        )
+        if self._failure is not None:
+            raise self._failure
+        if parts.monitor.ended_by:
+            raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
+        return code
+
+    def _publish(self, kind: str, text: str) -> None:
+        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks)
+
+    def _await_recorders(self) -> None:
+        """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""
+        parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
+        give_up_ns, queried_ns = clock.monotonic_ns() + LINGER_NS, 0
+        while clock.monotonic_ns() < give_up_ns and not (monitor.stored and parts.interrupt.requested()):
+            while parts.buffer.answer_query():
+                queried_ns = clock.monotonic_ns()
+                give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
+            self._publisher.answer_queries()
+            monitor.watch(self._publisher, self._t_ns)
+            if not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS:
+                patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
+            if monitor.read_stored(self._ticks) and monitor.recorders <= monitor.stored:
+                give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)

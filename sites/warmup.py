@@ -22,23 +22,18 @@ from .law_watchdog import LawWatchdog
 _TICKS = 200
 
 
-def warm_up(scenario: Scenario, name: str, time: Clock | None = None) -> None:
-    """Steps a throw-away site, so that everything that a tick runs through is compiled and in memory.
-
-    Args:
-        scenario: the experiment.
-        name: which of its sites.
-        time: the time; by default the machine's.
+def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
+    """Steps a throw-away site, so that all code of a tick is compiled and in memory.
 
     Raises:
-        LawFailed: a law from outside does so already with every arm at rest where it starts.
+        LawFailed: a user law fails already with every arm at rest where it starts.
     """
     setup, law = scenario.setup(name), scenario.sites[name].control
     site = Site(setup)
     try:
         if isinstance(law, ImportedLaw):
-            with LawWatchdog(site, law.code, time or SystemClock()) as overtime:
-                _warm(setup, site, overtime.step)
+            with LawWatchdog(site, law.code, clock or SystemClock()) as watchdog:
+                _warm(setup, site, watchdog.step)
         else:
             _warm(setup, site, site.step)
     except LawFailed as failed:
@@ -47,7 +42,7 @@ def warm_up(scenario: Scenario, name: str, time: Clock | None = None) -> None:
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
-    clock = OffsetEstimator()
+    estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(_TICKS):
         arrivals = [
@@ -56,5 +51,5 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
         decode(encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo), PeerSample)
-        clock.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
-        clock.estimate(k)
+        estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
+        estimator.estimate(k)

@@ -97,7 +97,7 @@ class Session:
     def _due(self, n: int, k: int) -> int:
         """When a tick is due, in true time."""
         site = self.sites[n]
-        ahead_ns = site.timing.grid.deadline(k) - site.clock.monotonic_ns()
+        ahead_ns = site.timing.schedule.deadline(k) - site.clock.monotonic_ns()
         return self.true.monotonic_ns() + round(ahead_ns / (1 + site.clock._drift_ppb / S)) + 1
 
     def _tick(self, n: int, k: int) -> PeerSample:
@@ -139,8 +139,8 @@ def test_delays_are_inside_their_bound_and_the_grid_follows_the_leader(skew: tup
     late_ns = [b - a for a, b in zip(leader.ticked_ns, follower.ticked_ns, strict=True)]
     assert abs(late_ns[0] - 300_000) <= 101_000
     assert max(map(abs, late_ns[10 * RATE_HZ :])) <= 60_000  # the ways are unlike by 60 us
-    assert leader.timing.grid.slew == 0.0
-    assert abs(follower.timing.grid.slew - skew[1]) <= 10_000
+    assert leader.timing.schedule.slew == 0.0
+    assert abs(follower.timing.schedule.slew - skew[1]) <= 10_000
     assert all(abs(stats["slew_ppb"]) <= SLEW_LIMIT for stats in follower.stats)
 
 
@@ -276,5 +276,5 @@ def test_who_shares_the_leaders_clock_is_not_steered() -> None:
     for k in range(0, 5000, 100):
         timing.meters[0].take(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []
-    assert timing.grid.deadline(10_000) == 5 + 10 * S
-    assert timing.grid.slew == 0.0
+    assert timing.schedule.deadline(10_000) == 5 + 10 * S
+    assert timing.schedule.slew == 0.0

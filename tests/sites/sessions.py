@@ -7,7 +7,8 @@ from pathlib import Path
 import msgpack
 
 from recorder.record_process import Recorder
-from sites.site_process import SiteOptions, SiteProcess
+from sites.site_parts import SiteOptions, SiteParts
+from sites.site_process import take_part
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
@@ -56,7 +57,7 @@ class Session:
         own = self._own(name, clock)
         bus = self.network.join()
         try:
-            return SiteProcess(self.scenario, name, options, bus, own, interrupt, self.said.append).live()
+            return take_part(SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append))
         finally:
             bus.close()
 

@@ -181,7 +181,7 @@ class Heard:
     def hear(self, *payloads: bytes) -> None:
         for payload in payloads:
             self.ring.take(payload)
-        self.arm.look()
+        self.arm.poll()
 
 
 @pytest.mark.parametrize(

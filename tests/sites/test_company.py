@@ -92,9 +92,9 @@ def test_a_recorder_has_all_of_a_site_when_it_says_so_of_all_its_ticks() -> None
     desk = Desk()
     desk.says(topics.RECORDER, 9, "stored", about="m1", ticks=4)
     desk.says(topics.RECORDER, 9, "stored", about="m2", ticks=5)
-    assert not desk.company.hear_recorders(5)
+    assert not desk.company.read_stored(5)
     desk.says(topics.RECORDER, 10, "stored", about="m1", ticks=5)
-    assert desk.company.hear_recorders(5)
+    assert desk.company.read_stored(5)
     assert desk.company.stored == {"10"}
     desk.says(topics.RECORDER, 10, "stored", about="m1", ticks=5)
-    assert not desk.company.hear_recorders(5)
+    assert not desk.company.read_stored(5)

@@ -24,7 +24,7 @@ class Desk:
 
     def ask(self, payload: bytes) -> Inbox:
         replies = self._asker.ask(KEY, payload)
-        while self.history.answer():
+        while self.history.answer_query():
             pass
         return replies
 
@@ -82,10 +82,10 @@ def test_a_ring_forgets_no_more_than_it_must(capacity: int, size_bytes: int, siz
 
 def test_every_channel_is_told_apart() -> None:
     desk = Desk()
-    for n, ring in enumerate(desk.history.rings.values()):
+    for n, ring in enumerate(desk.history.channels.values()):
         for m in range(n + 2):
             ring.keep(b"%d %d" % (n, m))
-    for n, channel in enumerate(desk.history.rings):
+    for n, channel in enumerate(desk.history.channels):
         past = desk.told(channel, 1, 9)
         assert (past.member, past.boot, past.channel) == ("m1", BOOT, channel)
         assert (past.first, past.made) == (1, n + 2)
@@ -93,12 +93,12 @@ def test_every_channel_is_told_apart() -> None:
 
 
 def test_memory_holds_a_minute_and_no_more() -> None:
-    rings = Desk(1000).history.rings
+    rings = Desk(1000).history.channels
     for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS_KEPT), strict=True):
         for _ in range(capacity + 5):
             ring.keep(b"x" * 600)
         assert ring.oldest == 5
-    fast = Desk(20_000).history.rings[topics.STATE]
+    fast = Desk(20_000).history.channels[topics.STATE]
     for _ in range(RECORDS_KEPT + 1):
         fast.keep(b"x" * 600)
     assert fast.oldest == 1
@@ -108,7 +108,7 @@ def test_the_largest_messages_fit_an_answer() -> None:
     """One message is always told, however large it is."""
     desk = Desk()
     for _ in range(3):
-        desk.history.rings[topics.EVENT].keep(b"x" * MAX_BYTES)
+        desk.history.channels[topics.EVENT].keep(b"x" * MAX_BYTES)
     assert [len(payload) for payload in desk.told(topics.EVENT, 0, 9).payloads] == [MAX_BYTES]
 
 

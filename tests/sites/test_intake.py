@@ -50,11 +50,10 @@ class Desk:
         rings = [receiver.stamped(name, self.clock.monotonic_ns, capacity) for name in PEERS]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
-        self.intake = PeerInbox(PEERS, rings, rates, self.dropped)
         self.meters = [
             LinkTimingMonitor(EPOCH_NS, 0, SentStamps(), SlewedOffset(exact_offset(0)), None) for _ in PEERS
         ]
-        self.intake.admit(BOOTS, self.meters)
+        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped)
 
     def wait(self, until_ns: int) -> None:
         """Time goes on, to an instant since the epoch."""

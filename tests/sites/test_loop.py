@@ -1,15 +1,15 @@
 """The live loop: an absolute grid, lateness that enters no formula, and the numbers of virtual time."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from sites.site_loop import LoopIO, PeerInbox, run_loop
+from sites.site_loop import PeerInbox, run_loop
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Mode
+from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -56,16 +56,28 @@ class Alone:
         self._clock, self._ticks = clock, scenario.ticks("m")
 
     def run(self) -> object:
-        ports = LoopIO(
-            self._clock,
-            PeerInbox((), (), (), self.stats.dropped),
-            SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s"),
-            lambda payload: self.states.append(decode(payload, State)),
-            lambda payload: self.links.append(decode(payload, LinkStats)),
-            lambda k, t_ns: self.slack.append((k, t_ns)),
-            lambda: self.stopped(),
-        )
-        return run_loop(self.site, 1, self._ticks, self.stats, ports)
+        inbox = PeerInbox((), (), (), (), (), self.stats.dropped)
+        timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
+        return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, self)
+
+    def should_stop(self) -> bool:
+        return self.stopped()
+
+    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
+        return self.site.step(TickInput(k, arrivals))
+
+    def publish_state(self, payload: bytes) -> None:
+        self.states.append(decode(payload, State))
+
+    def publish_link(self, payload: bytes) -> None:
+        self.links.append(decode(payload, LinkStats))
+
+    def attend(self, k: int, t_ns: int) -> None:
+        self.slack.append((k, t_ns))
+
+    def report(self, output: TickRecord) -> None: ...
+
+    def use_slack(self) -> None: ...
 
 
 @pytest.mark.parametrize("rate_hz", [100, 333, 1000, 1024, 3000])

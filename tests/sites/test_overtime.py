@@ -71,7 +71,7 @@ def test_a_single_hiccup_is_counted_and_no_more(hiccup_ns: int) -> None:
     overtime = steps.overtime()
     assert ended(steps, overtime) is None
     assert (overtime.hiccups, overtime.longest_tick, overtime.longest_ns) == (1, 700, hiccup_ns)
-    assert "at 1 ticks" in overtime.told()
+    assert "at 1 ticks" in overtime.describe_hiccups()
 
 
 def test_a_machine_that_takes_the_processor_away_is_no_fault_of_the_law() -> None:
@@ -86,7 +86,7 @@ def test_a_law_that_keeps_up_has_nothing_told() -> None:
     steps = Steps(lambda _: 700_000)
     overtime = steps.overtime()
     assert ended(steps, overtime) is None
-    assert overtime.told() == ""
+    assert overtime.describe_hiccups() == ""
 
 
 class Hanging:

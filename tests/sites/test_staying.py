@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from recorder.record_process import Recorder
-from sites.site_process import SiteOptions, SiteProcess
+from sites.site_parts import SiteOptions, SiteParts
+from sites.site_process import take_part
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.net.connection import Connection
 from trilat_net.process import Interrupt
@@ -36,11 +37,10 @@ class Ending:
             bus = self.session.network.join()
             options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder=True, stay_s=self._stay_s)
             interrupt = self.interrupts[name]
-            member = SiteProcess(
-                self.session.scenario, name, options, bus, clock, interrupt, lambda _text: None
-            )
+            scenario = self.session.scenario
+            parts = SiteParts(scenario, name, options, bus, clock, interrupt, lambda _text: None)
             try:
-                return member.live()
+                return take_part(parts)
             finally:
                 bus.close()
                 self.left_ns[name] = clock.monotonic_ns()

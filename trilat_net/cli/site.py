@@ -62,7 +62,8 @@ def site_command(
     Without endpoints, sites of a session find each other on this machine: each listens at a loopback port
     that follows from session and site, and connects to the sites before it in the scenario.
     """
-    from sites.site_process import SiteOptions, run_site
+    from sites.site_parts import SiteOptions
+    from sites.site_process import run_site
 
     from ..net.connection import default_endpoints
     from ..scenario import find_site

@@ -272,7 +272,7 @@ class SiteTiming:
     """
 
     def __init__(self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str) -> None:
-        self.grid = TickSchedule(epoch_ns, rate_hz)
+        self.schedule = TickSchedule(epoch_ns, rate_hz)
         self._epoch_ns = epoch_ns
         self._names = [peer.name for peer in peers]
         self._sent = SentStamps()
@@ -325,7 +325,7 @@ class SiteTiming:
             What a log should say of it.
         """
         news: list[ClockNotice] = []
-        due_ns = self.grid.deadline(k)
+        due_ns = self.schedule.deadline(k)
         self._estimate(k, now_ns, due_ns, news)
         for n, (name, meter) in enumerate(zip(self._names, self.meters, strict=True)):
             faulty = bool(meter.worst_ns) or meter.contradicted
@@ -336,7 +336,7 @@ class SiteTiming:
         if self._followed is not None:
             course = self._followed.course
             leader_ns = due_ns + course.at(due_ns) - self._leader_epoch_ns
-            self.grid.steer(k, leader_ns - self.grid.nominal(k), course.estimate.drift)
+            self.schedule.steer(k, leader_ns - self.schedule.nominal(k), course.estimate.drift)
         return news
 
     def _estimate(self, k: int, now_ns: int, due_ns: int, news: list[ClockNotice]) -> None:
@@ -359,8 +359,8 @@ class SiteTiming:
             "delay_max_us": {name: figure.delay_max_us for name, figure in figures.items()},
             "rtt_us": {name: figure.rtt_us for name, figure in figures.items()},
             "clock_faults": {name: figure.faults for name, figure in figures.items()},
-            "grid_error_us": self.grid.error_ns // 1000,
-            "slew_ppb": round(self.grid.slew),
+            "grid_error_us": self.schedule.error_ns // 1000,
+            "slew_ppb": round(self.schedule.slew),
         }
 
 

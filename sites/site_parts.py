@@ -1,0 +1,116 @@
+"""The parts of a site that live from its start to its end, and its options.
+
+Invariant: once made, every subscription of the site is declared and its step is compiled, so a site that
+declares itself alive is ready for its session.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from trilat_net.core.site_step import Site
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection
+from trilat_net.net.loop_stats import LoopStats
+from trilat_net.net.membership import new_boot
+from trilat_net.process import Interrupt
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.laws import ImportedLaw
+
+from .change_server import ChangeServer
+from .external_arm import MEASUREMENTS_KEPT, ExternalArm
+from .law_watchdog import LawWatchdog
+from .peer_monitor import PeerMonitor
+from .retransmit_buffer import RetransmitBuffer
+from .warmup import warm_up
+
+
+@dataclass(frozen=True, slots=True)
+class SiteOptions:
+    """How a site takes part in a session.
+
+    Attributes:
+        session: the session's name.
+        connection: its connection to the network.
+        join_timeout_s: how long to wait for the others, s.
+        needs_recorder: whether the session needs a recorder.
+        cpu: the processor to stay on, or None.
+        stay_s: how long to stay afterwards until the recorder has left, at most, s.
+        clock_offset_s: injected offset of the clock from the machine's, s.
+        clock_drift_ppm: injected drift of the clock, ppm.
+    """
+
+    session: str
+    connection: Connection
+    join_timeout_s: float = 60.0
+    needs_recorder: bool = False
+    cpu: int | None = None
+    stay_s: float = 0.0
+    clock_offset_s: float = 0.0
+    clock_drift_ppm: float = 0.0
+
+
+class SiteParts:
+    """One site's parts; attributes of the same names as the arguments, and those made here.
+
+    Attributes:
+        site: the site, at its start.
+        boot: this process's boot.
+        rates: tick rates of the peers, Hz.
+        stats: counters of its loop.
+        rings: the peers' records as they arrive.
+        watchdog: steps the site under a user's law; None without one.
+        arm: measurements of its external arm; None without one.
+        buffer: its recently published messages.
+        publish_state: publishes a record, and keeps it in the buffer.
+        publish_link: publishes statistics, and keeps them.
+        monitor: presence of the other members.
+        changes: answers change requests.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        options: SiteOptions,
+        bus: Bus,
+        clock: Clock,
+        interrupt: Interrupt,
+        say: Callable[[str], None],
+    ) -> None:
+        self.scenario, self.name, self.options = scenario, name, options
+        self.bus, self.clock, self.interrupt = bus, clock, interrupt
+        self.say: Callable[[str], None] = lambda text: say(f"{name}: {text}")
+        self.site, self.boot = Site(scenario.setup(name)), new_boot()
+        peers, session = self.site.peers, options.session
+        self.rates = [scenario.sites[peer].rate_hz for peer in peers]
+        self.stats = LoopStats(self.site, self.boot, self.rates)
+        law = scenario.sites[name].control
+        self.watchdog = LawWatchdog(self.site, law.code, clock) if isinstance(law, ImportedLaw) else None
+        self.rings = [
+            bus.stamped(topics.key(session, peer, topics.STATE), clock.monotonic_ns) for peer in peers
+        ]
+        self.arm: ExternalArm | None = None
+        if name in scenario.external:
+            key = topics.key(session, name, topics.MEASURED)
+            ring = bus.stamped(key, clock.monotonic_ns, MEASUREMENTS_KEPT)
+            place = " at ".join([key, *map(str, options.connection.places[:1])])
+            self.arm = ExternalArm(name, ring, clock, self.stats.dropped, place)
+        queries = bus.questions(topics.key(session, name, topics.PAST))
+        self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries)
+        self.publish_state = self._keeping_publisher(topics.STATE)
+        self.publish_link = self._keeping_publisher(topics.LINK)
+        self.monitor = PeerMonitor(bus, session, name, peers)
+        self.changes = ChangeServer(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
+        warm_up(scenario, name, clock)
+
+    def _keeping_publisher(self, channel: str) -> Callable[[bytes], None]:
+        keep = self.buffer.channels[channel].keep
+        publish = self.bus.publisher(topics.key(self.options.session, self.name, channel))
+
+        def keep_and_publish(payload: bytes) -> None:
+            keep(payload)
+            publish(payload)
+
+        return keep_and_publish
