@@ -32,7 +32,6 @@ def lap(what):
     last = now
 from trilat_net.reporting.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import certify
-from trilat_net.reporting.certificate_section import build_certificate_section
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
@@ -43,7 +42,7 @@ metrics_to_json(log, compute_log_metrics(log))
 lap("metrics")
 certify(log)
 lap("certificate")
-write_report(log, Path(sys.argv[2]), sections=[build_certificate_section(log)])
+write_report(log, Path(sys.argv[2]), certificate=certify(log))
 lap("report")
 simulate_without_operators(log)
 lap("twin")

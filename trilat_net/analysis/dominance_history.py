@@ -44,13 +44,22 @@ def trace_dominance(log: Log, track: AlignedRecords) -> DominanceHistory:
     """
     row = log.scenario.dominance[track.site]
     start = np.array([row.get(peer, 0.0) for peer in track.used])
+    return evaluate_ramps(start, list_dominance_ramps(log, track.site), track.t_s, track.h_s)
+
+
+def list_dominance_ramps(log: Log, site: str) -> list[DominanceRamp]:
+    """Returns the changes of the shares of a site: those of the scenario, then those in its records.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
     scripted = [
-        log.scenario.ramp(track.site, change.shares, change.start_ns, change.ramp_s)
+        log.scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
         for change in log.scenario.timeline
-        if change.dominance == track.site
+        if change.dominance == site
     ]
-    ordered = [c.ramp for batch in log.commands(track.site).values() for c in batch if c.ramp is not None]
-    return evaluate_ramps(start, [*scripted, *ordered], track.t_s, track.h_s)
+    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
+    return [*scripted, *ordered]
 
 
 def evaluate_ramps(start: Array, ramps: list[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:

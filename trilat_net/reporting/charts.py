@@ -5,19 +5,20 @@ third of their length as text.
 """
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..analysis import site_signals
-from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models
+from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
 from ..analysis.trace_decimation import decimate
 from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
 from . import style
 from .figures import arm_poses, loop_timing, sample_age
 from .figures.joint_motion import THETA_UNITS
@@ -35,7 +36,7 @@ class Charts:
 
     Args:
         log: the log.
-        twin: the same experiment with nobody at the arms, or None.
+        twin: the same experiment without operators, or None.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
@@ -50,7 +51,7 @@ class Charts:
         """Returns tables and charts, ready for JSON."""
         charts = [*self._motion(), *self._timing()]
         return {
-            "end_s": style.time_axis_end_s(self._log),
+            "end_s": recorded_end_s(self._log),
             "colours": {"light": list(style.SITE_COLOURS), "dark": list(style.DARK_SITE_COLOURS)},
             "tables": self._tables,
             "charts": charts,
@@ -62,11 +63,11 @@ class Charts:
                 site: [(index, *span) for span in find_mode_intervals(self._log[site])]
                 for index, site in enumerate(self._log.sites)
             },
-            "arms": self._arms(),
+            "arms": [self._arm(index, site) for index, site in enumerate(self._log.sites)],
         }
 
-    def _table(self, site: str, tick: Ints, t_s: Array, values: Array) -> int:
-        """Stores the columns of a site, thinned together, and returns the number of the table."""
+    def _table(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> int:
+        """Stores the columns of a site, decimated together, and returns the number of the table."""
         trace = decimate(tick, t_s, values, self._buckets)
         self._tables.append(
             {
@@ -77,105 +78,88 @@ class Charts:
         )
         return len(self._tables) - 1
 
-    def _tables_of(self, sites: list[str], quantity: Any) -> dict[str, int]:
-        parts = {site: self._log[site] for site in sites}
-        return {s: self._table(s, part.tick, part.t_s, quantity(part)) for s, part in parts.items()}
+    def _site_table(self, site: str, values: NDArray[Any]) -> int:
+        """Stores columns over all records of a site."""
+        return self._table(site, self._log[site].tick, self._log[site].t_s, values)
 
     def _series(self, site: str, table: int, column: int, label: str = "") -> ChartJson:
-        return {
-            "label": label or site,
-            "colour": self._log.sites.index(site),
-            "table": table,
-            "column": column,
-        }
+        colour = self._log.sites.index(site)
+        return {"label": label or site, "colour": colour, "table": table, "column": column}
 
-    def _chart(
-        self, section: str, title: str, unit: str, series: list[ChartJson], **options: Any
-    ) -> ChartJson:
-        return {"section": section, "title": title, "unit": unit, "series": series, **options}
+    def _motion(self) -> Iterator[ChartJson]:
+        log = self._log
+        operated = site_signals.sites_with_operator(log)
+        if operated:
+            tables = self._tables_of(site_signals.external_torques, operated)
+            yield from self._per_joint("torques", "operator torque on the arm", "N m", tables)
+        yield from self._positions()
+        tables = self._tables_of(site_signals.joint_errors)
+        yield from self._per_joint("errors", "tracking error", "rad", tables)
+        yield from self._estimates()
+        if self._twin is not None:
+            moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites}
+            tables = {s: self._table(s, *columns) for s, columns in moved.items()}
+            yield from self._per_joint("moved", "moved by the operators", "rad", tables)
+        tables = self._tables_of(site_signals.controller_torques)
+        yield from self._per_joint("control", "control torque", "N m", tables)
+
+    def _tables_of(
+        self, signal: Callable[[SiteLog], NDArray[Any]], sites: list[str] | None = None
+    ) -> dict[str, int]:
+        return {s: self._site_table(s, signal(self._log[s])) for s in sites or self._log.sites}
 
     def _per_joint(self, section: str, title: str, unit: str, tables: dict[str, int]) -> Iterator[ChartJson]:
         for joint in range(JOINTS):
             series = [self._series(site, table, joint) for site, table in tables.items()]
-            yield self._chart(section, f"{title}, joint {joint + 1}", unit, series)
-
-    def _motion(self) -> Iterator[ChartJson]:
-        log, sites = self._log, list(self._log.sites)
-        hands = site_signals.sites_with_operator(log)
-        if hands:
-            tables = self._tables_of(hands, site_signals.external_torques)
-            yield from self._per_joint("torques", "torque of the hands on the arm", "N m", tables)
-        yield from self._positions()
-        tables = self._tables_of(sites, site_signals.joint_errors)
-        yield from self._per_joint("errors", "tracking error", "rad", tables)
-        yield from self._estimates()
-        if self._twin is not None:
-            moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in sites}
-            tables = {s: self._table(s, *columns) for s, columns in moved.items()}
-            yield from self._per_joint("moved", "moved by the hands", "rad", tables)
-        tables = self._tables_of(sites, site_signals.controller_torques)
-        yield from self._per_joint("control", "control torque", "N m", tables)
+            yield _chart(section, f"{title}, joint {joint + 1}", unit, series)
 
     def _positions(self) -> Iterator[ChartJson]:
         for site in self._log.sites:
             part = self._log[site]
             both = np.stack([site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2)
             for joint in range(JOINTS):
-                table = self._table(site, part.tick, part.t_s, both[:, joint])
-                desired = {
-                    "label": "desired",
-                    "colour": LIMIT_COLOUR,
-                    "dash": True,
-                    "table": table,
-                    "column": 1,
-                }
-                series = [self._series(site, table, 0), desired]
-                yield self._chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
+                table = self._site_table(site, both[:, joint])
+                desired = {"colour": LIMIT_COLOUR, "dash": True}
+                series = [
+                    self._series(site, table, 0),
+                    {**self._series(site, table, 1, "desired"), **desired},
+                ]
+                yield _chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
 
     def _estimates(self) -> Iterator[ChartJson]:
         log = self._log
-        tables = self._tables_of(list(log.sites), site_signals.parameter_estimates)
+        tables = self._tables_of(site_signals.parameter_estimates)
         for index in range(PARAMETERS):
             series = [self._series(site, table, index) for site, table in tables.items()]
-            truths = {site: float(site_signals.true_parameters(log, site)[index]) for site in log.sites}
-            same = len(set(truths.values())) == 1
-            lines = [
-                {"value": truth, "colour": LIMIT_COLOUR if same else log.sites.index(site)}
-                for site, truth in list(truths.items())[: 1 if same else None]
-            ]
+            truths = [float(site_signals.true_parameters(log, site)[index]) for site in log.sites]
+            lines: list[ChartJson] = [{"value": truth, "colour": n} for n, truth in enumerate(truths)]
+            if len(set(truths)) == 1:
+                lines = [{"value": truths[0], "colour": LIMIT_COLOUR}]
             title = f"estimate of θ{'₁₂₃₄₅'[index]}"
-            yield self._chart("estimates", title, THETA_UNITS[index], series, lines=lines)
+            yield _chart("estimates", title, THETA_UNITS[index], series, lines=lines)
 
     def _timing(self) -> Iterator[ChartJson]:
         log = self._log
         yield from self._ages()
         if sample_age.has_varying_delay(log):
             yield from self._distributions()
-        if loop_timing.has_loop_times(log):
-            tables = self._tables_of(list(log.sites), lambda part: part.late_us[:, np.newaxis] * 1e-3)
+        if not loop_timing.explain_missing_loop_times(log):
+            tables = self._tables_of(lambda part: part.late_us[:, np.newaxis] * 1e-3)
             series = [self._series(site, table, 0) for site, table in tables.items()]
-            yield self._chart("timing", "wake-up after the deadline", "ms", series, zero=True)
+            yield _chart("timing", "wake-up after the deadline", "ms", series, zero=True)
             yield from self._histograms()
 
     def _ages(self) -> Iterator[ChartJson]:
         log = self._log
         for site in log.sites:
-            part, age_ms = log[site], site_signals.sample_ages_ms(log, site)
-            table = self._table(site, part.tick, part.t_s, age_ms)
-            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(part.peers)]
+            age_ms, peers = site_signals.sample_ages_ms(log, site), log[site].peers
+            table = self._site_table(site, age_ms)
+            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)]
             lines = self._stated(site)
             drawn = np.concatenate([age_ms.ravel(), [line["value"] for line in lines]])
-            yield self._chart(
-                "ages",
-                f"age of the samples that {site} uses",
-                "ms",
-                series,
-                lines=lines,
-                margin=0.025,
-                sites=[site],
-                links=True,
-                log=sample_age.needs_log_axis(drawn),
-            )
+            axis = {"margin": 0.025, "log": sample_age.needs_log_axis(drawn)}
+            title = f"age of the samples that {site} uses"
+            yield _chart("ages", title, "ms", series, lines=lines, sites=[site], links=True, **axis)
 
     def _stated(self, site: str) -> list[ChartJson]:
         """Returns the stated mean delays of the links to a site, as lines while they held."""
@@ -203,48 +187,43 @@ class Charts:
                     entry = {"label": f"{name}, {link.peer}", "values": percent, "dash": dash}
                     series.append({**entry, "colour": self._log.sites.index(link.peer)})
             title = f"delay and age on the way to {site}"
-            yield self._chart("delays", title, "ms", series, points=len(x_ms), end=float(x_ms[-1]))
+            yield _chart("delays", title, "ms", series, points=len(x_ms), end=float(x_ms[-1]))
 
     def _histograms(self) -> Iterator[ChartJson]:
         log = self._log
         edges = loop_timing.loop_time_bin_edges(log)
+        periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
         titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
         for field, title in titles.items():
-            counts = {
-                site: loop_timing.bin_loop_times(getattr(log[site], field), edges) for site in log.sites
-            }
             series = [
-                {"label": site, "colour": log.sites.index(site), "counts": count.tolist()}
-                for site, count in counts.items()
-            ]
-            periods = {1e6 / log.scenario.sites[site].rate_hz for site in log.sites}
-            yield self._chart(
-                "timing", f"{title}, histogram", "µs", series, edges=edges.tolist(), periods=sorted(periods)
-            )
-
-    def _arms(self) -> list[ChartJson]:
-        """Returns what draws an arm at any time: its links and where its angles stand among the tables."""
-        found = []
-        for index, site in enumerate(self._log.sites):
-            part, arm = self._log[site], self._log.scenario.sites[site].arm
-            values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
-            found.append(
                 {
-                    "site": site,
-                    "colour": index,
-                    "links_m": [arm.l1_m, arm.l2_m],
-                    "table": self._table(site, part.tick, part.t_s, values),
+                    "label": site,
+                    "colour": n,
+                    "counts": loop_timing.bin_loop_times(getattr(log[site], field), edges).tolist(),
                 }
-            )
-        return found
+                for n, site in enumerate(log.sites)
+            ]
+            axis = {"edges": edges.tolist(), "periods": periods}
+            yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
+
+    def _arm(self, index: int, site: str) -> ChartJson:
+        """Returns what draws an arm at any time: its links and the table of its angles."""
+        part, arm = self._log[site], self._log.scenario.sites[site].arm
+        values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
+        table = self._site_table(site, values)
+        return {"site": site, "colour": index, "links_m": [arm.l1_m, arm.l2_m], "table": table}
+
+
+def _chart(section: str, title: str, unit: str, series: list[ChartJson], **options: Any) -> ChartJson:
+    return {"section": section, "title": title, "unit": unit, "series": series, **options}
 
 
 def workspace_box_m(log: Log) -> tuple[float, float, float, float]:
-    """Returns left, right, bottom and top of a box around all that the arms did, m."""
+    """Returns left, right, bottom and top of a box around the motion of all arms, m."""
     drawn = [
         arm_poses.pose_at(log, site, t)
         for site in log.sites
-        for t in np.linspace(0.0, style.time_axis_end_s(log), 60)
+        for t in np.linspace(0.0, recorded_end_s(log), 60)
     ]
     return arm_poses.pose_box_m(drawn)
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.certificate.stability_certificate import certify
 from ..errors import LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import RECORDS_LABEL, CheckLine, check_log_files
 from ..execution.verify import find_last_ticks
@@ -22,13 +23,13 @@ from .text_table import TextTable
 
 
 class Conclusion(NamedTuple):
-    """A log, judged.
+    """A finished run with its checks.
 
     Attributes:
         table: a row per site.
-        notes: what links did and what happened, a line each.
-        lines: what was checked and how it came out.
-        paths: the files that were made.
+        notes: links, changes, modes, clocks and certificate, a line each.
+        lines: the checks and their results.
+        paths: the log's files, and those that were written.
     """
 
     table: TextTable
@@ -38,12 +39,12 @@ class Conclusion(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """True where every check passed."""
+        """True if every check passed."""
         return all(line.passed for line in self.lines)
 
     @property
     def agreed(self) -> bool:
-        """True where every execution agreed with the log, complete or not."""
+        """True if every execution agreed with the log, complete or not."""
         return all(line.passed for line in self.lines if line.label != RECORDS_LABEL)
 
 
@@ -52,15 +53,14 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
 
     Args:
         log: the log, from a file.
-        folder: where the results go; exists.
-        progress: told how many figures are drawn, and how many there are.
+        folder: of the results; exists.
+        progress: called with the number of figures that are drawn, and of all.
 
     Raises:
         LogError: a record cannot be read.
         RunFailed: the process that executes the log was ended.
     """
     # Matplotlib takes a second, and `verify` needs none of it
-    from .certificate_section import build_certificate_section
     from .page import write_report
 
     lines: list[CheckLine] = []
@@ -68,8 +68,8 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
         with ignore_sigint():
             checking = pool.submit(check_log_files, log.sources)
         twin = _run_without_operators(log)
-        certified = build_certificate_section(log)
-        notes = [*format_run_lines(log), f"certificate: {certified.facts['text']}"]
+        certificate = certify(log)
+        notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
 
         def verdicts() -> Iterator[CheckLine]:
             try:
@@ -79,14 +79,14 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
             yield from lines
 
         made = write_report(
-            log, folder, twin=twin, verdicts=verdicts(), progress=progress, sections=[certified]
+            log, folder, twin=twin, certificate=certificate, verdicts=verdicts(), progress=progress
         )
     table = TextTable(_HEADERS, [_site_row(log, site) for site in log.sites], align="lr")
     return Conclusion(table, notes, lines, [*map(Path, log.sources), *made])
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Returns the same run without hands; None where it would be the same, or cannot be run."""
+    """Returns the same run without operators; None if it would be the same, or cannot be run."""
     broke_off = any(event.kind == "failed" for event in log.events)  # so would the twin, or hang
     pushed = any(site.hands for site in log.scenario.sites.values())
     if broke_off or log.scenario.external or not pushed:

@@ -1,4 +1,4 @@
-"""Write the report of a log: `report.html`, `summary.json` and the figures, with sections from other modules.
+"""Write the report of a log: `report.html`, `summary.json` and the figures.
 
 Invariant: the page is one file with images, styles and scripts inside; it loads nothing from a network.
 """
@@ -11,86 +11,39 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any, NamedTuple
+from typing import Any
 
-from matplotlib.figure import Figure
-
+from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
 from ..analysis.run_summary import JsonObject, summarise_run
 from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from . import arm_svg, charts, page_tables, style
-from .figures import joint_motion, loop_timing
-from .figures.registry import write_report_figures
+from .figures.certificate_energy import draw_functional
+from .figures.loop_timing import explain_missing_loop_times
+from .figures.registry import explain_absent_operator, write_report_figures
 
 _PAGE_DPI = 110
-
-
-class ReportSection(NamedTuple):
-    """A section of the page.
-
-    Attributes:
-        key: its name in `summary.json`, and of its figure's file.
-        heading: in words.
-        html: its body, with everything escaped that came from outside.
-        facts: its numbers, ready for JSON.
-        figure: what it shows; None: nothing.
-    """
-
-    key: str
-    heading: str
-    html: str
-    facts: dict[str, Any]
-    figure: Figure | None = None
-
-
-def render_sections(sections: Sequence[ReportSection]) -> str:
-    """Returns the sections for the page, figures and all."""
-    return "".join(
-        f"<section><h2>{escape(one.heading)}</h2>{one.html}{_image(one)}</section>" for one in sections
-    )
-
-
-def write_section_figures(sections: Sequence[ReportSection], folder: Path) -> list[Path]:
-    """Writes the sections' figures as PNG into a folder that exists, and returns the paths."""
-    paths = []
-    for one in sections:
-        if one.figure is not None:
-            paths.append(folder / f"{one.key}.png")
-            one.figure.savefig(paths[-1], dpi=style.REPORT_DPI)
-    return paths
-
-
-def _image(section: ReportSection) -> str:
-    if section.figure is None:
-        return ""
-    stream = io.BytesIO()
-    section.figure.savefig(stream, format="png", dpi=_PAGE_DPI)
-    data = base64.b64encode(stream.getvalue()).decode()
-    alt = escape(section.heading)
-    return f'<img src="data:image/png;base64,{data}" alt="{alt}" style="max-width:100%">'
-
-
 _ASSETS = resources.files("trilat_net.reporting") / "assets"
 
 _SECTIONS = {
-    "torques": ("What the hands did", "The torque of the operators' hands on the arms; Fig. 3 of the paper."),
+    "torques": ("Operator torques", "The torque of the operators on the arms; Fig. 3 of the paper."),
     "positions": ("Positions", "Actual and desired joint angles; Fig. 4 of the paper."),
     "errors": ("Tracking errors", "e = q − q_des, Eq. (9); Fig. 5 of the paper."),
     "estimates": (
         "Parameter estimates",
         "Dashed: the true value, Eq. (24). Fig. 6 of the paper shows one site.",
     ),
-    "moved": ("How far the hands moved the arms", "The log minus the same run with nobody at the arms."),
-    "control": ("Control torques", "τ of Eq. (13), what the controllers ask of the joints."),
+    "moved": ("Motion due to the operators", "The log minus the same run without operators."),
+    "control": ("Control torques", "τ of Eq. (13), the controllers' command to the joints."),
     "ages": (
         "Age of the samples in use",
-        "Now minus the stamp of the sample in use: the effective delay. Dashed: the mean delay as stated.",
+        "Now minus the stamp of the sample in use: the effective delay. Dashed: the stated mean delay.",
     ),
     "delays": (
-        "Delay and age, how often",
-        "Which share of samples has no more delay, and which share of ticks no more age, than so much.",
+        "Distributions of delay and age",
+        "The percentage of samples with at most that delay, and of ticks with at most that age.",
     ),
     "timing": ("The loops", "How late each loop woke up, and how long its ticks took."),
 }
@@ -99,9 +52,9 @@ _EFFECTIVE = (
     "makes it shorter than stated where the newest sample wins, and longer where samples stay in order."
 )
 _SAMPLES = (
-    "What became of the samples. Superseded: never used, because a newer one came into use before or with it."
+    "Delivery of the samples. Superseded: never used, because a newer one came into use before or with it."
 )
-_CLOCKS = "The sender's clock against the receiver's, as it was estimated while the session ran."
+_CLOCKS = "The sender's clock against the receiver's, as estimated while the session ran."
 
 
 def write_report(
@@ -109,49 +62,57 @@ def write_report(
     folder: Path,
     *,
     twin: Log | None = None,
+    certificate: Certificate | None = None,
     verdicts: Iterable[CheckLine] = (),
     progress: Progress | None = None,
-    sections: Sequence[ReportSection] = (),
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
 
-    Figures are drawn first: verdicts may still be in the making.
+    Figures are drawn before the verdicts are read, which may still be in the making.
 
     Args:
         log: the log.
-        folder: where to; made if it does not exist.
-        twin: the same experiment with nobody at the arms, or None.
-        verdicts: what was checked and how it came out.
-        progress: told how many figures are drawn, and how many there are.
-        sections: what is shown besides, from elsewhere.
+        folder: made if it does not exist.
+        twin: the same experiment without operators, or None.
+        certificate: the log's, for a section of its own; None leaves it out.
+        verdicts: the checks of the log and their results.
+        progress: called with the number of figures that are drawn, and of all.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
-    figures = [*write_report_figures(log, folder, twin, progress), *write_section_figures(sections, folder)]
+    figures = write_report_figures(log, folder, twin, progress)
+    section = ""
+    if certificate is not None:
+        facts["certificate"] = certificate_to_json(certificate)
+        section = page_tables.render_certificate(certificate)
+        if certificate.balance is not None:
+            drawn = draw_functional(log, certificate)
+            figures.append(folder / "certificate.png")
+            style.write_figure(drawn, figures[-1], style.REPORT_DPI)
+            stream = io.BytesIO()
+            drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
+            data = base64.b64encode(stream.getvalue()).decode()
+            section += f'<img src="data:image/png;base64,{data}" alt="V and energies" style="max-width:100%">'
+        section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
-    checks = [line._asdict() for line in lines]
+    facts["checks"] = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    write_whole(page, render_report(log, twin, lines, facts, sections))
-    more = {section.key: section.facts for section in sections}
-    write_whole(numbers, _json({**facts, **more, "checks": checks}, indent=2) + "\n")
+    write_whole(page, render_report(log, twin, lines, facts, section))
+    write_whole(numbers, _json(facts, indent=2) + "\n")
     return [page, numbers, *figures]
 
 
 def render_report(
-    log: Log,
-    twin: Log | None,
-    verdicts: Sequence[CheckLine],
-    facts: JsonObject,
-    sections: Sequence[ReportSection] = (),
+    log: Log, twin: Log | None, verdicts: Sequence[CheckLine], facts: JsonObject, certificate: str = ""
 ) -> str:
     """Returns the page of a log.
 
     Args:
         log: the log.
-        twin: the same experiment with nobody at the arms, or None.
-        verdicts: what was checked and how it came out.
-        facts: as from `summarise`.
-        sections: what is shown besides, from elsewhere.
+        twin: the same experiment without operators, or None.
+        verdicts: the checks of the log and their results.
+        facts: as from `summarise_run`.
+        certificate: the section of the certificate, as HTML.
     """
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
@@ -166,7 +127,7 @@ def render_report(
         loops=page_tables.render_loops(log, facts),
         links=_links(log, facts),
         strip=arm_svg.render_arms_svg(log, bounds),
-        sections=render_sections(sections) + _sections(log, data["charts"]),
+        sections=certificate + _sections(log, data["charts"]),
         assumed=page_tables.render_assumptions(scenario),
         again=page_tables.render_commands(log),
         versions=page_tables.render_versions(log),
@@ -182,9 +143,9 @@ def render_report(
 
 
 def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
-    """Returns a heading, a sentence and room for charts per section, or why there are none."""
+    """Returns a heading, a sentence and room for charts per section, or the reason why there are none."""
     filled = {chart["section"] for chart in drawn}
-    absent = {"torques": joint_motion.NO_OPERATOR, "timing": loop_timing.explain_missing_loop_times(log)}
+    absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
     html = ""
     for key, (heading, sentence) in _SECTIONS.items():
         if key in filled:
@@ -198,13 +159,13 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
 
 
 def _links(log: Log, facts: JsonObject) -> str:
-    """Returns what the links did and what happened besides, in tables, each with a sentence."""
+    """Returns the tables of links, clocks, changes and modes, each with a sentence."""
     parts = [
         (page_tables.render_link_ages(log, facts), _EFFECTIVE),
         (page_tables.render_link_samples(log, facts), _SAMPLES),
         (page_tables.render_clocks(log, facts), _CLOCKS),
-        (page_tables.render_changes(facts), "What was changed while it ran; charts have its number."),
-        (page_tables.render_modes(log, facts), "What sites did about stale peers; charts are shaded then."),
+        (page_tables.render_changes(facts), "Changes during the run; charts show their numbers."),
+        (page_tables.render_modes(log, facts), "Reactions of sites to stale peers; charts are shaded then."),
     ]
     return "".join(
         f'<p class="note">{escape(sentence)}</p><div class="scroll">{table}</div>'

@@ -1,4 +1,4 @@
-"""HTML tables and paragraphs of the report page: run, sites, loops, links, clocks, changes, versions.
+"""HTML tables and paragraphs of the report page: run, sites, loops, links, clocks, changes, certificate.
 
 Invariant: every text from a scenario or a log is escaped here, cell by cell. Empty tables are left out.
 """
@@ -9,14 +9,25 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.run_summary import JsonObject
 from ..execution.log_checks import CheckLine
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario
+from .certificate_text import describe_certificate, list_energies
+from .style import typeset
+
+_MOST_MODES = 200
+"""Intervals of a site that are listed."""
+_PREMISE_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
+_CERTIFICATE_NOTE = (
+    "V of the theorem, with the weights that the shares ask for, and its energy balance: what is left of "
+    "V − V(0) + dissipation − work must vanish, whatever the operators do."
+)
 
 
 def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
-    """Returns the list of verdicts; "" where nothing was checked."""
+    """Returns the list of verdicts; "" if nothing was checked."""
     items = ""
     for line in verdicts:
         kind, mark = ("passed", "✓ ok") if line.passed else ("failed", "✗ failed")
@@ -31,58 +42,158 @@ def render_description(scenario: Scenario) -> str:
 
 
 def render_run_facts(log: Log, facts: JsonObject) -> str:
-    """Returns the table of what the run was."""
-    scenario = log.scenario
+    """Returns the table of the run."""
+    scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
+    settled = f"every |e| below {facts['settle_below_rad']:g} rad"
+    dominance = "; ".join(
+        f"{site} follows " + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
+        for site, shares in scenario.dominance.items()
+    )
     rows = [
         ("scenario", f"{scenario.name}, sha256 {scenario.sha256[:16]}"),
-        ("driven by", _driven(log)),
+        ("driven by", _describe_driver(log)),
         ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}"),
-        ("records", f"{facts['records']}, {facts['missing']} missing" + _torn(log)),
+        ("records", f"{facts['records']}, {facts['missing']} missing{torn}"),
         ("largest error at the end", f"{format_cell(facts['max_error_end_rad'])} rad in the last second"),
-        ("settled", _settled(facts)),
-        ("dominance", _dominance(scenario)),
+        (
+            "settled",
+            "not within the run"
+            if facts["settle_s"] is None
+            else f"{settled} from {facts['settle_s']:.3f} s on",
+        ),
+        ("dominance", dominance),
         ("diverged", "yes" if facts["diverged"] else "no"),
     ]
-    return _facts(rows)
+    return _render_facts(rows)
 
 
 def render_sites(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the sites: their records, and how they moved."""
-    return render_html_table(_SITE_HEADS, [_site_row(log, facts, name) for name in log.sites])
-
-
-def render_loops(log: Log, facts: JsonObject) -> str:
-    """Returns the table of how the loops kept time; "" in virtual time, which keeps none."""
-    if log.driver == "virtual":
-        return ""
+    """Returns the table of the sites: their records and their motion."""
+    headers = ["site", "records", "missing", "q at the end (rad)", "max |e| (rad)", "max |e|, last 1 s (rad)"]
+    headers += ["settled (s)", "max |τ| (N\u00a0m)", "ticks at the limit", "moved by operators, max (rad)"]
     rows = []
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
-        late, busy = site["late_us"], site["busy_us"]
-        values = [*(late[key] for key in ("p50", "p99", "p99_9", "max"))]
-        values += [*(busy[key] for key in ("p50", "p99", "max")), site["overruns"]]
-        rows.append([_site_label(log, name), *("–" if v is None else f"{v:.0f}" for v in values)])
-    return render_html_table(_LOOP_HEADS, rows)
+        motion = (site[key] for key in ("max_error_rad", "max_error_end_rad", "settle_s", "peak_tau_nm"))
+        cells = [str(site["records"]), str(site["missing"]), _format_numbers(site["q_end_rad"])]
+        cells += [*map(format_cell, motion), str(site["saturated_ticks"])]
+        rows.append([_label_site(log, name), *cells, _format_numbers(site["hands_moved_max_rad"])])
+    return render_html_table(headers, rows)
 
 
-def _site_row(log: Log, facts: JsonObject, name: str) -> list[str]:
-    site: JsonObject = facts["sites"][name]
-    cells = [
-        str(site["records"]),
-        str(site["missing"]),
-        _numbers(site["q_end_rad"]),
-        format_cell(site["max_error_rad"]),
-        format_cell(site["max_error_end_rad"]),
-        format_cell(site["settle_s"]),
-        format_cell(site["peak_tau_nm"]),
-        str(site["saturated_ticks"]),
-        _numbers(site["hands_moved_max_rad"]),
+def render_loops(log: Log, facts: JsonObject) -> str:
+    """Returns the table of the loops' timing; "" in virtual time, which has none."""
+    if log.driver == "virtual":
+        return ""
+    headers = ["loop", "late p50 (µs)", "late p99 (µs)", "late p99.9 (µs)", "late max (µs)"]
+    headers += ["busy p50 (µs)", "busy p99 (µs)", "busy max (µs)", "overruns"]
+    rows = []
+    for name in log.sites:
+        site: JsonObject = facts["sites"][name]
+        values = [*(site["late_us"][key] for key in ("p50", "p99", "p99_9", "max"))]
+        values += [*(site["busy_us"][key] for key in ("p50", "p99", "max")), site["overruns"]]
+        rows.append([_label_site(log, name), *("–" if v is None else f"{v:.0f}" for v in values)])
+    return render_html_table(headers, rows)
+
+
+def render_link_ages(log: Log, facts: JsonObject) -> str:
+    """Returns the table of the links: the stated delay, and the delay that the controller saw."""
+    headers = ["link", "stated delay", "effective, mean (ms)", "deviation", "p50", "p99", "min", "max"]
+    headers += ["nothing new (% of ticks)", "longest silence (ms)"]
+    rows = []
+    for name, link in facts["links"].items():
+        first, *later = link["stated"]
+        stated = [first["link"], *(f"from {state['from_s']:g} s: {state['link']}" for state in later)]
+        ages = [link["age_ms"][key] for key in ("mean", "deviation", "p50", "p99", "min", "max")]
+        cells = [*ages, _percent(link["ticks_without_new"]), link["silence_ms"]]
+        text = "<br>".join(escape(typeset(words)) for words in stated)
+        rows.append([_label_link(log, name), text, *map(format_cell, cells)])
+    return render_html_table(headers, rows, words=[1])
+
+
+def render_link_samples(log: Log, facts: JsonObject) -> str:
+    """Returns the table of the delivery of samples, with measured delays if there are any."""
+    headers = ["link", "samples sent", "missing on the way", "lost by the model", "late", "superseded"]
+    headers += ["duplicates", "of the model", "lost in all (%)", "in a row"]
+    keys = ("sent", "missing", "lost", "late", "superseded", "duplicate", "copies")
+    links: dict[str, JsonObject] = facts["links"]
+    measured = any(link["one_way_us"] for link in links.values())
+    if measured:
+        headers += ["one way, min (µs)", "p50", "p99", "max", "known to, p50 (µs)"]
+    rows = []
+    for name, link in links.items():
+        counts: JsonObject = link["samples"] or {}
+        cells = [*map(counts.get, keys), _percent(link["loss"]), link["burst"]]
+        if measured:
+            way, clock = link["one_way_us"] or {}, link["clock"] or {}
+            cells += [*map(way.get, ("min", "p50", "p99", "max")), clock.get("bound_p50_us")]
+        rows.append([_label_link(log, name), *map(format_cell, cells)])
+    return render_html_table(headers, rows)
+
+
+_CLOCK_COLUMNS = {
+    "offset_us": "ahead at the end (µs)",
+    "offset_first_us": "at the start",
+    "drift_ppm": "drift (ppm)",
+    "drift_bound_ppm": "known to (ppm)",
+    "bound_us": "offset known to, end (µs)",
+    "bound_p50_us": "p50",
+    "bound_max_us": "max",
+    "rtt_min_us": "round trip, min (µs)",
+    "faults": "faults",
+}
+
+
+def render_clocks(log: Log, facts: JsonObject) -> str:
+    """Returns the table of the clocks as sites saw them; "" if all read the same one."""
+    rows = []
+    for name, link in facts["links"].items():
+        clock: JsonObject = link["clock"] or {}
+        if clock and (clock["bound_max_us"] or clock["offset_us"]):
+            rows.append([_label_link(log, name), *(format_cell(clock[key]) for key in _CLOCK_COLUMNS)])
+    return render_html_table(("clock of the sender", *_CLOCK_COLUMNS.values()), rows) if rows else ""
+
+
+def render_changes(facts: JsonObject) -> str:
+    """Returns the table of the changes during the run; "" without any."""
+    rows = []
+    for n, changed in enumerate(facts["changes"], 1):
+        tick = changed["taken_at_tick"]
+        by = "scenario" if tick is None else f"ordered, taken in at tick {tick} of {changed['site']}"
+        about, to = (escape(typeset(changed[key])) for key in ("about", "to"))
+        rows.append([str(n), about, format_cell(changed["at_s"]), to, escape(by)])
+    headers = ("no.", "what", "from (s)", "becomes", "by")
+    return render_html_table(headers, rows, words=[1, 3, 4]) if rows else ""
+
+
+def render_modes(log: Log, facts: JsonObject) -> str:
+    """Returns the table of the times in which sites held, braked or returned; "" if none did."""
+    rows = [
+        [_swatch(log, name) + escape(name), span["mode"], f"{span['from_s']:.3f}", f"{span['to_s']:.3f}"]
+        for name, site in facts["sites"].items()
+        for span in site["modes"][:_MOST_MODES]
     ]
-    return [_site_label(log, name), *map(escape, cells)]
+    return render_html_table(("site", "mode", "from (s)", "to (s)"), rows, words=[1]) if rows else ""
+
+
+def render_certificate(certificate: Certificate) -> str:
+    """Returns verdict, premises and energies of a stability certificate."""
+    premises = "".join(
+        f"<tr><th>{escape(p.name)}</th><th>{_PREMISE_MARKS[p.holds]}</th><td>{escape(p.text)}</td></tr>"
+        for p in certificate.premises
+    )
+    first, *others = (escape(line.text) for line in describe_certificate(certificate))
+    html = f"<p><strong>{first}</strong></p>" + "".join(f"<p>{text}</p>" for text in others)
+    html += f'<div class="scroll"><table class="facts">{premises}</table></div>'
+    if certificate.balance is None:
+        return html
+    rows = [(escape(name), f"{value:.4g}") for name, value in list_energies(certificate.balance)]
+    table = f'<div class="scroll">{render_html_table(("energy", "J"), rows)}</div>'
+    return f'{html}{table}<p class="note">{escape(_CERTIFICATE_NOTE)}</p>'
 
 
 def render_assumptions(scenario: Scenario) -> str:
-    """Returns what the scenario assumes beyond its source."""
+    """Returns the scenario's assumptions beyond its source."""
     if not scenario.assumed:
         return "<p>Nothing is declared as assumed.</p>"
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in scenario.assumed)}</ul>"
@@ -105,21 +216,19 @@ def render_commands(log: Log) -> str:
 
 
 def render_versions(log: Log) -> str:
-    """Returns the table of what made the log."""
+    """Returns the table of commit, platform and versions that made the log."""
     session = log.session
-    names = [key for key in session if key.startswith("version_")]
-    commit = session.get("commit", "unknown")
     changed = " with changes" if session.get("commit_dirty") == "true" else ""
     rows = [
-        ("commit", commit + changed),
+        ("commit", session.get("commit", "unknown") + changed),
         ("fingerprint of arithmetic", session.get("fingerprint", "unknown")),
         ("platform", f"{session.get('platform', 'unknown')}, {session.get('python', 'unknown')}"),
-        *((name.removeprefix("version_"), session[name]) for name in names),
     ]
-    return _facts(rows)
+    versions = [(k.removeprefix("version_"), v) for k, v in session.items() if k.startswith("version_")]
+    return _render_facts([*rows, *versions])
 
 
-def _driven(log: Log) -> str:
+def _describe_driver(log: Log) -> str:
     if log.driver == "virtual":
         return "virtual time"
     if log.driver == "rerun":
@@ -130,223 +239,52 @@ def _driven(log: Log) -> str:
     return f"live, session {log.session.get('session', '')}, epoch {began:%Y-%m-%d %H:%M:%S} UTC"
 
 
-def _torn(log: Log) -> str:
-    return "" if log.complete else "; the file was not finished"
-
-
-def _settled(facts: JsonObject) -> str:
-    limit = f"every |e| below {facts['settle_below_rad']:g} rad"
-    return "not within the run" if facts["settle_s"] is None else f"{limit} from {facts['settle_s']:.3f} s on"
-
-
-def _dominance(scenario: Scenario) -> str:
-    rows = [
-        f"{site} follows " + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
-        for site, shares in scenario.dominance.items()
-    ]
-    return "; ".join(rows)
-
-
 def format_cell(value: float | None) -> str:
-    """Returns a number as cells show it; a dash where there is none."""
-    return "–" if value is None else f"{value:.4g}"
+    """Returns a number as cells show it, integers in full; a dash for None."""
+    return "–" if value is None else str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
-def _numbers(values: Iterable[float] | None) -> str:
+def _format_numbers(values: Iterable[float] | None) -> str:
     return "–" if values is None else ", ".join(f"{value:.4f}" for value in values)
 
 
-def _site_label(log: Log, name: str) -> str:
-    return f"{colour_swatch(log, name)}{escape(name)} ({escape(log.scenario.sites[name].role)})"
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100.0 * share
 
 
-def colour_swatch(log: Log, name: str) -> str:
-    """Returns a little square in the colour of a site."""
+def _label_site(log: Log, name: str) -> str:
+    return f"{_swatch(log, name)}{escape(name)} ({escape(log.scenario.sites[name].role)})"
+
+
+def _label_link(log: Log, link: str) -> str:
+    peer, site = link.split("->")
+    return f"{_swatch(log, peer)}{escape(peer)} → {escape(site)}"
+
+
+def _swatch(log: Log, name: str) -> str:
+    """Returns a small square in the colour of a site."""
     return f'<span class="swatch fill-{log.sites.index(name)}"></span>'
 
 
-def _facts(rows: Iterable[tuple[str, Any]]) -> str:
+def _render_facts(rows: Iterable[tuple[str, Any]]) -> str:
     lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape(str(value))}</td></tr>" for key, value in rows)
     return f'<table class="facts">{lines}</table>'
 
 
-def render_html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()) -> str:
+def render_html_table(
+    headers: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()
+) -> str:
     """Returns a table.
 
     Args:
-        heads: of its columns; ours, plain text.
+        headers: of its columns, plain text of this program.
         rows: their cells, HTML already.
         words: the columns besides the first that hold words instead of numbers.
     """
-    kinds = [' class="words"' if n in words else "" for n in range(len(heads))]
-    head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, heads, strict=True))
+    kinds = [' class="words"' if n in words else "" for n in range(len(headers))]
+    head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, headers, strict=True))
     body = "".join(
         f"<tr>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in zip(kinds, row, strict=True))}</tr>"
         for row in rows
     )
     return f'<table class="sites"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-
-
-_SITE_HEADS = (
-    "site",
-    "records",
-    "missing",
-    "q at the end (rad)",
-    "max |e| (rad)",
-    "max |e|, last 1 s (rad)",
-    "settled (s)",
-    "max |τ| (N\u00a0m)",
-    "ticks at the limit",
-    "moved by hands, max (rad)",
-)
-_LOOP_HEADS = (
-    "loop",
-    "late p50 (µs)",
-    "late p99 (µs)",
-    "late p99.9 (µs)",
-    "late max (µs)",
-    "busy p50 (µs)",
-    "busy p99 (µs)",
-    "busy max (µs)",
-    "overruns",
-)
-
-
-def render_link_ages(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the links: what was stated, and what the controller saw."""
-    rows = []
-    for name, link in facts["links"].items():
-        age: JsonObject = link["age_ms"]
-        cells = [age["mean"], age["deviation"], *(age[key] for key in ("p50", "p99", "min", "max"))]
-        share = link["ticks_without_new"]
-        cells += [None if share is None else 100.0 * share, link["silence_ms"]]
-        rows.append([_label(log, name), _stated(link), *map(_cell, cells)])
-    return render_html_table(_AGE_HEADS, rows, words=[1])
-
-
-def render_link_samples(log: Log, facts: JsonObject) -> str:
-    """Returns the table of what became of the samples, with measured delays where there are any."""
-    links: dict[str, JsonObject] = facts["links"]
-    measured = any(link["one_way_us"] for link in links.values())
-    rows = []
-    for name, link in links.items():
-        counts: JsonObject = link["samples"] or {}
-        cells = [counts.get(key) for key in _COUNTS]
-        loss = link["loss"]
-        cells += [None if loss is None else 100.0 * loss, link["burst"]]
-        if measured:
-            way: JsonObject = link["one_way_us"] or {}
-            clock: JsonObject = link["clock"] or {}
-            cells += [*(way.get(key) for key in ("min", "p50", "p99", "max")), clock.get("bound_p50_us")]
-        rows.append([_label(log, name), *map(_cell, cells)])
-    return render_html_table([*_SAMPLE_HEADS, *(_WAY_HEADS if measured else ())], rows)
-
-
-def render_clocks(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the clocks as sites saw them; "" where all read the same one."""
-    rows = []
-    for name, link in facts["links"].items():
-        clock: JsonObject = link["clock"] or {}
-        if clock and (clock["bound_max_us"] or clock["offset_us"]):
-            rows.append([_label(log, name), *(_cell(clock[key]) for key in _CLOCK_KEYS)])
-    return render_html_table(_CLOCK_HEADS, rows) if rows else ""
-
-
-def render_changes(facts: JsonObject) -> str:
-    """Returns the table of what was changed while it ran; "" where nothing was."""
-    rows = []
-    for n, changed in enumerate(facts["changes"], 1):
-        tick = changed["taken_at_tick"]
-        by = "scenario" if tick is None else f"ordered, taken in at tick {tick} of {changed['site']}"
-        at_s = format_cell(changed["at_s"])
-        rows.append([str(n), _typeset(changed["about"]), at_s, _typeset(changed["to"]), escape(by)])
-    return render_html_table(_CHANGE_HEADS, rows, words=[1, 3, 4]) if rows else ""
-
-
-def render_modes(log: Log, facts: JsonObject) -> str:
-    """Returns the table of when sites held, braked or returned; "" where none did."""
-    rows = [
-        [
-            f"{colour_swatch(log, name)}{escape(name)}",
-            span["mode"],
-            f"{span['from_s']:.3f}",
-            f"{span['to_s']:.3f}",
-        ]
-        for name, site in facts["sites"].items()
-        for span in site["modes"][:_MOST]
-    ]
-    return render_html_table(("site", "mode", "from (s)", "to (s)"), rows, words=[1]) if rows else ""
-
-
-def _label(log: Log, link: str) -> str:
-    peer, site = link.split("->")
-    return f"{colour_swatch(log, peer)}{escape(peer)} → {escape(site)}"
-
-
-def _stated(link: JsonObject) -> str:
-    first, *later = link["stated"]
-    words = [first["link"], *(f"from {state['from_s']:g} s: {state['link']}" for state in later)]
-    return "<br>".join(map(_typeset, words))
-
-
-def _typeset(text: str) -> str:
-    return escape(text.replace("+-", "±").replace("->", " → "))
-
-
-def _cell(value: float | None) -> str:
-    if isinstance(value, int):
-        return str(value)
-    return format_cell(value)
-
-
-_MOST = 200
-_COUNTS = ("sent", "missing", "lost", "late", "superseded", "duplicate", "copies")
-_CLOCK_KEYS = (
-    "offset_us",
-    "offset_first_us",
-    "drift_ppm",
-    "drift_bound_ppm",
-    "bound_us",
-    "bound_p50_us",
-    "bound_max_us",
-    "rtt_min_us",
-    "faults",
-)
-_AGE_HEADS = (
-    "link",
-    "stated delay",
-    "effective, mean (ms)",
-    "deviation",
-    "p50",
-    "p99",
-    "min",
-    "max",
-    "nothing new (% of ticks)",
-    "longest silence (ms)",
-)
-_SAMPLE_HEADS = (
-    "link",
-    "samples sent",
-    "missing on the way",
-    "lost by the model",
-    "late",
-    "superseded",
-    "duplicates",
-    "of the model",
-    "lost in all (%)",
-    "in a row",
-)
-_WAY_HEADS = ("one way, min (µs)", "p50", "p99", "max", "known to, p50 (µs)")
-_CLOCK_HEADS = (
-    "clock of the sender",
-    "ahead at the end (µs)",
-    "at the start",
-    "drift (ppm)",
-    "known to (ppm)",
-    "offset known to, end (µs)",
-    "p50",
-    "max",
-    "round trip, min (µs)",
-    "faults",
-)
-_CHANGE_HEADS = ("no.", "what", "from (s)", "becomes", "by")

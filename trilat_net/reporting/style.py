@@ -80,11 +80,7 @@ _NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "leg
 
 @contextmanager
 def figure_style(form: FigureSize = REPORT_SIZE) -> Iterator[None]:
-    """Makes figures inside the block look like ours; outside, nothing changes.
-
-    Args:
-        form: what they are drawn for.
-    """
+    """Gives figures inside the block the style of all figures; outside, nothing changes."""
     sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
     with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
         yield
@@ -112,14 +108,9 @@ def site_dashes(log: Log, site: str) -> Any:
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
-    """Returns how the line of a site is drawn.
+    """Returns the options of a site's line, `width` pt wide.
 
-    Where sites share a panel, later ones are drawn thinner, so that lines on top of each other all show.
-
-    Args:
-        log: whose site.
-        site: which one.
-        width: of the line, pt; None where sites share a panel.
+    Without a width sites share a panel: later ones are thinner, so that lines on top of each other all show.
     """
     shared = 2.0 - 1.2 * log.sites.index(site) / (len(log.sites) - 1)
     width = shared if width is None else width
@@ -127,42 +118,38 @@ def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]
 
 
 def site_title(log: Log, site: str) -> str:
-    """Returns what a legend calls a site."""
+    """Returns the name of a site in legends: with its role."""
     return f"{site} ({log.scenario.sites[site].role})"
 
 
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws one quantity over time, thinned.
-
-    Args:
-        axes: where.
-        tick: ticks, shape (K,).
-        t_s: their time, shape (K,), s.
-        values: shape (K,).
-        **options: of the line.
-    """
+    """Draws values over ticks and their times, s, each of shape (K,), decimated with all extremes."""
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
     axes.plot(trace.t_s, trace.values[:, 0], **options)
 
 
 def set_time_axis(log: Log, row: Sequence[Axes]) -> None:
-    """Gives the lowest panels their time axis: the time of the whole run, in every figure."""
+    """Gives panels their time axis: the whole run, in every figure."""
     for axes in row:
         axes.set_xlabel("time (s)")
-        axes.set_xlim(0.0, time_axis_end_s(log))
+        axes.set_xlim(0.0, recorded_end_s(log))
 
 
-def time_axis_end_s(log: Log) -> float:
-    """Returns the time that figures show, s: to the end of the last record's period."""
-    return recorded_end_s(log)
+def title_joints(row: Sequence[Axes]) -> None:
+    """Titles a row of panels, one per joint."""
+    for joint, axes in enumerate(row, 1):
+        axes.set_title(f"joint {joint}")
+
+
+def typeset(text: str) -> str:
+    """Returns a text of the terminal with the signs that type has."""
+    return text.replace("+-", "±").replace("->", " → ")
 
 
 def add_legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
     """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for.
 
-    Args:
-        figure: whose.
-        entries: (text, options of the line).
+    An entry is a text with the options of its line.
     """
     handles = [Line2D([], [], label=text, **options) for text, options in entries]
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
@@ -179,7 +166,7 @@ def site_legend_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that says why there is nothing to draw."""
+    """Returns a figure that consists of a text: why there is nothing to draw."""
     with figure_style(form):
         figure = new_figure(1.0, form.width_in)
         lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
@@ -188,7 +175,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Says in an empty panel why it is empty."""
+    """Writes into an empty panel why it is empty."""
     axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
 
 
@@ -199,13 +186,7 @@ _UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "png": {},
 
 
 def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure; the suffix says how: one of `FORMATS`.
-
-    Args:
-        drawn: the figure.
-        path: where to.
-        dpi: dots per inch of a .png.
-    """
+    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of a .png."""
     kind = path.suffix.removeprefix(".").lower()
     with mpl.rc_context(_FILE_RC):
         drawn.savefig(path, format=kind, dpi=dpi, metadata=_UNDATED[kind])

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis import site_signals
+from ...analysis.timeline import recorded_end_s
 from ...core.two_link_arm import JOINTS, forward_kinematics
 from ...core.vectors import Array
 from ...log.log_reader import Log
@@ -27,9 +28,9 @@ class ArmPose(NamedTuple):
     """One site at one instant.
 
     Attributes:
-        actual: base, elbow and tip, shape (3, 2), m.
-        desired: the same under the reference, shape (3, 2), m.
-        path: where the tip has been until then, shape (P, 2), m.
+        actual: base, elbow and end effector, shape (3, 2), m.
+        desired: the same of the reference, shape (3, 2), m.
+        path: path of the end effector until then, shape (P, 2), m.
     """
 
     actual: Array
@@ -38,12 +39,7 @@ class ArmPose(NamedTuple):
 
 
 def joint_positions_m(arm: Arm, q: Array) -> Array:
-    """Returns base, elbow and tip in the plane, shape (K, 3, 2), m, base at the origin.
-
-    Args:
-        arm: the links.
-        q: joint angles, shape (K, 2), rad.
-    """
+    """Returns base, elbow and end effector in the plane, shape (K, 3, 2), m, of angles (K, 2), rad."""
     points = np.zeros((len(q), 1 + JOINTS, 2))
     for pose, angles in zip(points, q, strict=True):
         pose[1:] = forward_kinematics((arm.l1_m, arm.l2_m), angles)
@@ -55,7 +51,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
     Equal steps of time alone would spend most of a row on arms at rest.
     """
-    end_s = style.time_axis_end_s(log)
+    end_s = recorded_end_s(log)
     grid = np.linspace(0.0, end_s, 1001)
     moved = np.zeros_like(grid)
     for name in log.sites:
@@ -71,7 +67,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
-    """Returns a site at an instant: its last record until then; None where there is none."""
+    """Returns the pose of a site at an instant: that of its last record until then; None without one."""
     part, arm = log[site], log.scenario.sites[site].arm
     last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
     if last < 0:
@@ -87,20 +83,19 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> tuple[float, float, float, fl
     every = np.concatenate([*points, np.zeros((1, 2))])
     low, high = every.min(axis=0), every.max(axis=0)
     centre = (low + high) / 2.0
-    half = np.maximum((high - low) / 2.0, 0.35 * max(float((high - low).max()), 0.1)) + 0.08 * max(
-        float((high - low).max()), 0.1
-    )
+    extent = max(float((high - low).max()), 0.1)
+    half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
     (left, bottom), (right, top) = centre - half, centre + half
     return float(left), float(right), float(bottom), float(top)
 
 
-def draw_arms(log: Log, instants: Sequence[float] | None = None, form: FigureSize = REPORT_SIZE) -> Figure:
+def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[float] | None = None) -> Figure:
     """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
 
     Args:
         log: the log.
-        instants: which, s; None for `instants_s`.
-        form: what it is drawn for.
+        form: width and type size.
+        instants: the instants, s; None for `choose_instants_s`.
     """
     count = _NARROW_INSTANTS if form.narrow else INSTANTS
     times = choose_instants_s(log, count) if instants is None else list(instants)

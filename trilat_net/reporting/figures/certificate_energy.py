@@ -18,8 +18,8 @@ from ...analysis.certificate.stability_certificate import Certificate
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from .. import style
-from ..event_markers import EventMarkers
 from ..figure_size import REPORT_SIZE, FigureSize
+from .time_figure import time_figure
 
 _PARTS = {
     "kinetic": "r'Mr / 2",
@@ -41,42 +41,37 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
 
     Args:
         log: the log.
-        certificate: its certificate.
-        form: what it is drawn for.
+        certificate: its certificate; one without a balance gives a figure with the reason.
+        form: width and type size.
     """
     balance = certificate.balance
     if balance is None:
         return style.empty_figure(certificate.verdict.text, form)
-    marks = EventMarkers(log, form)
-    with style.figure_style(form):
-        figure = style.new_figure(7.2 if form.narrow else 6.4, form.width_in)
-        rows = style.add_panels(figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
-        _functional(log, certificate, rows[0])
-        _parts(balance, rows[1], form)
-        _work(balance, rows[2], form)
-        _residual(balance, rows[3], form)
+    with time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
+        rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
+        _draw_functional_of_sites(log, certificate, balance, rows[0])
+        _draw_parts(balance, rows[1], form)
+        _draw_work(balance, rows[2], form)
+        _draw_residual(balance, rows[3], form)
         for axes in rows:
-            marks.draw(axes, log.sites, numbered=axes is rows[0])  # others have a legend there
+            plot.mark(axes, log.sites, numbered=axes is rows[0])  # others have a legend there
             for from_s, to_s in find_unjudged_spans(balance):
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
         rise = certificate.verdict.rise
         if rise is not None:
             rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
             rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
-        style.set_time_axis(log, [rows[-1]])
         ones = [] if certificate.ones is None else [("V with the paper's ones", _ONES)]
-        style.add_legend(figure, [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *ones])
-        marks.explain(figure)
-    return figure
+        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *ones])
+    return plot.figure
 
 
 def _draw(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
     style.plot_decimated(axes, np.arange(len(balance.t_s)), balance.t_s, values, **options)
 
 
-def _functional(log: Log, certificate: Certificate, axes: Axes) -> None:
-    balance, ones = certificate.balance, certificate.ones
-    assert balance is not None
+def _draw_functional_of_sites(log: Log, certificate: Certificate, balance: EnergyBalance, axes: Axes) -> None:
+    ones = certificate.ones
     _draw(balance, axes, balance.V, **_TOTAL)
     if ones is not None:
         _draw(ones, axes, ones.V, **_ONES)
@@ -86,14 +81,14 @@ def _functional(log: Log, certificate: Certificate, axes: Axes) -> None:
     axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
 
 
-def _parts(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+def _draw_parts(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
     for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw(balance, axes, values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
     axes.set_ylabel("parts of V (J)")
-    _entries(axes, form)
+    _add_panel_legend(axes, form)
 
 
-def _entries(axes: Axes, form: FigureSize) -> None:
+def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
     """Puts a legend above the lines."""
     low, high = axes.get_ylim()
     columns = 2 if form.narrow else 4
@@ -108,7 +103,7 @@ def _legend_pt(form: FigureSize) -> float:
     return form.small_pt if form.small_pt == form.tick_pt else form.small_pt + 0.5
 
 
-def _work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+def _draw_work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
     for (name, values), line in zip(balance.taken.items(), style.DASHES, strict=False):
         _draw(balance, axes, values, label=_TAKEN[name], color=style.REFERENCE, linestyle=line)
     links = np.sum([x for name, x in balance.given.items() if "->" in name], axis=0)
@@ -119,11 +114,11 @@ def _work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
     for (name, values), colour in zip(shown.items(), (*_COLOURS, *_COLOURS), strict=False):
         if np.abs(values).max() > least:
             _draw(balance, axes, values, label=f"given: {name}", color=colour)
-    _entries(axes, form)
+    _add_panel_legend(axes, form)
     axes.set_ylabel("taken and given (J)")
 
 
-def _residual(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+def _draw_residual(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
     scale = balance.scale or 1.0
     floor = 1e-9 * scale
     for label, values, line in (

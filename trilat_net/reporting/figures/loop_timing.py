@@ -16,17 +16,12 @@ from ..figure_size import REPORT_SIZE, FigureSize
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
-_WORDS = ("wake-up after the deadline", "computing time of a tick")
-_SHORT = ("lateness", "computing time")
-
-
-def has_loop_times(log: Log) -> bool:
-    """True where the log has a lateness or a computing time that is not zero."""
-    return any(np.any(log[name].late_us) or np.any(log[name].busy_us) for name in log.sites)
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns why there are no times to draw."""
+    """Returns why there are no times to draw; "" if a lateness or a computing time is not zero."""
+    if any(np.any(log[name].late_us) or np.any(log[name].busy_us) for name in log.sites):
+        return ""
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
@@ -46,21 +41,15 @@ def loop_time_bin_edges(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
-    """Returns how many times lie in each bin, shape (B,).
-
-    Args:
-        times_us: shape (K,), us.
-        edges: as from `bin_edges`, us.
-    """
+    """Returns how many times, shape (K,), us, lie in each bin between `edges`, shape (B + 1,), us."""
     return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
 
 
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
-    if not has_loop_times(log):
-        return style.empty_figure(explain_missing_loop_times(log), form)
     edges = loop_time_bin_edges(log)
-    words = _SHORT if form.narrow else _WORDS
+    lateness = "lateness" if form.narrow else "wake-up after the deadline"
+    computing = "computing time" if form.narrow else "computing time of a tick"
     with style.figure_style(form):
         figure = style.new_figure(0.6 + (1.3 if form.narrow else 1.05) * len(log.sites), form.width_in)
         grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
@@ -69,7 +58,7 @@ def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             _bars(log, site, busy, log[site].busy_us, edges, form)
             late.set_ylabel("ticks (count)")
         grid[0, 0].set_ylim(bottom=0.7)
-        for axes, text in zip(grid[-1], words, strict=True):
+        for axes, text in zip(grid[-1], (lateness, computing), strict=True):
             axes.set_xlabel(f"{text} (µs)")
         style.add_legend(figure, [("one period", style.LIMIT_LINE)])
     return figure

@@ -1,12 +1,13 @@
-"""Registry of all figures of a log, drawn by name for a paper or written beside the report.
+"""Registry of all figures of a log, drawn by name for a paper or written with the report.
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
 Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,57 +18,47 @@ from ...analysis.certificate.premises import check_scenario_premises
 from ...analysis.certificate.stability_certificate import certify
 from ...analysis.site_signals import sites_with_operator
 from ...errors import UsageError
-from ...execution.virtual_comparison import simulate_without_operators
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log
 from ...log.mcap_reader import Progress
-from .. import style
-from ..figure_size import COLUMN_IN, FigureSize, make_print_size
+from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
-from . import arm_poses, authority, contact_force, joint_motion, loop_timing, sample_age
+from . import joint_motion
 from .arm_poses import draw_arms
+from .authority import draw_authority, sites_with_changing_dominance
 from .certificate_energy import draw_functional
-from .joint_motion import (
-    draw_operator_displacement,
-    draw_operator_torques,
-    draw_parameter_estimates,
-    draw_positions,
-    draw_tracking_errors,
-)
-from .loop_timing import draw_loop_timing
+from .contact_force import draw_contact, sites_with_walls
+from .loop_timing import draw_loop_timing, explain_missing_loop_times
 from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_delay
 
-NO_ESTIMATE_CHANGE = "no estimate changed in this run"
+NO_OPERATOR = "no site has an operator in this run"
+
+Draw = Callable[[Log, FigureSize], Figure]
 
 
 class FigureEntry(NamedTuple):
     """A figure.
 
     Attributes:
-        about: what it shows, in a few words.
-        draw: makes it.
-        absent: says why a log has nothing for it; "" where it has.
+        about: its content, in a few words.
+        draw: draws it.
+        absent: returns why a log has nothing to show in it; "" if it has.
+        in_report: whether the report has it.
     """
 
     about: str
-    draw: Callable[[Log, FigureSize], Figure]
+    draw: Draw
     absent: Callable[[Log], str] = lambda _: ""
+    in_report: bool = False
 
 
-def _no_hands(log: Log) -> str:
-    return "" if sites_with_operator(log) else joint_motion.NO_OPERATOR
+def explain_absent_operator(log: Log) -> str:
+    """Returns why there is no torque of an operator to draw; "" if there is one."""
+    return "" if sites_with_operator(log) else NO_OPERATOR
 
 
 def _no_script(log: Log) -> str:
-    return "" if any(site.hands for site in log.scenario.sites.values()) else joint_motion.NO_OPERATOR
-
-
-def _no_walls(log: Log) -> str:
-    return "" if contact_force.sites_with_walls(log) else contact_force.NO_SITE_WITH_WALL
-
-
-def _no_clock(log: Log) -> str:
-    return "" if loop_timing.has_loop_times(log) else loop_timing.explain_missing_loop_times(log)
+    return "" if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
 
 
 def _no_functional(log: Log) -> str:
@@ -75,55 +66,72 @@ def _no_functional(log: Log) -> str:
     return "" if law.holds else law.text
 
 
-def _nothing_learnt(log: Log) -> str:
+def _no_learning(log: Log) -> str:
     learnt = any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
-    return "" if learnt else NO_ESTIMATE_CHANGE
-
-
-def _hands_moved(log: Log, form: FigureSize) -> Figure:
-    return joint_motion.draw_operator_displacement(log, simulate_without_operators(log), form)
-
-
-def _certificate(log: Log, form: FigureSize) -> Figure:
-    return draw_functional(log, certify(log), form)
+    return "" if learnt else "no estimate changed in this run"
 
 
 FIGURES = {
-    "operation": FigureEntry("torque on the arms above their angles", joint_motion.draw_operation, _no_hands),
-    "operator_torques": FigureEntry(
-        "torque on the arms (Fig. 3)", joint_motion.draw_operator_torques, _no_hands
+    "operation": FigureEntry(
+        "torque on the arms above their angles", joint_motion.draw_operation, explain_absent_operator
     ),
-    "positions": FigureEntry("actual and desired angles (Fig. 4)", joint_motion.draw_positions),
+    "operator_torques": FigureEntry(
+        "torque on the arms (Fig. 3)",
+        joint_motion.draw_operator_torques,
+        explain_absent_operator,
+        in_report=True,
+    ),
+    "positions": FigureEntry(
+        "actual and desired angles (Fig. 4)", joint_motion.draw_positions, in_report=True
+    ),
     "tracking_errors": FigureEntry(
-        "errors, and the largest one still to come (Fig. 5)", joint_motion.draw_tracking_errors
+        "errors, and the largest one still to come (Fig. 5)",
+        joint_motion.draw_tracking_errors,
+        in_report=True,
     ),
     "settling": FigureEntry("size of the errors on a log axis, settling times", joint_motion.draw_settling),
     "phase": FigureEntry("errors against their rates", joint_motion.draw_phase_portrait),
     "parameter_estimates": FigureEntry(
         "estimates and true values (Fig. 6)",
-        lambda log, form: joint_motion.draw_parameter_estimates(log, None, form),
-        _nothing_learnt,
+        joint_motion.draw_parameter_estimates,
+        _no_learning,
+        in_report=True,
     ),
     "control_torques": FigureEntry("torque of the controllers", joint_motion.draw_control_torques),
-    "hands_moved": FigureEntry("the log minus the same run without hands", _hands_moved, _no_script),
-    "contact": FigureEntry("force of the walls, and depth in them", contact_force.draw_contact, _no_walls),
+    "hands_moved": FigureEntry(
+        "the log minus the same run without operators",
+        joint_motion.draw_operator_displacement,
+        _no_script,
+        in_report=True,
+    ),
+    "contact": FigureEntry(
+        "force of the walls, and depth in them",
+        draw_contact,
+        lambda log: "" if sites_with_walls(log) else "no site has a wall in this run",
+    ),
     "authority": FigureEntry(
-        "shares that change, and where the arms went",
-        authority.draw_authority,
-        lambda log: "" if authority.sites_with_changing_dominance(log) else authority.CONSTANT_DOMINANCE,
+        "shares that change, and the motion of the arms",
+        draw_authority,
+        lambda log: "" if sites_with_changing_dominance(log) else "the shares of all sites are constant",
     ),
     "certificate": FigureEntry(
-        "V, its parts, who changed it, the energy balance", _certificate, _no_functional
+        "V, its parts, who changed it, the energy balance",
+        lambda log, form: draw_functional(log, certify(log), form),
+        _no_functional,
     ),
-    "arms": FigureEntry("the arms at a few instants", lambda log, form: arm_poses.draw_arms(log, None, form)),
-    "sample_age": FigureEntry("age of the samples in use, per link", sample_age.draw_sample_age),
+    "arms": FigureEntry("the arms at a few instants", draw_arms, in_report=True),
+    "sample_age": FigureEntry("age of the samples in use, per link", draw_sample_age, in_report=True),
     "delay_distributions": FigureEntry(
-        "delays and ages, how often",
-        sample_age.draw_delay_distributions,
-        lambda log: "" if sample_age.has_varying_delay(log) else sample_age.NO_VARYING_DELAY,
+        "distributions of delays and ages",
+        draw_delay_distributions,
+        lambda log: "" if has_varying_delay(log) else "every link is stated as one constant delay",
+        in_report=True,
     ),
     "loop_timing": FigureEntry(
-        "lateness and computing time of the loops", loop_timing.draw_loop_timing, _no_clock
+        "lateness and computing time of the loops",
+        draw_loop_timing,
+        explain_missing_loop_times,
+        in_report=True,
     ),
 }
 """By name, in the order in which a paper has them."""
@@ -134,18 +142,19 @@ def figure(log: Log, name: str, width_in: float = COLUMN_IN) -> Figure:
 
     Args:
         log: the log.
-        name: which one, of `PLATES`.
+        name: one of `FIGURES`.
         width_in: 3.5 for one column, 7 for two, in.
 
     Raises:
         UsageError: there is no such figure or width, or the log has nothing to show in it.
     """
-    return _drawn(log, name, make_print_size(width_in))
+    form = make_print_size(width_in)
+    return _find_figure(log, name).draw(log, form)
 
 
 def list_drawable_figures(log: Log) -> list[str]:
     """Returns the names of the figures for which a log has something to show."""
-    return [name for name, plate in FIGURES.items() if not plate.absent(log)]
+    return [name for name, entry in FIGURES.items() if not entry.absent(log)]
 
 
 def write_figures(
@@ -162,12 +171,12 @@ def write_figures(
 
     Args:
         log: the log.
-        folder: where to; made if it does not exist.
-        names: which ones; none: all for which the log has something to show.
+        folder: made if it does not exist.
+        names: the figures; none: all for which the log has something to show.
         width_in: 3.5 or 7, in.
-        formats: of `FORMATS`.
+        formats: of `FIGURE_FORMATS`.
         force: whether files that exist are replaced.
-        progress: told how many figures are drawn, and how many there are.
+        progress: called with the number of figures that are drawn, and of all.
 
     Raises:
         UsageError: there is no such figure, width or format, the log has nothing to show in it, or a file
@@ -178,71 +187,55 @@ def write_figures(
     for kind in kinds:
         if kind not in FIGURE_FORMATS:
             raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {kind!r}")
-    for name in wanted:
-        _check(log, name)
-    paths = {name: [folder / f"{name}.{kind}" for kind in kinds] for name in wanted}
-    _prepare(folder, [path for each in paths.values() for path in each], force=force)
-    for n, (name, each) in enumerate(paths.items()):
+    chosen = {name: _find_figure(log, name).draw for name in wanted}
+    for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
+        refuse_existing(path, force=force)
+    return _write(log, make_folder(folder), chosen, form, kinds, progress)
+
+
+def write_report_figures(
+    log: Log, folder: Path, twin: Log | None, progress: Progress | None = None
+) -> list[Path]:
+    """Writes the figures of the report for which a log has something to show, and returns the paths.
+
+    Args:
+        log: the log.
+        folder: exists; earlier figures in it are replaced.
+        twin: the same experiment without operators; None: `hands_moved` is left out.
+        progress: called with the number of figures that are drawn, and of all.
+    """
+    chosen = {name: FIGURES[name].draw for name in list_drawable_figures(log) if FIGURES[name].in_report}
+    if twin is None:
+        chosen.pop("hands_moved", None)
+    else:
+        chosen["hands_moved"] = partial(joint_motion.draw_operator_displacement, twin=twin)
+    return _write(log, folder, chosen, REPORT_SIZE, ["png"], progress)
+
+
+def _write(
+    log: Log,
+    folder: Path,
+    chosen: Mapping[str, Draw],
+    form: FigureSize,
+    kinds: Sequence[str],
+    progress: Progress | None,
+) -> list[Path]:
+    paths = []
+    for n, (name, draw) in enumerate(chosen.items()):
         if progress is not None:
-            progress(n, len(paths))
-        drawn = FIGURES[name].draw(log, form)
-        for path in each:
-            write_figure(drawn, path, form.dpi)
-    return [path for each in paths.values() for path in each]
+            progress(n, len(chosen))
+        drawn = draw(log, form)
+        for kind in kinds:
+            paths.append(folder / f"{name}.{kind}")
+            write_figure(drawn, paths[-1], form.dpi)
+    return paths
 
 
-def _drawn(log: Log, name: str, form: FigureSize) -> Figure:
-    _check(log, name)
-    return FIGURES[name].draw(log, form)
-
-
-def _check(log: Log, name: str) -> None:
+def _find_figure(log: Log, name: str) -> FigureEntry:
     if name not in FIGURES:
         near = get_close_matches(name, FIGURES, 1)
         hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(FIGURES)}"
         raise UsageError(f"no figure {name!r}; {hint}")
     if why := FIGURES[name].absent(log):
         raise UsageError(f"{name}: nothing to show: {why}")
-
-
-def _prepare(folder: Path, paths: Sequence[Path], *, force: bool) -> None:
-    for path in paths:
-        refuse_existing(path, force=force)
-    make_folder(folder)
-
-
-MOST_REPORT_FIGURES = 9
-"""As many as a log can have."""
-
-
-def draw_report_figures(log: Log, twin: Log | None) -> Iterator[tuple[str, Figure]]:
-    """Yields every figure with the name of its file, without suffix.
-
-    Args:
-        log: the log.
-        twin: the same experiment with nobody at the arms, or None.
-    """
-    yield "operator_torques", draw_operator_torques(log)
-    yield "positions", draw_positions(log)
-    yield "tracking_errors", draw_tracking_errors(log)
-    yield "parameter_estimates", draw_parameter_estimates(log)
-    yield "hands_moved", draw_operator_displacement(log, twin)
-    yield "arms", draw_arms(log)
-    yield "sample_age", draw_sample_age(log)
-    if has_varying_delay(log):
-        yield "delay_distributions", draw_delay_distributions(log)
-    yield "loop_timing", draw_loop_timing(log)
-
-
-def write_report_figures(
-    log: Log, folder: Path, twin: Log | None, progress: Progress | None = None
-) -> list[Path]:
-    """Writes every figure as PNG into a folder that exists, and returns the paths."""
-    paths = []
-    for n, (name, figure) in enumerate(draw_report_figures(log, twin)):
-        if progress is not None:
-            progress(n, MOST_REPORT_FIGURES)
-        path = folder / f"{name}.png"
-        figure.savefig(path, dpi=style.REPORT_DPI)
-        paths.append(path)
-    return paths
+    return FIGURES[name]

@@ -10,28 +10,27 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ...analysis import site_signals
 from ...analysis.delivery import count_sent, predict_delivery, read_arrivals
 from ...analysis.link_summary import has_one_constant_delay, sample_ages_ns
+from ...analysis.site_signals import sample_ages_ms
 from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from .. import style
-from ..event_markers import EventMarkers
 from ..figure_size import REPORT_SIZE, FigureSize
+from .time_figure import time_figure
 
-NO_VARYING_DELAY = "every link is said to give one constant delay: nothing is distributed"
 _POINTS = 400
 _TALL = 6.0
 
 
 class DelayDistribution(NamedTuple):
-    """What a link gave, and what its controller saw.
+    """Delays on a link, and the ages that its receiver saw.
 
     Attributes:
-        peer: who sends.
-        site: who receives.
-        delay_ms: delays of the samples: what the model gave them, or else what was measured, ms.
+        peer: the sender.
+        site: the receiver.
+        delay_ms: delays of the samples, ms: those of the model, or else those that were measured.
         age_ms: ages of the sample in use at the receiver's ticks, ms.
     """
 
@@ -43,22 +42,18 @@ class DelayDistribution(NamedTuple):
 
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    marks, changed = EventMarkers(log, form), list_changes(log)
+    changed = list_changes(log)
     lines = {
         link: stated_delay_line(log, list_stated_models(log, link, changed)) for link in log.scenario.links
     }
-    with style.figure_style(form):
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
-        grid = style.add_panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+    with time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
+        grid = style.add_panels(plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         drawn: list[Array] = []
         for site, row in zip(log.sites, grid, strict=True):
-            part = log[site]
-            for peer, age_ms, axes in zip(
-                part.peers, site_signals.sample_ages_ms(log, site).T, row, strict=True
-            ):
+            for peer, age_ms, axes in zip(log[site].peers, sample_ages_ms(log, site).T, row, strict=True):
                 line = lines[f"{peer}->{site}"]
-                marks.draw(axes, [site], f"{peer}->{site}")
-                style.plot_decimated(axes, part.tick, part.t_s, age_ms, **style.site_line(log, peer, 1.4))
+                plot.mark(axes, [site], f"{peer}->{site}")
+                plot.trace(axes, site, age_ms, **style.site_line(log, peer, 1.4))
                 axes.plot(*line, **style.LIMIT_LINE)
                 axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
                 if not np.any(np.isfinite(age_ms)):
@@ -67,22 +62,17 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         for axes in grid[:, 0]:
             axes.set_ylabel("age (ms)")
         _age_axis(grid[0, 0], np.concatenate(drawn))
-        style.set_time_axis(log, grid[-1])
         known = any(np.any(np.isfinite(values)) for _, values in lines.values())
-        style.add_legend(
-            figure, [*_senders(log), *([("mean delay as stated", style.LIMIT_LINE)] if known else [])]
-        )
-        marks.explain(figure, links=True)
-    return figure
+        stated = [("mean delay as stated", style.LIMIT_LINE)] if known else []
+        plot.finish(grid[-1], [*_senders(log), *stated], links=True)
+    return plot.figure
 
 
 def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the distributions of delay and age on every link: a row per receiver.
 
-    A curve says how many samples, or ticks, have no more than so much, %.
+    A curve is the percentage of samples, or of ticks, with at most that delay or age.
     """
-    if not has_varying_delay(log):
-        return style.empty_figure(NO_VARYING_DELAY, form)
     found = {(d.peer, d.site): d for d in measure_delay_distributions(log)}
     with style.figure_style(form):
         figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
@@ -105,7 +95,7 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def has_varying_delay(log: Log) -> bool:
-    """True where some link was said to do more than give one constant delay."""
+    """True if some link is stated as more than one constant delay."""
     changed = list_changes(log)
     return not all(
         has_one_constant_delay(list_stated_models(log, link, changed)) for link in log.scenario.links
@@ -126,14 +116,14 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
 
 
 def delay_axis_ms(found: list[DelayDistribution]) -> Array:
-    """Returns the delays at which distributions are drawn, ms: what an outage leads to lies beyond."""
+    """Returns the delays at which distributions are drawn, ms; those after an outage lie beyond."""
     ends = [np.percentile(d.delay_ms, 99.5) for d in found if len(d.delay_ms)]
     ends += [np.percentile(d.age_ms, 90.0) for d in found if len(d.age_ms)]
     return np.linspace(0.0, 1.15 * max([*ends, 1.0]), _POINTS)
 
 
 def cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns how many of some values are at most as large as each limit, %; NaN where there are none."""
+    """Returns the percentage of values that are at most as large as each limit; NaN without values."""
     if not len(values):
         return np.full(len(limits), np.nan)
     percent: Array = 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
@@ -150,7 +140,7 @@ def stated_delay_line(log: Log, states: list[StatedModel]) -> tuple[Array, Array
 
 
 def needs_log_axis(ages_ms: Array) -> bool:
-    """True where a few ages, as after an outage, would press all others into a line at the bottom."""
+    """True if a few ages, as after an outage, would press all others into a line at the bottom."""
     known = ages_ms[np.isfinite(ages_ms)]
     return len(known) > 0 and bool(known.max() > _TALL * np.percentile(known, 95.0))
 

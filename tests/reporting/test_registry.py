@@ -13,7 +13,7 @@ from tests.analysis import logs
 from tests.reporting.layout import misplaced
 from trilat_net.errors import UsageError
 from trilat_net.reporting.figure_size import COLUMN_IN, PAGE_IN, make_print_size
-from trilat_net.reporting.figures import contact_force, registry
+from trilat_net.reporting.figures import contact_force, loop_timing, registry
 from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
 from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
 
@@ -111,9 +111,20 @@ def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
     assert dict(mpl.rcParams) == before
 
 
-def test_every_figure_of_the_report_can_be_had_for_a_paper():
-    of_report = {name for name, _ in registry.draw_report_figures(logs.busy().log, None)}
-    assert of_report <= set(FIGURES)
+def test_the_report_has_the_figures_with_something_to_show(tmp_path):
+    log = logs.simulated("paper")
+    paths = registry.write_report_figures(log, tmp_path, logs.twin("paper"))
+    wanted = {n for n in list_drawable_figures(log) if FIGURES[n].in_report}
+    assert {path.stem for path in paths} == wanted
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+def test_a_figure_without_content_has_a_reason():
+    log = logs.simulated("free")
+    reasons = {name: entry.absent(log) for name, entry in FIGURES.items()}
+    assert reasons["operator_torques"] == reasons["hands_moved"] == registry.NO_OPERATOR
+    assert reasons["loop_timing"] == loop_timing.NO_LOOP_CLOCK
+    assert not reasons["positions"]
 
 
 def test_a_log_has_the_figures_that_it_has_something_for():

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from tests.analysis import logs
+from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.certificate_section import build_certificate_section
 from trilat_net.reporting.certificate_text import CertificateMark, describe_certificate, list_energies
 from trilat_net.reporting.figures.certificate_energy import draw_functional
-from trilat_net.reporting.page import render_sections, write_section_figures
-
-from . import runs
+from trilat_net.reporting.page import write_report
 
 
 def jittered() -> Log:
@@ -70,14 +68,14 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
 
 
 def test_the_page_shows_it_in_one_file_and_a_figure_beside_it(tmp_path: Path) -> None:
-    made = build_certificate_section(jittered())
-    html = render_sections([made])
-    assert "Was it stable, and why" in html
+    log = jittered()
+    page, facts, *figures = write_report(log, tmp_path, certificate=certify(log))
+    html = page.read_text(encoding="utf-8")
     assert "<strong>outside the theorem (delays): V rose by" in html
     assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
-    assert write_section_figures([made], tmp_path) == [tmp_path / "certificate.png"]
-    assert made.facts["verdict"] == "rose"
+    assert tmp_path / "certificate.png" in figures
+    assert json.loads(facts.read_text())["certificate"]["verdict"] == "rose"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import trilat_net
+from tests.analysis import logs
 from trilat_net.analysis.health import summarise_clock
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.reporting import summary_text
@@ -13,8 +14,6 @@ from trilat_net.reporting.summary_text import (
     format_outside_lines,
     format_run_lines,
 )
-
-from . import logs
 
 
 def test_a_run_of_constant_links_without_loss_is_not_worth_a_line():

@@ -1,27 +1,27 @@
-import re
+"""Figures of a log: what they show, per figure and per marker. Their size and type: test_registry."""
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
 import trilat_net
+from tests.analysis import logs
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.timeline import find_mode_intervals
-from trilat_net.reporting import event_markers, style
-from trilat_net.reporting.figures import arm_poses, joint_motion, loop_timing, registry, sample_age
+from trilat_net.reporting import style
+from trilat_net.reporting.figures import (
+    arm_poses,
+    authority,
+    joint_motion,
+    loop_timing,
+    registry,
+    sample_age,
+    time_figure,
+)
 
-from . import logs
-
-UNIT = re.compile(r"\((s|rad|m|N m|kg m|kg m²|ms|µs|count|%)\)$")
 SCENARIOS = ("two_sites", "paper", "four")
 BACKGROUND = 0.6
 """What marks are drawn at or below, so that lines cover them."""
-
-
-def outer(figure):
-    """Panels in which something is drawn."""
-    return [axes for axes in figure.axes if axes.axison]
 
 
 def marked(figure):
@@ -36,36 +36,12 @@ def lines(axes):
     return [line for line in axes.lines if line.get_transform() == axes.transData]
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_every_axis_says_its_unit(name):
-    log = logs.timed(logs.simulated(name))
-    for title, figure in registry.draw_report_figures(log, logs.twin(name)):
-        grid = outer(figure)
-        assert grid, title
-        for axes in grid:
-            spec = axes.get_subplotspec()
-            shared_x = len(axes.get_shared_x_axes().get_siblings(axes)) > 1
-            if spec.is_last_row() or not shared_x:
-                assert UNIT.search(axes.get_xlabel()), (title, axes.get_xlabel())
-            if spec.is_first_col():
-                assert UNIT.search(axes.get_ylabel()), (title, axes.get_ylabel())
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_figures_are_written_and_leave_matplotlib_as_it_was(name, tmp_path):
-    before = dict(mpl.rcParams)
-    paths = registry.write_report_figures(logs.timed(logs.simulated(name)), tmp_path, logs.twin(name))
-    assert len(paths) == 8
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
-    assert dict(mpl.rcParams) == before
-
-
 def test_a_site_has_one_colour_in_every_figure():
     log = logs.simulated("paper")
     for figure in (
         joint_motion.draw_tracking_errors(log),
         joint_motion.draw_parameter_estimates(log),
-        joint_motion.draw_operator_displacement(log, log),
+        joint_motion.draw_operator_displacement(log, twin=log),
     ):
         drawn = [to_hex(line.get_color()) for line in lines(figure.axes[0])]
         assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
@@ -81,22 +57,6 @@ def test_operator_torque_is_the_torque_on_the_arm():
     assert site_signals.sites_with_operator(log) == ["a"]
 
 
-def test_nobody_at_the_arms_is_said():
-    log = logs.simulated("free")
-    for figure in (
-        joint_motion.draw_operator_torques(log),
-        joint_motion.draw_operator_displacement(log, None),
-    ):
-        assert [text.get_text() for text in figure.texts] == [joint_motion.NO_OPERATOR]
-    (text,) = joint_motion.draw_operator_displacement(logs.simulated("paper"), None).texts
-    assert text.get_text() == joint_motion.NO_RUN_WITHOUT_OPERATOR
-
-
-def test_virtual_time_is_said_instead_of_zeros():
-    (text,) = loop_timing.draw_loop_timing(logs.simulated("paper")).texts
-    assert text.get_text() == loop_timing.NO_LOOP_CLOCK
-
-
 def test_histograms_count_every_tick():
     log = logs.timed(logs.simulated("four"))
     edges = loop_timing.loop_time_bin_edges(log)
@@ -107,7 +67,7 @@ def test_histograms_count_every_tick():
 
 def test_estimates_show_the_sites_that_are_asked_for():
     log = logs.simulated("paper")
-    figure = joint_motion.draw_parameter_estimates(log, ["m2"])
+    figure = joint_motion.draw_parameter_estimates(log, sites=["m2"])
     assert [len(lines(axes)) for axes in figure.axes] == [1] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
     assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
@@ -123,15 +83,13 @@ def test_ages_are_drawn_per_link():
     assert np.nanmin(drawn) >= 40.0
 
 
-def test_a_log_in_which_nothing_happened_has_no_marks_and_no_distribution():
+def test_a_log_without_events_has_no_markers():
     log = logs.simulated("paper")
-    for title, figure in registry.draw_report_figures(log, logs.twin("paper")):
-        assert marked(figure) == ([], []), title
-        assert figure.get_supxlabel() == ""
-    assert "delay_distributions" not in dict(registry.draw_report_figures(log, None))
-    assert [text.get_text() for text in sample_age.draw_delay_distributions(log).texts] == [
-        sample_age.NO_VARYING_DELAY
-    ]
+    for name in registry.list_drawable_figures(log):
+        drawn = registry.figure(log, name)
+        if name != "certificate":  # which marks a rise of V
+            assert marked(drawn) == ([], []), name
+        assert drawn.get_supxlabel() == ""
 
 
 def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow():
@@ -153,7 +111,7 @@ def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow():
 
 
 def test_of_many_changes_a_figure_names_the_first_ones(monkeypatch):
-    monkeypatch.setattr(event_markers, "MOST_EXPLAINED_CHANGES", 1)
+    monkeypatch.setattr(time_figure, "MOST_EXPLAINED_CHANGES", 1)
     assert "and 2 more" in joint_motion.draw_positions(logs.busy().log).get_supxlabel()
 
 
@@ -172,7 +130,6 @@ def test_the_stated_mean_is_drawn_while_it_holds_and_not_where_there_is_none():
 
 def test_distributions_are_cumulative_and_of_delay_and_age():
     log = logs.busy().log
-    assert "delay_distributions" in dict(registry.draw_report_figures(log, None))
     for axes in sample_age.draw_delay_distributions(log).axes:
         age, delay = (line.get_ydata() for line in axes.lines)
         for curve in (age, delay):
@@ -209,7 +166,7 @@ def test_arms_stand_where_their_angles_put_them():
 
 def test_arms_fit_into_their_panels_with_equal_axes():
     log = logs.simulated("four")
-    figure = arm_poses.draw_arms(log, [0.0, 1.0])
+    figure = arm_poses.draw_arms(log, instants=[0.0, 1.0])
     assert len(figure.axes) == 8
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -232,9 +189,67 @@ def test_instants_begin_at_the_beginning_and_end_at_the_end(name):
     assert 3 <= len(instants) <= arm_poses.INSTANTS
 
 
-def test_importing_the_package_does_not_import_matplotlib():
-    import subprocess
-    import sys
+def test_a_path_is_thinned_by_its_length_and_keeps_its_ends():
+    turns = np.linspace(0.0, 6.0, 20_001) ** 3  # ever faster
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    kept = joint_motion.thin_path(circle)
+    assert len(kept) < 0.6 * len(circle)
+    assert kept[0].tolist() == circle[0].tolist()
+    assert kept[-1].tolist() == circle[-1].tolist()
+    gaps = np.hypot(*np.diff(kept, axis=0).T)
+    assert gaps.max() < 2 * 0.01 * 2 + np.hypot(*np.diff(circle, axis=0).T).max()
 
-    code = "import sys, trilat_net; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_an_arm_that_never_moves_is_a_point(rows):
+    kept = joint_motion.thin_path(np.ones((rows, 2)))
+    assert np.unique(kept, axis=0).tolist() == [[1.0, 1.0]]
+
+
+def test_a_triangle_stands_where_a_site_settles():
+    log = logs.simulated("two_sites")
+    (axes,) = joint_motion.draw_settling(log).axes
+    marks = [line.get_data() for line in axes.lines if line.get_marker() == "v"]
+    settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
+    assert [float(t) for (t,), _ in marks] == pytest.approx([t for t in settled if t is not None])
+    assert all(float(y) == site_signals.SETTLED_ERROR_RAD for _, (y,) in marks)
+
+
+def test_a_phase_portrait_is_of_e_and_its_rate():
+    log = logs.simulated("paper")
+    line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
+    part = log["m1"]
+    both = np.stack([part.e[:, 1], (part.qd - part.qd_des)[:, 1]], axis=1)
+    assert {tuple(row) for row in np.transpose(line.get_data()).tolist()} <= {tuple(r) for r in both.tolist()}
+
+
+def test_the_limit_of_a_torque_is_drawn_where_it_was_reached():
+    free = joint_motion.draw_control_torques(logs.simulated("paper"))
+    assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
+    held = trilat_net.simulate("paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20})
+    figure = joint_motion.draw_control_torques(held)
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
+    levels = {
+        line.get_ydata()[0]
+        for line in figure.axes[0].lines
+        if line.get_transform() != figure.axes[0].transData
+    }
+    assert levels == {20.0, -20.0}
+
+
+RAMPS = [
+    {"at_s": 0.5, "dominance": "s", "to": {"m1": 1.0, "m2": 0.0}, "ramp_s": 1.0},
+    {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.0, "m2": 1.0}, "ramp_s": 0.5},
+]
+"""The second ramp starts half-way through the first one, at 0.75."""
+
+
+def test_shares_are_drawn_as_they_change():
+    log = trilat_net.simulate("paper", {"duration_s": 2.0, "rate_hz": 100, "timeline": RAMPS})
+    assert authority.sites_with_changing_dominance(log) == ["s"]
+    figure = authority.draw_authority(log)
+    assert len(figure.axes) == 3
+    m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
+    assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx([0.5, 0.625, 0.75, 0.375, 0.0])
+    assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
+    assert authority.sites_with_changing_dominance(logs.simulated("paper")) == []
