@@ -1,8 +1,9 @@
-"""Accounts of channels: received and missing messages by number, counted live or rebuilt from a log.
+"""Accounts of channels: received and missing messages by number, counted live or from a log.
 
 Invariant: expected = received + missing, always. A message's number is its tick for a record, its place
 from 0 for statistics and events. Memory is bounded: of more gaps than `MAX_GAPS`, the lowest are only
-counted. Rebuilding decodes events only, and judges a part of a log from its first message on.
+counted. Accounts made from a file decode events only, and count a later part of a log from its first
+message on.
 """
 
 from bisect import bisect_right
@@ -14,23 +15,15 @@ from ..net.loop_stats import ticks_per_stats
 from ..net.messages import READABLE, Event
 from ..net.wire import decode
 from ..scenario import parse_embedded
-from .log_layout import PART, SCENARIO, SESSION
+from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 
 class RangeSet:
-    """A set of whole numbers that grows at its upper end.
+    """A set of whole numbers that grows at its upper end; keeps the highest `most` ranges."""
 
-    Args:
-        most: ranges that are kept apart.
-
-    Attributes:
-        count: how many numbers are in it.
-    """
-
-    __slots__ = ("_firsts", "_lasts", "_most", "count")
+    __slots__ = ("_firsts", "_lasts", "_most")
 
     def __init__(self, most: int) -> None:
-        self.count = 0
         self._most = most
         self._firsts: list[int] = []
         self._lasts: list[int] = []
@@ -40,21 +33,20 @@ class RangeSet:
         return zip(self._firsts, self._lasts, strict=True)
 
     def __len__(self) -> int:
-        """Returns how many ranges there are."""
+        """Returns the number of ranges."""
         return len(self._firsts)
 
     def append(self, first: int, last: int) -> None:
-        """Adds numbers that lie above all that are in it."""
+        """Adds numbers above all that are in it."""
         if self._lasts and self._lasts[-1] == first - 1:
             self._lasts[-1] = last
         else:
             self._firsts.append(first)
             self._lasts.append(last)
-        self.count += last - first + 1
-        self._bound()
+        self._drop_lowest()
 
     def remove(self, number: int) -> bool:
-        """Takes one number out; False where it is not in."""
+        """Removes one number; returns False if it is not in."""
         place = bisect_right(self._firsts, number) - 1
         if place < 0 or number > self._lasts[place]:
             return False
@@ -62,12 +54,11 @@ class RangeSet:
         parts = [(a, b) for a, b in ((first, number - 1), (number + 1, last)) if a <= b]
         self._firsts[place : place + 1] = [a for a, _ in parts]
         self._lasts[place : place + 1] = [b for _, b in parts]
-        self.count -= 1
-        self._bound()
+        self._drop_lowest()
         return True
 
-    def from_(self, number: int) -> tuple[int, int] | None:
-        """Returns the first range at or above a number, cut off below it; None where there is none."""
+    def find_from(self, number: int) -> tuple[int, int] | None:
+        """Returns the first range at or above a number, cut off below it; None if there is none."""
         place = max(0, bisect_right(self._firsts, number) - 1)
         if place < len(self._lasts) and self._lasts[place] < number:
             place += 1
@@ -79,13 +70,13 @@ class RangeSet:
         """Returns how many numbers the longest range has."""
         return max((last - first + 1 for first, last in self), default=0)
 
-    def _bound(self) -> None:
+    def _drop_lowest(self) -> None:
         if len(self._firsts) > self._most:
-            self.count -= self._lasts.pop(0) - self._firsts.pop(0) + 1
+            del self._firsts[0], self._lasts[0]
 
 
 MAX_GAPS = 50_000
-"""Gaps that an account keeps apart: of those before, it knows how many are missing, and no more which."""
+"""Gaps that an account keeps apart; of those before, it keeps the number of missing messages only."""
 SHOWN_GAPS = 20
 """Gaps that are named in a text."""
 
@@ -94,21 +85,20 @@ class Account:
     """The account of one channel.
 
     Attributes:
-        received: messages that there are, each number once.
-        duplicate: those that came though their number was there.
-        reordered: those that came after one with a higher number had come.
-        refilled: those that came from the sender's memory, after they had been missing.
+        received: messages that are there, each number once.
+        duplicate: messages that came though their number was there.
+        reordered: messages that came after one with a higher number.
+        refilled: messages from the sender's memory, after they had been missing.
         last: largest number that is known to exist, -1 before the first.
-        hopeless: numbers below this one that are missing can be had from nobody.
-        silence_ns: the longest time between two that came, ns; 0 where nobody stamps them.
+        silence_ns: the longest time between two that came, ns; 0 if they are not stamped.
     """
 
     __slots__ = (
         "_came_ns",
         "_gaps",
+        "_lost_below",
         "_newest",
         "duplicate",
-        "hopeless",
         "last",
         "received",
         "refilled",
@@ -119,14 +109,14 @@ class Account:
     def __init__(self) -> None:
         self.received = self.duplicate = self.reordered = self.refilled = 0
         self.last = -1
-        self.hopeless = 0
         self.silence_ns = 0
+        self._lost_below = 0  # missing numbers below this one cannot be had from any member
         self._newest = -1  # of those that came by themselves
         self._came_ns: int | None = None
         self._gaps = RangeSet(MAX_GAPS)
 
     def take(self, number: int, came_ns: int | None = None) -> bool:
-        """Books one message; False where its number is there already.
+        """Counts one message; returns False if its number is there already.
 
         Args:
             number: its number, 0 or more.
@@ -136,54 +126,54 @@ class Account:
             if self._came_ns is not None and came_ns - self._came_ns > self.silence_ns:
                 self.silence_ns = came_ns - self._came_ns
             self._came_ns = came_ns
-        passed = number <= self._newest
+        overtaken = number <= self._newest
         self._newest = max(self._newest, number)
-        if not self._is_new(number):
+        if not self._add(number):
             self.duplicate += 1
             return False
-        self.reordered += passed
+        self.reordered += overtaken
         self.received += 1
         return True
 
     def refill(self, number: int) -> bool:
-        """Books one message from the sender's memory; False where its number is there already."""
-        new = self._is_new(number)
+        """Counts one message from the sender's memory; returns False if its number is there already."""
+        new = self._add(number)
         self.refilled += new
         self.received += new
         return new
 
     def expect(self, made: int) -> None:
-        """Books what is missing, where it is known how many there are at least."""
+        """Counts as missing what is not there of the first `made` messages."""
         if made > self.last + 1:
             self._gaps.append(self.last + 1, made - 1)
             self.last = made - 1
 
     def give_up(self, below: int) -> None:
-        """Books what is missing below a number as lost for good; should it come yet, it is welcome."""
-        self.hopeless = max(self.hopeless, below)
+        """Marks what is missing below a number as lost for good; if it comes all the same, it counts."""
+        self._lost_below = max(self._lost_below, below)
 
     def wanted(self, number: int = 0) -> tuple[int, int] | None:
-        """Returns the first gap at or above a number that is not hopeless; None where there is none."""
-        return self._gaps.from_(max(number, self.hopeless))
+        """Returns the first gap at or above a number that is not given up; None if there is none."""
+        return self._gaps.find_from(max(number, self._lost_below))
 
     @property
     def expected(self) -> int:
-        """How many are known to exist."""
+        """Number of messages that are known to exist."""
         return self.last + 1
 
     @property
     def missing(self) -> int:
-        """How many of them are missing."""
+        """Number of missing messages."""
         return self.last + 1 - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Numbers that are missing, as [first, last] pairs; the newest MAX_GAPS of them."""
+        """Missing numbers, as [first, last] pairs; the newest MAX_GAPS of them."""
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """How many the largest gap has."""
+        """Number of messages that the largest gap has."""
         return self._gaps.longest()
 
     def as_text(self) -> str:
@@ -197,12 +187,13 @@ class Account:
             f"largest gap {self.largest_gap}{named}{silence}"
         )
 
-    def gap_texts(self, most: int) -> list[str]:
-        """Returns the gaps as "first-last", the first ones of them."""
-        return [f"{first}-{last}" for (first, last), _ in zip(self._gaps, range(most), strict=False)]
+    def gap_texts(self, most: int, base: int = 0) -> list[str]:
+        """Returns the first gaps as "first-last", where number 0 stands for `base`."""
+        pairs = zip(self._gaps, range(most), strict=False)
+        return [f"{base + first}-{base + last}" for (first, last), _ in pairs]
 
-    def _is_new(self, number: int) -> bool:
-        """Takes a number out of what is missing; False where it was not."""
+    def _add(self, number: int) -> bool:
+        """Adds a number to those that are there; returns False if it is one of them."""
         if number > self.last:
             self.expect(number)
             self.last = number
@@ -210,106 +201,118 @@ class Account:
         return self._gaps.remove(number)
 
 
+def number_message(channel: str, tick: int, rate_hz: int) -> int:
+    """Returns the number in its channel of the record or the statistics of a tick."""
+    return tick // ticks_per_stats(rate_hz) if channel == topics.LINK else tick
+
+
+def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
+    """Returns how many records or statistics a site publishes in so many ticks."""
+    return -(-ticks // ticks_per_stats(rate_hz)) if channel == topics.LINK else ticks
+
+
 EVENTS_NUMBERED_SINCE = 3
 """Events have numbers from this version of the schema on."""
 
 
-class RebuiltAccounts:
-    """The accounts of one file.
+class SessionAccounts:
+    """Accounts of the numbered channels of a session.
 
     Args:
-        metadata: the file's, by name, as far as it was read.
-        attachments: the file's, by name.
-
-    Raises:
-        NotOurs: it is no log of ours.
+        session: its name.
+        rates_hz: tick rate of every site, in scenario order.
+        continued: True for a later part of a log, which is counted from its first message on.
+        events: True if events have numbers.
     """
 
-    def __init__(self, metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]) -> None:
-        session = metadata.get(SESSION, {})
-        try:
-            scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
-            self._session = session["session"]
-            version = int(session["schema_version"])
-        except (KeyError, ValueError, ScenarioError) as error:
-            raise NotATrilatLog(str(error)) from None
-        self._sites = scenario.names
-        self._every = {name: ticks_per_stats(scenario.sites[name].rate_hz) for name in scenario.names}
-        self._numbered = (topics.STATE, topics.LINK, topics.EVENT)[
-            : 3 if version >= EVENTS_NUMBERED_SINCE else 2
-        ]
-        self._carried_on = metadata.get(PART, {}).get("index", "1") != "1"
+    def __init__(
+        self, session: str, rates_hz: Mapping[str, int], *, continued: bool = False, events: bool = True
+    ) -> None:
+        self._session, self._rates_hz, self._continued = session, rates_hz, continued
+        self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
         self._bases: dict[str, int] = {}
 
+    def _topic(self, member: str, channel: str) -> str:
+        return "/" + topics.key(self._session, member, channel)
+
     def open(self, topic: str) -> None:
-        """Takes note of a channel that the file has."""
-        where = topics.parse_key(topic.removeprefix("/"))
-        if where is not None and where.session == self._session and where.channel in self._numbered:
+        """Opens the account of a channel, if it is a numbered one of the session."""
+        key = topics.parse_key(topic.removeprefix("/"))
+        if key is not None and key.session == self._session and key.channel in self._numbered:
             self._accounts[topic] = Account()
 
-    def take(self, topic: str, sequence: int, payload: bytes) -> None:
-        """Books a message."""
+    def take(self, topic: str, sequence: int, payload: bytes = b"") -> None:
+        """Counts a message by its sequence number; the payload of an event may state the number of ticks."""
         account = self._accounts.get(topic)
         if account is None:
             return
         member, channel = topic.split("/")[-2:]
-        number = sequence // self._every.get(member, 1) if channel == topics.LINK else sequence
-        base = self._bases.setdefault(topic, number if self._carried_on else 0)
+        number = number_message(channel, sequence, self._rates_hz.get(member, 0))
+        base = self._bases.setdefault(topic, number if self._continued else 0)
         if number >= base:
             account.take(number - base)
         if channel == topics.LINK:
             self._expect(member, topics.STATE, sequence + 1)
-        elif channel == topics.EVENT:
-            self._learn(payload)
+        elif channel == topics.EVENT and payload:
+            self._take_end(payload)
 
-    def _learn(self, payload: bytes) -> None:
-        """Books what an event says of the number of ticks."""
+    def _take_end(self, payload: bytes) -> None:
         try:
             event = decode(payload, Event, READABLE)
         except WireError:
             return
-        if event.kind == "end" and event.member in self._every and 0 <= event.ticks < 1 << 32:
-            self._expect(event.member, topics.STATE, event.ticks)
-            self._expect(event.member, topics.LINK, -(-event.ticks // self._every[event.member]))
+        if event.kind == "end" and event.member in self._rates_hz and 0 <= event.ticks < 1 << 32:
+            self.expect(event.member, event.ticks)
+
+    def expect(self, site: str, ticks: int) -> None:
+        """Counts as missing what a site published in so many ticks and is not there."""
+        for channel in (topics.STATE, topics.LINK):
+            self._expect(site, channel, count_messages(channel, ticks, self._rates_hz[site]))
 
     def _expect(self, member: str, channel: str, made: int) -> None:
-        topic = "/" + topics.key(self._session, member, channel)
+        topic = self._topic(member, channel)
         if topic in self._accounts:
             self._accounts[topic].expect(made - self._bases.get(topic, 0))
 
     def texts(self) -> dict[str, str]:
-        """Returns the accounts by topic, as the file holds them."""
-        return {
-            topic: self._text(topic, account)
-            for topic, account in self._accounts.items()
-            if account.expected or topic.split("/")[-2] in self._every
-        }
-
-    def _text(self, topic: str, account: Account) -> str:
-        base = self._bases.get(topic, 0)
-        return account.as_text() if not base else f"from {base} on: {account.as_text()}"
+        """Returns the accounts by topic, as a file holds them."""
+        texts = {}
+        for topic, account in self._accounts.items():
+            if account.expected or topic.split("/")[-2] in self._rates_hz:
+                base = self._bases.get(topic, 0)
+                texts[topic] = account.as_text() if not base else f"from {base} on: {account.as_text()}"
+        return texts
 
     def records(self) -> dict[str, int]:
-        """Returns per site how many of its records are in the file."""
-        topics_of = {site: "/" + topics.key(self._session, site, topics.STATE) for site in self._sites}
-        return {
-            site: self._accounts[topic].received
-            for site, topic in topics_of.items()
-            if topic in self._accounts
-        }
+        """Returns the number of records per site."""
+        accounts = {site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz}
+        return {site: account.received for site, account in accounts.items() if account is not None}
 
     def missing(self) -> Iterator[str]:
-        """Yields per site which of its records are not in the file."""
-        for site in self._sites:
-            topic = "/" + topics.key(self._session, site, topics.STATE)
+        """Yields a text per site that lacks records."""
+        for site in self._rates_hz:
+            topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)
             if account is not None and account.missing:
-                base = self._bases.get(topic, 0)
-                gaps = [f"{base + first}-{base + last}" for first, last in account.gaps[:SHOWN_GAPS]]
+                gaps = account.gap_texts(SHOWN_GAPS, self._bases.get(topic, 0))
                 more = " ..." if len(account.gaps) > len(gaps) else ""
                 yield f"{site}: {account.missing} of {account.expected} records: {' '.join(gaps)}{more}"
 
 
-class NotATrilatLog(Exception):  # noqa: N818 - what it says of a file
-    """A file that is no log of ours; never leaves this package."""
+def open_session_accounts(
+    metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
+) -> SessionAccounts | None:
+    """Returns empty accounts for the messages of a file; None if it is no trilat-net log."""
+    about = metadata.get(SESSION, {})
+    try:
+        scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
+        session, version = about["session"], int(about["schema_version"])
+    except (KeyError, ValueError, ScenarioError):
+        return None
+    return SessionAccounts(
+        session,
+        {name: site.rate_hz for name, site in scenario.sites.items()},
+        continued=metadata.get(PART, {}).get("index", "1") != "1",
+        events=version >= EVENTS_NUMBERED_SINCE,
+    )

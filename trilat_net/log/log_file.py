@@ -20,7 +20,7 @@ from ..files import publish_file, refuse_existing, sync_folder
 from ..net import topics
 from ..net.clock import SystemClock
 from .log_layout import active_path
-from .mcap_writer import MAGIC
+from .mcap_records import MAGIC
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """What a disk says that takes no more."""

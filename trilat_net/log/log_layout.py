@@ -152,6 +152,10 @@ def collect_provenance() -> dict[str, str]:
     return facts
 
 
+VIZ_ROOT = "/viz/"
+"""How topics of channels for viewers begin."""
+MAX_TIME_NS = (1 << 64) - 1
+"""Largest time stamp of a message in a file; longer ones of others are cut to it."""
 SESSION, PART, ACCOUNTS, SCENARIO = "trilat.session", "trilat.part", "trilat.accounts", "scenario.toml"
 CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATE: State,

@@ -26,13 +26,12 @@ from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
-from ..net.loop_stats import ticks_per_stats
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
 from ..scenario import Scenario, parse_core_change, parse_embedded
-from .accounting import Account
+from .accounting import SessionAccounts
 from .log_layout import ACCOUNTS, describe_unfinished
-from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents
+from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
 from .record_columns import Ints
 from .site_log import MessageTimes, SiteLog
@@ -151,25 +150,26 @@ class Log:
         Of several files, what is in all of them together.
         """
         written = self._whole.metadata.get(ACCOUNTS, {})
-        return written if len(self.sources) == 1 else {**self._accounts(), **written}
+        return written if len(self.sources) == 1 else {**self._make_accounts(), **written}
 
-    def _accounts(self) -> dict[str, str]:
-        """Returns the accounts of the sites' channels, drawn up from what is there."""
-        made, texts = self._made(), {}
+    def _make_accounts(self) -> dict[str, str]:
+        """Returns the accounts of the sites' channels, made from what is there."""
+        rates_hz = {name: self.scenario.sites[name].rate_hz for name in self.sites}
+        accounts = SessionAccounts(self.session["session"], rates_hz)
         for name in self.sites:
-            every = ticks_per_stats(self[name].rate_hz)
             numbers = {
                 topics.STATE: self[name].tick.tolist(),
-                topics.LINK: [stats.tick // every for stats in self.link_stats(name)],
+                topics.LINK: [stats.tick for stats in self.link_stats(name)],
                 topics.EVENT: [event.n for event in self.events if event.member == name and event.n >= 0],
             }
-            for channel, have in numbers.items():
-                account = Account()
-                for number in have:
-                    account.take(number)
-                account.expect(made.get(name, 0) if channel == topics.STATE else 0)
-                texts[self._topic(name, channel)] = account.as_text()
-        return texts
+            for channel in numbers:
+                accounts.open(self._topic(name, channel))
+            for channel, sequences in numbers.items():
+                for sequence in sequences:
+                    accounts.take(self._topic(name, channel), sequence)
+        for name, ticks in self._made().items():
+            accounts.expect(name, ticks)
+        return accounts.texts()
 
     def account(self, site: str) -> str:
         """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
@@ -308,7 +308,7 @@ def open_log(
         files = [_opened(one, stack) for one in (source, *more)]
         sizes = [_size(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
-            told = None if progress is None else _from(sum(sizes[:n]), sum(sizes), progress)
+            told = shift_progress(progress, sum(sizes[:n]), sum(sizes))
             with _readable(name):
                 parts.append(read_contents(stream, name, told))
     return Log(merge_parts(parts))
@@ -336,11 +336,6 @@ def _size(stream: BinaryIO) -> int:
     size = stream.seek(0, os.SEEK_END)
     stream.seek(here)
     return size - here
-
-
-def _from(before: int, total: int, progress: Progress) -> Progress:
-    """Returns what tells of one of several files as of a part of the whole."""
-    return lambda done, _: progress(before + done, total)
 
 
 DelayRow = tuple[float, float]

@@ -25,6 +25,7 @@ from .log_layout import (
     ACTIVE_SUFFIX,
     ALL_CHANNELS,
     CHANNEL_TYPES,
+    MAX_TIME_NS,
     PART,
     RECORDER_CHANNELS,
     SCENARIO,
@@ -39,8 +40,6 @@ from .log_layout import (
 from .mcap_writer import McapWriter, Sink
 from .ros2 import cdr
 from .ros2.viz_channels import MAX_PENDING_BYTES, TakeMessage, VizChannels
-
-_LAST_NS = (1 << 64) - 1  # of the file's time stamps; a stranger's may be anything
 
 
 class LogWriter:
@@ -180,7 +179,9 @@ class LogWriter:
         sent_ns = self._epoch_unix_ns + t_ns
         with_number = number & 0xFFFFFFFF if number >= 0 else 0
         try:
-            self._file.add_message(channel, log_time_ns, payload, min(max(0, sent_ns), _LAST_NS), with_number)
+            self._file.add_message(
+                channel, log_time_ns, payload, min(max(0, sent_ns), MAX_TIME_NS), with_number
+            )
             if message is not None and (take := self._takers.get(key)) is not None:
                 take(message, log_time_ns)
         except OSError as error:
@@ -197,7 +198,7 @@ class LogWriter:
             channel = self._file.register_channel(topic, cdr.ENCODING, self._standard[kind], about)
             self._standard[topic] = channel
         if channel is not None:
-            self._file.add_message(channel, log_ns, data, min(publish_ns, _LAST_NS))
+            self._file.add_message(channel, log_ns, data, min(publish_ns, MAX_TIME_NS))
 
     def flush(self) -> None:
         """Closes the open chunk and hands it to the operating system: a crash loses nothing before it.

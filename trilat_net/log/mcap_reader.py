@@ -2,12 +2,8 @@
 
 Invariant: the reader holds one chunk at a time; what it cannot read it skips and reports. Messages of a
 log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped.
-
-The loop over the messages in a chunk is written out here because it dominates the time to read a log.
 """
 
-import struct
-import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -20,55 +16,56 @@ from numpy.typing import NDArray
 
 from ..errors import LogError
 from ..net import topics
-from .log_layout import PART, SCENARIO, SESSION
+from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .mcap_records import (
-    RECORD_HEAD_BYTES,
+    MESSAGE_HEAD,
+    OP_MESSAGE,
+    RECORD_HEAD,
     Damage,
     RecordFrame,
     RecordScanner,
     UnreadableRecord,
+    has_right_crc,
+    iterate_records,
     parse_record,
     unpack_chunk,
 )
 
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_BEFORE_PAYLOAD = RECORD_HEAD_BYTES + _MESSAGE.size
-_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a member of an enumeration compares slowly
-_NAMING = (Opcode.SCHEMA, Opcode.CHANNEL)
-_READ = (
-    Opcode.CHUNK,
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.MESSAGE,
-    Opcode.METADATA,
-    Opcode.ATTACHMENT,
-    Opcode.HEADER,
-)
-"""Kinds of records that a walk looks into; indexes are for those who do not read all."""
+_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 
 KEPT_BYTES = 64 << 20
 KEPT_RATIO = 300
-"""What a walk gives to one who keeps it takes at most so much memory, or so many times the file's size.
+"""Messages that are kept take at most so much memory, or so many times the file's size.
 
 Arms at rest in virtual time pack best of all that is no bomb: 120 times.
 """
 _DECODED_BYTES = 3_000
 _LONG_BYTES, _LONG_RATIO = 300, 24
-"""A message of a log, decoded, takes some memory, and more where it is longer than a record must be."""
+"""A message of a log, decoded, takes some memory, and more if it is longer than a record must be."""
 _NAME_BYTES, _NAME_RATIO = 600, 20
 """What a channel and its metadata take, likewise."""
 
+Progress = Callable[[int, int], None]
+"""Takes how much of something is done: (bytes so far, bytes in all)."""
+
+
+def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Returns the progress of one file as a part of `total` bytes, of which `before` were done."""
+    if progress is None:
+        return None
+    return lambda done, _: progress(before + done, total)
+
 
 class ChannelInfo(NamedTuple):
-    """What a file says of a channel.
+    """A channel as its file describes it.
 
     Attributes:
         topic: its name.
         encoding: of its messages.
-        schema: name of their schema, "" where they have none.
+        schema: name of their schema, "" if they have none.
         schema_encoding: how that is written.
-        metadata: what else is said of it.
+        metadata: further entries.
+        schema_data: the schema itself.
     """
 
     topic: str
@@ -76,13 +73,14 @@ class ChannelInfo(NamedTuple):
     schema: str
     schema_encoding: str
     metadata: dict[str, str]
+    schema_data: bytes = b""
 
 
 class McapMessage(NamedTuple):
     """One message.
 
     Attributes:
-        topic: of its channel; "" where the file never named it.
+        topic: of its channel; "" if the file never named it.
         payload: its bytes, as published.
         log_time_ns: when it came, Unix ns.
         publish_time_ns: when it was sent, by its own stamp, Unix ns.
@@ -96,30 +94,25 @@ class McapMessage(NamedTuple):
     sequence: int
 
 
-Progress = Callable[[int, int], None]
-"""Told how much of something is done: (bytes so far, bytes in all)."""
-
-
 class McapReader:
     """One pass over a file.
 
     Args:
         stream: the file, opened for reading.
-        name: what errors call it.
-        progress: told after every record of the file how many bytes of it are read, and how many it has.
-        kept: whether the messages are kept: then what they take, decoded, is limited; see `KEPT_RATIO`.
+        name: its name in errors.
+        progress: called after every record of the file.
+        kept: True if the caller keeps the messages: then what they take, decoded, is limited (`KEPT_RATIO`).
 
     Attributes:
         metadata: metadata records seen so far, by name.
         attachments: attachments seen so far, by name.
-        channels: channels seen so far, by topic; what one was first said to be, it is.
-        library: what wrote the file, by its own word.
+        channels: channels seen so far, by topic; the first definition of one holds.
+        library: what wrote the file, as its header states.
         chunks: chunks read so far, by compression ("" for none).
         packed_bytes: what they take in the file.
         unpacked_bytes: what they take unpacked.
+        offset: first byte of the record of the file that is being read.
         complete: True once all was read, to the end mark's last byte: the file was finished.
-        damaged: parts that could not be read, in the order in which they were met.
-        torn: the end that was cut off, in a file that was not finished.
     """
 
     def __init__(
@@ -131,29 +124,30 @@ class McapReader:
         self.library = ""
         self.chunks: Counter[str] = Counter()
         self.packed_bytes = self.unpacked_bytes = 0
+        self.offset = 0
         self.complete = False
-        self._framing = RecordScanner(stream)
+        self._scanner = RecordScanner(stream)
         self._source = name
         self._progress = progress
-        self._schemas: dict[int, tuple[str, str]] = {}
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._ours: set[int] = set()
-        self._room = max(KEPT_BYTES, KEPT_RATIO * self._framing.size) if kept else None
+        self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
 
     @property
     def size(self) -> int:
         """Bytes of the file."""
-        return self._framing.size
+        return self._scanner.size
 
     @property
     def damaged(self) -> list[Damage]:
         """Parts that could not be read, so far."""
-        return self._framing.damaged
+        return self._scanner.damaged
 
     @property
     def torn(self) -> Damage | None:
-        """The end that was cut off; None in a finished file, and before the walk has come to it."""
-        return self._framing.torn
+        """The end that was cut off; None in a finished file, and before it was reached."""
+        return self._scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in file order.
@@ -161,112 +155,102 @@ class McapReader:
         Raises:
             LogError: the file is no MCAP file, or holds absurdly much for its size.
         """
-        framing = self._framing
-        if not framing.begins:
-            empty = "is empty" if not framing.size else "does not begin as one does"
+        scanner = self._scanner
+        if not scanner.begins:
+            empty = "is empty" if not self.size else "does not begin as one does"
             raise LogError(f"{self._source}: is no MCAP file: it {empty}")
-        for frame in framing.frames():
-            if frame.opcode in _READ:
-                try:
-                    yield from self._in_frame(frame)
-                except UnreadableRecord as error:
-                    framing.damaged.append(Damage(frame.offset, RECORD_HEAD_BYTES + frame.length, str(error)))
+        for frame in scanner.frames():
+            self.offset = frame.offset
+            try:
+                yield from self._read_records(self._unpack(frame), frame)
+            except UnreadableRecord as error:
+                scanner.damaged.append(Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
-                self._progress(frame.end, framing.size)
-        self.complete = framing.finished
+                self._progress(frame.end, self.size)
+        self.complete = scanner.finished
 
-    def _in_frame(self, frame: RecordFrame) -> Iterator[McapMessage]:
-        """Yields the messages of one record of the file, and takes in what else it may be.
+    def _unpack(self, frame: RecordFrame) -> bytes:
+        """Returns the records with messages and channels in a record of the file; stores other contents."""
+        content = self._scanner.content(frame)
+        match frame.opcode:
+            case Opcode.CHUNK:
+                data = unpack_chunk(content)
+                self.chunks[self._scanner.head(frame).compression] += 1
+                self.packed_bytes += len(content)
+                self.unpacked_bytes += len(data)
+                return data
+            case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:  # outside of chunks
+                return RECORD_HEAD.pack(frame.opcode, frame.length) + content
+            case Opcode.METADATA:
+                entry = parse_record(frame.opcode, content)
+                self.metadata[entry.name] = entry.metadata
+            case Opcode.ATTACHMENT:
+                attachment = parse_record(frame.opcode, content)
+                if not has_right_crc(content):
+                    raise UnreadableRecord(f"the attachment {attachment.name[:80]!r}: its CRC differs")
+                self.attachments[attachment.name] = attachment.data
+            case Opcode.HEADER:
+                self.library = parse_record(frame.opcode, content).library
+        return b""
 
-        Raises:
-            Unreadable: it is damaged.
-            LogError: it holds more than there is room for.
-        """
-        content = self._framing.content(frame)
-        if frame.opcode == Opcode.CHUNK:
-            head = self._framing.head(frame)
-            data = unpack_chunk(content)
-            self.chunks[head.compression] += 1
-            self.packed_bytes += len(content)
-            self.unpacked_bytes += len(data)
-            yield from self._in_chunk(data, frame)
-        elif frame.opcode == Opcode.METADATA:
-            entry = parse_record(frame.opcode, content)
-            self.metadata[entry.name] = entry.metadata
-        elif frame.opcode == Opcode.ATTACHMENT:
-            attachment = parse_record(frame.opcode, content)
-            crc = int.from_bytes(content[-4:], "little")
-            if crc and zlib.crc32(memoryview(content)[:-4]) != crc:
-                raise UnreadableRecord(f"the attachment {attachment.name[:80]!r}: its CRC differs")
-            self.attachments[attachment.name] = attachment.data
-        elif frame.opcode == Opcode.HEADER:
-            self.library = parse_record(frame.opcode, content).library
-        else:  # outside of chunks
-            yield from self._in_chunk(_RECORD.pack(frame.opcode, frame.length) + content, frame)
+    def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
+        topics_by_id, ours, parse_head, head_bytes = (
+            self._topics,
+            self._ours,
+            MESSAGE_HEAD.unpack_from,
+            MESSAGE_HEAD.size,
+        )
+        memory = 0
+        for opcode, begin, end in iterate_records(data):
+            if opcode == OP_MESSAGE:
+                length = end - begin
+                if length < head_bytes:
+                    raise UnreadableRecord("a message is shorter than its head")
+                channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
+                if channel in ours:
+                    memory += _DECODED_BYTES
+                    if length > _LONG_BYTES:
+                        memory += (length - _LONG_BYTES) * _LONG_RATIO
+                else:
+                    memory += 100 + length
+                yield McapMessage(
+                    topics_by_id.get(channel, ""),
+                    data[begin + head_bytes : end],
+                    log_time_ns,
+                    publish_time_ns,
+                    sequence,
+                )
+            elif opcode in _DEFINITIONS:
+                self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
+                self._define(opcode, data[begin:end])
+        self._take_memory(memory, frame)
 
-    def _in_chunk(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
-        topics, ours = self._topics, self._ours
-        offset, end, taken = 0, len(data), 0
-        try:
-            while offset < end:
-                opcode, length = _RECORD.unpack_from(data, offset)
-                behind = offset + RECORD_HEAD_BYTES + length
-                if behind > end:
-                    raise UnreadableRecord("a record reaches beyond its chunk")
-                if opcode == _MESSAGE_OPCODE:
-                    channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(
-                        data, offset + RECORD_HEAD_BYTES
-                    )
-                    payload = data[offset + _BEFORE_PAYLOAD : behind]
-                    if channel in ours:
-                        taken += _DECODED_BYTES
-                        if length > _LONG_BYTES:
-                            taken += (length - _LONG_BYTES) * _LONG_RATIO
-                    else:
-                        taken += 100 + length
-                    yield McapMessage(
-                        topics.get(channel, ""), payload, log_time_ns, publish_time_ns, sequence
-                    )
-                elif opcode in _NAMING:
-                    self._take(_NAME_BYTES + _NAME_RATIO * length, frame)
-                    self._name(opcode, data[offset + RECORD_HEAD_BYTES : behind])
-                offset = behind
-        except struct.error:
-            raise UnreadableRecord("a record in a chunk is cut off") from None
-        self._take(taken, frame)
-
-    def _name(self, opcode: int, content: bytes) -> None:
+    def _define(self, opcode: int, content: bytes) -> None:
         record = parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
-            self._schemas.setdefault(record.id, (record.name, record.encoding))
+            self._schemas.setdefault(record.id, (record.name, record.encoding, record.data))
         elif record.id not in self._topics:
             self._topics[record.id] = topic = record.topic
-            schema = self._schemas.get(record.schema_id, ("", ""))
-            self.channels.setdefault(
-                topic, ChannelInfo(topic, record.message_encoding, *schema, record.metadata)
-            )
+            name, encoding, data = self._schemas.get(record.schema_id, ("", "", b""))
+            info = ChannelInfo(topic, record.message_encoding, name, encoding, record.metadata, data)
+            self.channels.setdefault(topic, info)
             if topic.startswith("/trilat/"):
                 self._ours.add(record.id)
 
-    def _take(self, amount: int, frame: RecordFrame) -> None:
-        """Books what was kept.
-
-        Raises:
-            LogError: there is no room for it.
-        """
+    def _take_memory(self, amount: int, frame: RecordFrame) -> None:
+        """Takes memory for what is kept; raises `LogError` if there is not so much."""
         if self._room is None:
             return
         self._room -= amount
         if self._room < 0:
             raise LogError(
-                f"{self._source}: holds absurdly much for a file of {self._framing.size} bytes: up to byte "
+                f"{self._source}: holds absurdly much for a file of {self.size} bytes: up to byte "
                 f"{frame.end} alone it would take more than {KEPT_RATIO} times that in memory, and more than "
                 f"{KEPT_BYTES >> 20} MiB"
             )
 
 
-_OURS = (topics.STATE, topics.LINK, topics.EVENT, topics.STATS)
-_LAST_NS = np.uint64((1 << 63) - 1)
+_LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
 
 
 class ChannelMessages:
@@ -292,27 +276,26 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns when the messages came and when they were sent, shape (K,) each, Unix ns."""
-        return _signed(self.log_ns), _signed(self.publish_ns)
+        """Returns when the messages came and when they were sent, shape (K,) each, Unix ns below 2^63."""
+        return _to_signed(self.log_ns), _to_signed(self.publish_ns)
 
 
-def _signed(times: "array[int]") -> NDArray[np.int64]:
-    """Returns times as whole numbers that may be subtracted; a stranger's may be anything."""
-    return np.minimum(np.array(times, dtype=np.uint64), _LAST_NS).astype(np.int64)
+def _to_signed(times: "array[int]") -> NDArray[np.int64]:
+    return np.minimum(np.array(times, dtype=np.uint64), _LAST_SIGNED_NS).astype(np.int64)
 
 
 @dataclass
 class LogContents:
-    """A file, or several that are one session's.
+    """Contents of a file, or of several that are one session's.
 
     Attributes:
         sources: the files' names.
-        session: what the file says of the session.
+        session: metadata of the session.
         scenario: text of the scenario.
-        metadata: everything of that kind, by name.
+        metadata: all metadata, by name.
         channels: messages, by topic.
-        complete: whether all of it is there, finished and readable throughout; a later part alone is not.
-        ended: whether the last one was finished.
+        complete: True if all of it is there, finished and readable throughout; a later part alone is not.
+        ended: True if the last one was finished.
         damaged: what cannot be read, a sentence each.
     """
 
@@ -327,45 +310,42 @@ class LogContents:
 
     @property
     def source(self) -> str:
-        """What errors call it."""
+        """Its name in errors."""
         more = len(self.sources) - 1
         return self.sources[0] + (f" and {more} more {'parts' if more > 1 else 'part'}" if more else "")
 
 
 def read_contents(stream: BinaryIO, name: str, progress: Progress | None = None) -> LogContents:
-    """Returns what a file holds.
-
-    Args:
-        stream: the file, opened for reading.
-        name: what errors call it.
-        progress: told while it is read how many bytes of it are, and how many it has.
+    """Returns the contents of a file, called `name` in errors.
 
     Raises:
         LogError: it is no MCAP file, or no log of trilat-net.
     """
-    walk = McapReader(stream, name, progress)
+    reader = McapReader(stream, name, progress)
     channels: dict[str, ChannelMessages] = {}
     adders: dict[str, Callable[[bytes, int, int], None]] = {}
-    for topic, payload, log_ns, publish_ns, _ in walk.messages():
+    for topic, payload, log_ns, publish_ns, _ in reader.messages():
         try:
             add = adders[topic]
         except KeyError:
-            add = adders[topic] = _adder(topic, channels)
+            add = adders[topic] = _make_adder(topic, channels)
         add(payload, log_ns, publish_ns)
-    session = walk.metadata.get(SESSION, {})
-    lacking = {"session", "driver"} - session.keys() or {SCENARIO} - walk.attachments.keys()
+    session = reader.metadata.get(SESSION, {})
+    lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
     if lacking:
-        why = f"; damaged: {walk.damaged[0]}" if walk.damaged else f"; {walk.torn}" if walk.torn else ""
+        why = (
+            f"; damaged: {reader.damaged[0]}" if reader.damaged else f"; {reader.torn}" if reader.torn else ""
+        )
         raise LogError(f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}{why}")
-    damaged = [f"{name}: {damage}" for damage in walk.damaged]
-    complete = walk.complete and not damaged and walk.metadata.get(PART, {}).get("index", "1") == "1"
-    text = walk.attachments[SCENARIO]
-    return LogContents((name,), session, text, walk.metadata, channels, complete, walk.complete, damaged)
+    damaged = [f"{name}: {damage}" for damage in reader.damaged]
+    complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
+    text = reader.attachments[SCENARIO]
+    return LogContents((name,), session, text, reader.metadata, channels, complete, reader.complete, damaged)
 
 
-def _adder(topic: str, channels: dict[str, ChannelMessages]) -> Callable[[bytes, int, int], None]:
-    """Returns what keeps a topic's messages; or lets them go, where nobody will ask for them."""
-    where = topics.parse_key(topic.removeprefix("/"))
-    if where is None or where.channel not in _OURS:
+def _make_adder(topic: str, channels: dict[str, ChannelMessages]) -> Callable[[bytes, int, int], None]:
+    """Returns a function that keeps a topic's messages, or drops those that are not the log's own."""
+    key = topics.parse_key(topic.removeprefix("/"))
+    if key is None or key.channel not in CHANNEL_TYPES:
         return lambda payload, log_ns, publish_ns: None  # noqa: ARG005
     return channels.setdefault(topic, ChannelMessages()).add

@@ -15,12 +15,10 @@ from typing import Protocol, runtime_checkable
 import zstandard
 from mcap.opcode import Opcode
 
-MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of a file."""
+from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
+
 CHUNK_BYTES = 1 << 20
 
-_OP_MESSAGE = int(Opcode.MESSAGE)  # a member of an enumeration packs slowly
-_RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<BQQQI")
@@ -61,7 +59,7 @@ def pack_text_map(texts: Mapping[str, str]) -> bytes:
 
 def pack_record(opcode: int, body: bytes) -> bytes:
     """Returns a record: its kind and its length before it."""
-    return _RECORD.pack(opcode, len(body)) + body
+    return RECORD_HEAD.pack(opcode, len(body)) + body
 
 
 class McapWriter:
@@ -173,7 +171,7 @@ class McapWriter:
         """
         opened = self._open
         self._entries[channel_id] += (log_time, len(opened))
-        opened += _MESSAGE.pack(_OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time)
+        opened += _MESSAGE.pack(OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time)
         opened += data
         self._counts[channel_id] += 1
         self.messages += 1

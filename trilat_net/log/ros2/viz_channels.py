@@ -17,6 +17,7 @@ from ...errors import UsageError
 from ...net import topics
 from ...net.messages import Event, LinkStats
 from ...scenario import Scenario
+from ..log_layout import VIZ_ROOT
 from .cdr import JointStatePacker
 from .ros2_messages import (
     ERROR_ROW,
@@ -49,7 +50,6 @@ TakeMessage = Callable[[Any, int], None]
 StampedRow = tuple[int, SignalRow]
 """A stamp, Unix ns, and what bears it."""
 
-_ROOT = "/viz"
 _tick = attrgetter("tick")
 
 
@@ -97,7 +97,7 @@ class _SiteVizWriter:
     def __init__(self, site: str, peers: Sequence[str], put: PutMessage) -> None:
         self._put = put
         self._shapes = shapes = Ros2SiteChannels(site, peers)
-        root = f"{_ROOT}/{site}/"
+        root = f"{VIZ_ROOT}{site}/"
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{root}joint_states", JointStatePacker(names)
         self._error_topic, self._error = f"{root}error", shapes.arrays["error"].pack
@@ -258,7 +258,7 @@ class VizChannels:
     ) -> None:
         self._epoch_unix_ns, self._put = epoch_unix_ns, put
         self.channels: dict[str, Ros2Channel] = {
-            f"{_ROOT}/{name}": channel for name, channel in SESSION_CHANNELS.items()
+            f"{VIZ_ROOT}{name}": channel for name, channel in SESSION_CHANNELS.items()
         }
         self.takers: dict[str, TakeMessage] = {
             topics.key(session, topics.RECORDER, topics.EVENT): self._event
@@ -278,7 +278,7 @@ class VizChannels:
         """Writes an event as of when it came: members that send at once need not arrive in that order."""
         stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
         for name, data in pack_event(event, stamp_ns):
-            self._put(f"{_ROOT}/{name}", data, log_ns, log_ns)
+            self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
         """Lets out what has not been written yet.

@@ -1,0 +1,343 @@
+"""Check of the bytes of MCAP files: checksums, records, and an index that agrees with them.
+
+Invariant: each problem is reported once, with its place; its consequences are not. An index is compared
+with the records in the file, never followed. Any MCAP file is accepted. Conformance with every rule of the
+format is left to other programs (`pymcap-cli doctor`).
+"""
+
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from .mcap_reader import Progress
+from .mcap_records import (
+    MAGIC,
+    MESSAGE_HEAD,
+    OP_MESSAGE,
+    RECORD_HEAD_BYTES,
+    RecordFrame,
+    RecordScanner,
+    UnreadableRecord,
+    has_right_crc,
+    iterate_records,
+    parse_record,
+    unpack_chunk,
+)
+
+MAX_LISTED_PROBLEMS = 1000
+"""Problems that a finding keeps; more are counted."""
+_INDEX_HEAD_BYTES = 6  # of a message index: channel, length of its entries
+
+
+class ProblemPlace(NamedTuple):
+    """A problem and its place.
+
+    Attributes:
+        file: in which file.
+        offset: at which byte, or in the chunk that begins there; None if the whole file is meant.
+        text: the problem.
+    """
+
+    file: str
+    offset: int | None
+    text: str
+
+    def __str__(self) -> str:
+        return self.text if self.offset is None else f"byte {self.offset}: {self.text}"
+
+
+class CheckFinding(NamedTuple):
+    """Result of one check.
+
+    Attributes:
+        check: its name: "whole", "checksums", "records", "index"; of a trilat-net log also "sequence",
+            "accounts", "schema", "times", "rates", "scenario".
+        passed: True if it passed.
+        text: the result in one line.
+        places: problems, at most `MAX_LISTED_PROBLEMS`.
+        wrong: number of problems.
+    """
+
+    check: str
+    passed: bool
+    text: str
+    places: list[ProblemPlace]
+    wrong: int
+
+
+@dataclass(slots=True)
+class ProblemList:
+    """Problems of one check: the first of them, and their number."""
+
+    places: list[ProblemPlace] = field(default_factory=list)
+    wrong: int = 0
+
+    def add(self, file: str, offset: int | None, text: str) -> None:
+        """Adds a problem."""
+        self.wrong += 1
+        if len(self.places) < MAX_LISTED_PROBLEMS:
+            self.places.append(ProblemPlace(file, offset, text))
+
+    def summary(self) -> str:
+        """Returns the first problem, and the number of others."""
+        return f"{self.places[0]}; and {self.wrong - 1} more" if self.wrong > 1 else str(self.places[0])
+
+    def finding(self, check: str, text: str) -> CheckFinding:
+        """Returns the result of a check: `text` if there is no problem, else their summary."""
+        return CheckFinding(
+            check, not self.wrong, self.summary() if self.wrong else text, self.places, self.wrong
+        )
+
+
+class McapCheck:
+    """Check of one or more files.
+
+    Attributes:
+        whole, checksums, records, index: the problems of each check.
+    """
+
+    def __init__(self) -> None:
+        self.whole, self.checksums, self.records, self.index = (ProblemList() for _ in range(4))
+        self._bytes = self._chunks = self._messages = self._crcs = 0
+
+    def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> bool:
+        """Checks every byte of a file; returns False if it does not begin as an MCAP file."""
+        scanner = RecordScanner(stream)
+        self._bytes += scanner.size
+        if not scanner.begins:
+            self.whole.add(file, 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
+            return False
+        one = _FileCheck(file, scanner, self)
+        reported, last = 0, None
+        for last in scanner.frames():
+            one.take(last)
+            for damage in scanner.damaged[reported:]:
+                self.whole.add(file, damage.offset, str(damage))
+            reported = len(scanner.damaged)
+            if progress is not None:
+                progress(last.end, scanner.size)
+        for damage in scanner.damaged[reported:]:
+            self.whole.add(file, damage.offset, str(damage))
+        if scanner.torn is not None:
+            self.whole.add(file, scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
+        elif last is not None and scanner.finished and last.end + len(MAGIC) < scanner.size:
+            end = last.end + len(MAGIC)
+            self.whole.add(file, end, f"{scanner.size - end} bytes follow the end mark")
+        if scanner.finished and not scanner.damaged:
+            one.compare_end()
+        self._chunks += one.chunks
+        self._messages += one.messages
+        self._crcs += one.crcs
+        return True
+
+    def findings(self) -> list[CheckFinding]:
+        """Returns the results, a check each."""
+        built = f"{self._messages} messages in {self._chunks} chunks, built as the format says"
+        return [
+            self.whole.finding("whole", f"finished, {self._bytes / 1e6:.1f} MB"),
+            self.checksums.finding("checksums", f"{self._crcs} compared, all agree"),
+            self.records.finding("records", built),
+            self.index.finding("index", "is what is there"),
+        ]
+
+
+class _FileCheck:
+    """Check of one file; counts what it compares."""
+
+    def __init__(self, file: str, scanner: RecordScanner, problems: McapCheck) -> None:
+        self.chunks = self.messages = self.crcs = 0
+        self._file, self._scanner, self._problems = file, scanner, problems
+        self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
+        self._found: dict[tuple[int, int], Any] = {}  # what an index should name: by its opcode and place
+        self._indexed: dict[tuple[int, int], Any] = {}  # what the index names
+        self._ends: dict[int, Any] = {}  # statistics, end of the data and footer, each with its offset
+        self._unknown: set[int] = set()  # channels of messages that no record names
+        self._indexes: dict[int, int] | None = None  # of the last chunk: where the index of a channel is
+        self._entries: dict[int, array[int]] = {}  # of the last chunk: log times and places, by channel
+        self._unreadable = False  # something unreadable may have named a channel
+
+    def take(self, frame: RecordFrame) -> None:
+        """Checks one record of the file."""
+        if frame.offset == len(MAGIC) and frame.opcode != Opcode.HEADER:
+            self._add_records_problem(frame, "the first record is no header")
+        try:
+            self._take_content(frame, self._scanner.content(frame))
+        except UnreadableRecord as error:
+            text = str(error)
+            problems = self._problems.checksums if "CRC" in text else self._problems.records
+            problems.add(self._file, frame.offset, text)
+            self._unreadable = True
+
+    def _add_records_problem(self, frame: RecordFrame, text: str) -> None:
+        self._problems.records.add(self._file, frame.offset, text)
+
+    def _take_content(self, frame: RecordFrame, content: bytes) -> None:
+        opcode = frame.opcode
+        if opcode == Opcode.CHUNK:
+            self._take_chunk(frame, content)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self._take_message_index(frame, content)
+        elif opcode == OP_MESSAGE:
+            self._take_message(frame, content, 0, len(content))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._define(frame, opcode, content)
+        elif opcode in _OTHERS:
+            self._take_other(frame, content)
+        elif opcode < 0x80:
+            self._add_records_problem(frame, f"a record of kind {opcode} is none of the format")
+
+    def _take_other(self, frame: RecordFrame, content: bytes) -> None:
+        """Takes metadata, an attachment, or a record of the end; those of the index by what they name."""
+        record = parse_record(frame.opcode, content)
+        match frame.opcode:
+            case Opcode.METADATA:
+                self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
+            case Opcode.ATTACHMENT:
+                if not has_right_crc(content):
+                    raise UnreadableRecord("an attachment's CRC differs")
+                self.crcs += content[-4:] != bytes(4)
+                self._found[Opcode.ATTACHMENT_INDEX, frame.offset] = frame.size, record.name
+            case Opcode.METADATA_INDEX | Opcode.ATTACHMENT_INDEX:
+                self._indexed[frame.opcode, record.offset] = record.length, record.name
+            case Opcode.CHUNK_INDEX:
+                times = record.message_start_time, record.message_end_time
+                self._indexed[frame.opcode, record.chunk_start_offset] = (
+                    record.chunk_length,
+                    *times,
+                    record.message_index_offsets,
+                )
+            case _:
+                self._ends[frame.opcode] = frame.offset, record
+
+    def _define(self, frame: RecordFrame, opcode: int, content: bytes) -> None:
+        """Takes a schema or a channel; one that came before must be the same."""
+        record = parse_record(opcode, content)
+        name = "schema" if opcode == Opcode.SCHEMA else "channel"
+        if self._defined.setdefault((opcode, record.id), record) != record:
+            self._add_records_problem(frame, f"{name} {record.id} is not what it was before")
+        schema = record.schema_id if opcode == Opcode.CHANNEL else 0
+        if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._unreadable:
+            text = f"channel {record.id} names schema {schema}, which comes nowhere before"
+            self._add_records_problem(frame, text)
+
+    def _take_message(self, frame: RecordFrame, data: bytes, begin: int, end: int) -> tuple[int, int]:
+        """Takes a message; returns its channel and its log time."""
+        if end - begin < MESSAGE_HEAD.size:
+            raise UnreadableRecord("a message is shorter than its head")
+        channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, begin)
+        if (Opcode.CHANNEL, channel) not in self._defined and channel not in self._unknown:
+            self._unknown.add(channel)
+            if not self._unreadable:
+                text = f"messages of channel {channel}, which comes nowhere before"
+                self._add_records_problem(frame, text)
+        self.messages += 1
+        return channel, log_ns
+
+    def _take_chunk(self, frame: RecordFrame, content: bytes) -> None:
+        self._indexes = None
+        head = self._scanner.head(frame)
+        self.chunks += 1
+        data = unpack_chunk(content)
+        self.crcs += bool(head.crc)
+        self._entries.clear()
+        for opcode, begin, end in iterate_records(data):
+            if opcode == OP_MESSAGE:
+                channel, log_ns = self._take_message(frame, data, begin, end)
+                entries = self._entries.setdefault(channel, array("Q"))
+                entries.append(log_ns)
+                entries.append(begin - RECORD_HEAD_BYTES)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._define(frame, opcode, data[begin:end])
+            else:
+                self._add_records_problem(frame, f"a chunk holds a record of kind {opcode}")
+        self._indexes = {}
+        found = frame.size, head.start_ns, head.end_ns, self._indexes
+        self._found[Opcode.CHUNK_INDEX, frame.offset] = found
+
+    def _take_message_index(self, frame: RecordFrame, content: bytes) -> None:
+        """Compares the index of a channel's messages in the last chunk with these."""
+        if self._indexes is None:
+            return  # the chunk could not be read
+        channel, length = int.from_bytes(content[:2], "little"), int.from_bytes(content[2:6], "little")
+        body = content[_INDEX_HEAD_BYTES:]
+        if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
+            raise UnreadableRecord(f"a message index of {len(body)} bytes says that it has {length}")
+        self._indexes[channel] = frame.offset
+        if not np.array_equal(_sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))):
+            text = f"the index of channel {channel} in a chunk is not what is there"
+            self._problems.index.add(self._file, frame.offset, text)
+
+    def compare_end(self) -> None:
+        """Compares the end of a finished file with its data, and the checksums there."""
+        if not self._unreadable:
+            self._compare_index()
+            self._compare_statistics()
+        footer = self._scanner.footer()
+        if Opcode.DATA_END not in self._ends:
+            self._problems.records.add(self._file, self._scanner.size, "there is no end of the data")
+            return
+        offset, data_end = self._ends[Opcode.DATA_END]
+        self.crcs += bool(data_end.data_section_crc)
+        if data_end.data_section_crc and self._scanner.crc(0, offset) != data_end.data_section_crc:
+            self._problems.checksums.add(self._file, offset, "the CRC of the data differs")
+        if footer is not None and footer.summary_crc:
+            self.crcs += 1
+            if not self._scanner.is_summary_intact(footer):
+                offset, _ = self._ends[Opcode.FOOTER]
+                self._problems.checksums.add(self._file, offset, "the CRC of the index differs")
+
+    def _compare_index(self) -> None:
+        kinds = {opcode for opcode, _ in self._indexed}
+        for (opcode, offset), entry in sorted(self._found.items()):
+            if opcode in kinds and self._indexed.pop((opcode, offset), None) != entry:
+                text = f"the {_INDEXED_NAMES[opcode]} that begins here is not in the index as it is"
+                self._problems.index.add(self._file, offset, text)
+        for opcode, offset in sorted(self._indexed):
+            text = f"the index names {_INDEXED_NAMES[opcode]} that is not there"
+            self._problems.index.add(self._file, offset, text)
+
+    def _compare_statistics(self) -> None:
+        if Opcode.STATISTICS not in self._ends:
+            return
+        offset, statistics = self._ends[Opcode.STATISTICS]
+        counts: Mapping[str, tuple[int, int]] = {
+            "messages": (statistics.message_count, self.messages),
+            "schemas": (statistics.schema_count, self._count(self._defined, Opcode.SCHEMA)),
+            "channels": (statistics.channel_count, self._count(self._defined, Opcode.CHANNEL)),
+            "chunks": (statistics.chunk_count, self.chunks),
+            "attachments": (statistics.attachment_count, self._count(self._found, Opcode.ATTACHMENT_INDEX)),
+            "metadata": (statistics.metadata_count, self._count(self._found, Opcode.METADATA_INDEX)),
+        }
+        for name, (stated, there) in counts.items():
+            if stated != there:
+                text = f"the statistics say {stated} {name}, there are {there}"
+                self._problems.index.add(self._file, offset, text)
+
+    @staticmethod
+    def _count(keys: Mapping[tuple[int, int], Any], opcode: int) -> int:
+        return sum(kind == opcode for kind, _ in keys)
+
+
+def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
+    """Returns the entries of a message index, log time and place each, in the order of their places."""
+    pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
+    return pairs[np.argsort(pairs[:, 1], kind="stable")]
+
+
+_OTHERS = frozenset(Opcode) - {
+    Opcode.CHUNK,
+    Opcode.MESSAGE,
+    Opcode.MESSAGE_INDEX,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+}
+_INDEXED_NAMES: dict[int, str] = {
+    Opcode.CHUNK_INDEX: "chunk",
+    Opcode.ATTACHMENT_INDEX: "attachment",
+    Opcode.METADATA_INDEX: "metadata",
+}
