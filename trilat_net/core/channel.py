@@ -23,19 +23,15 @@ from .ticks import tick_ns
 from .vectors import Points, Row
 
 LOST = -1
-"""In the place of a time: the sample is lost."""
+"""Stands for the time of a sample that is lost."""
 
-_AR1, _SINE, _TRACE, _MEASURED = (
-    int(DelayKind.AR1),
-    int(DelayKind.SINE),
-    int(DelayKind.TRACE),
-    int(DelayKind.MEASURED),
-)
+_AR1, _SINE = int(DelayKind.AR1), int(DelayKind.SINE)
+_TRACE, _MEASURED = int(DelayKind.TRACE), int(DelayKind.MEASURED)
 
 
 @leaf
 def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
-    """True where a stamp lies in an outage of the link: its beginning belongs to it, its end does not."""
+    """True if a stamp lies in an outage of the link, which includes its beginning and not its end."""
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
             return True
@@ -43,8 +39,8 @@ def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
 
 
 @leaf
-def _lost(sample: int, fresh: bool, link: Row, model: Row) -> bool:
-    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample and says whether that is lost.
+def _draw_loss(sample: int, fresh: bool, link: Row, model: Row) -> bool:
+    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample; True if that is lost.
 
     A fresh chain begins in its stationary distribution.
     """
@@ -64,7 +60,7 @@ def _lost(sample: int, fresh: bool, link: Row, model: Row) -> bool:
 
 @leaf
 def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
-    """Returns the delay of a sample, us; LOST where a trace says so."""
+    """Returns the delay of a sample, us, or LOST by its trace."""
     key: DrawKey = link.key
     if model.kind == _MEASURED:
         return 0
@@ -81,7 +77,7 @@ def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, po
 @leaf
 def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
     """Returns when a sample is due, ns since the epoch, or LOST."""
-    lost = _lost(sample, fresh, link, model)
+    lost = _draw_loss(sample, fresh, link, model)
     delay_us = _delay_us(sample, stamp_ns, fresh, link, model, points)
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
         return LOST
@@ -101,14 +97,9 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
 
 @leaf
 def schedule_deliveries(sample: int, link: Row, models: Row, samples: Row, points: Points) -> None:
-    """Decides the fate of every sample up to one and writes it into its page, `due_ns`.
+    """Decides the delivery of every sample up to one and writes it into its page, `due_ns`.
 
-    Args:
-        sample: the index of the last one.
-        link: the link's row, dtype LINK.
-        models: its models in the order of their first stamps, shape (M,), dtype MODEL.
-        samples: the link's pages, shape (pages,), dtype SAMPLE.
-        points: the site's traces and outages.
+    `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
     """
     pages = samples.shape[0]
     while link.foreseen < sample:

@@ -1,7 +1,8 @@
 """The control laws: the paper's adaptive one, split as its equations are, and the classics.
 
 Invariant: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-
-order update explicit. Gains are diagonal and stand as vectors.
+order update explicit. Gains are diagonal and written as vectors, one number per joint (N m s/rad, Lambda in
+1/s) or per parameter; angles are rad, speeds rad/s, torques N m.
 
 Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
 Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009);
@@ -18,15 +19,7 @@ from .vectors import Five, Pair, Vector
 def control_errors(
     q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
 ) -> tuple[Pair, Pair, Pair]:
-    """Returns e, its derivative and r = qd + Lambda e: Eq. (9), (18), (10).
-
-    Args:
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        q_des: reference q_id of Eq. (6), shape (2,), rad.
-        qd_des: its derivative, shape (2,), rad/s.
-        Lambda: shape (2,), 1/s.
-    """
+    """Returns e, its derivative and r = qd + Lambda e: Eq. (9), (18), (10)."""
     e = (q[0] - q_des[0], q[1] - q_des[1])
     ed = (qd[0] - qd_des[0], qd[1] - qd_des[1])
     return e, ed, (qd[0] + Lambda[0] * e[0], qd[1] + Lambda[1] * e[1])
@@ -34,7 +27,7 @@ def control_errors(
 
 @leaf
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
-    """Returns Y' r, shape (5,), what drives the estimate in Eq. (15), for the two rows of Y."""
+    """Returns Y' r, which drives the estimate in Eq. (15), for the two rows of Y."""
     a, b = Y
     return (
         a[0] * r[0] + b[0] * r[1],
@@ -47,14 +40,7 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 @leaf
 def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
-    """Returns theta_hat - gain Gamma Y' r, Eq. (15) over a time `gain_s`.
-
-    Args:
-        theta_hat: estimate, shape (5,), units of theta.
-        gain_s: the time over which this value of Y' r counts, s.
-        Gamma: adaptation gain of each parameter, shape (5,).
-        Yr: Y' r, shape (5,).
-    """
+    """Returns theta_hat - gain_s Gamma Y' r, Eq. (15) over a time of gain_s."""
     return (
         theta_hat[0] - gain_s * Gamma[0] * Yr[0],
         theta_hat[1] - gain_s * Gamma[1] * Yr[1],
@@ -66,7 +52,7 @@ def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector)
 
 @leaf
 def limit_torque(torque: float, limit: float) -> float:
-    """Returns a torque held within +-limit, N m."""
+    """Returns a torque clipped to +-limit."""
     return min(max(torque, -limit), limit)
 
 
@@ -74,16 +60,9 @@ def limit_torque(torque: float, limit: float) -> float:
 def adaptive_torque(
     Y: tuple[Five, Five], theta_hat: Vector, Kp: Vector, Kd: Vector, r: Vector, ed: Vector, limit: float
 ) -> Pair:
-    """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), N m, held within +-limit.
+    """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), within +-limit.
 
-    Args:
-        Y: regressor Y(q, qd, -Lambda e, -Lambda ed), two rows.
-        theta_hat: estimate, shape (5,).
-        Kp: shape (2,), N m s/rad.
-        Kd: shape (2,), N m s/rad.
-        r: shape (2,), rad/s.
-        ed: shape (2,), rad/s.
-        limit: largest torque of a joint, N m.
+    Y is the regressor Y(q, qd, -Lambda e, -Lambda ed), two rows.
     """
     total_0 = total_1 = 0.0
     for p in range(5):
@@ -95,8 +74,7 @@ def adaptive_torque(
 
 
 @leaf
-def clamp(value: float, low: float, high: float) -> float:
-    """Returns a number held within a box."""
+def _clip(value: float, low: float, high: float) -> float:
     if value < low:
         return low
     return high if value > high else value
@@ -104,17 +82,17 @@ def clamp(value: float, low: float, high: float) -> float:
 
 @leaf
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
-    """Returns every parameter held within its box, shape (5,) each.
+    """Returns every parameter clipped to its box.
 
     For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)' Gamma^-1 (theta_hat -
     theta) rise, so that V' <= 0 stands.
     """
     return (
-        clamp(theta_hat[0], low[0], high[0]),
-        clamp(theta_hat[1], low[1], high[1]),
-        clamp(theta_hat[2], low[2], high[2]),
-        clamp(theta_hat[3], low[3], high[3]),
-        clamp(theta_hat[4], low[4], high[4]),
+        _clip(theta_hat[0], low[0], high[0]),
+        _clip(theta_hat[1], low[1], high[1]),
+        _clip(theta_hat[2], low[2], high[2]),
+        _clip(theta_hat[3], low[3], high[3]),
+        _clip(theta_hat[4], low[4], high[4]),
     )
 
 
@@ -133,7 +111,7 @@ def damped_torque(
     felt: Vector,
     limit: float,
 ) -> Pair:
-    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, N m, within +-limit: the laws that know gravity.
+    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, within +-limit: the laws of known gravity.
 
     P+d has Kd = k_f = 0. For N sites with equal K and d per joint and one constant delay T its linearised
     loop is stable from d = abs(lambda_min(alpha)) K T on, whatever the masses, for two sites with 4 d_1 d_2 >
@@ -143,16 +121,16 @@ def damped_torque(
     Args:
         theta: the parameters that the law takes the arm to have, shape (5,).
         g: gravitational acceleration, m/s^2.
-        K: stiffness, shape (2,), N m/rad.
-        d: damping of the arm's own velocity, shape (2,), N m s/rad.
-        Kd: damping of the error's velocity, shape (2,), N m s/rad.
-        k_f: share of what the peers feel, shape (2,).
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        e: position error, shape (2,), rad.
-        ed: its derivative, shape (2,), rad/s.
-        felt: the torque on the peers' arms as it came, weighted by dominance, shape (2,), N m.
-        limit: largest torque of a joint, N m.
+        K: stiffness, N m/rad.
+        d: damping of the arm's own velocity.
+        Kd: damping of the error's velocity.
+        k_f: gain of the reflected force, dimensionless.
+        q: joint angles.
+        qd: joint velocities.
+        e: position error.
+        ed: its derivative.
+        felt: the torque on the peers' arms as received, weighted by dominance.
+        limit: largest torque of a joint.
     """
     G = gravity(theta, g, q)
     total_0 = G[0] - K[0] * e[0] - d[0] * qd[0] - Kd[0] * ed[0] + k_f[0] * felt[0]

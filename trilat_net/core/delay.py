@@ -16,11 +16,11 @@ from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 from .vectors import Points, Row
 
 MAX_DELAY_US = 10_000_000
-"""No delay is longer; what a distribution's tail gives beyond is cut off here."""
+"""No delay is longer; the tail of a distribution is cut off here."""
 
 
 class DelayKind(IntEnum):
-    """The kinds of delay, and what the four parameters of a `Model` mean in each; times in us.
+    """The kinds of delay, and the meaning of the four parameters of a `LinkModel` in each; times in us.
 
     CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`, drawn again
     where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of normal (`location`, `scale`).
@@ -43,31 +43,27 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """What a trace does behind its last point: hold it, or begin again."""
+    """How a trace goes on after its last point: it holds that, or begins again."""
 
     HOLD = 0
     LOOP = 1
 
 
 class LinkModel(NamedTuple):
-    """What a link does to the samples from one stamp on.
+    """A link's effect on its samples from one stamp on.
 
     Attributes:
         from_ns: the first stamp that it applies to, ns since the epoch.
-        kind: a `Delay`.
-        location: see `Delay`.
-        scale: see `Delay`.
-        extra: see `Delay`.
-        weight: see `Delay`.
-        at_end: an `AtEnd`, of a trace.
-        trace_first: where its points begin in the site's table, of a trace.
+        kind: a `DelayKind`, which gives `location`, `scale`, `extra` and `weight` their meaning.
+        at_end: a `TraceEnd`, of a trace.
+        trace_first: where the points of a trace begin in the site's table.
         trace_count: how many they are.
         loss_good: probability that a sample is lost in the good state.
         loss_bad: probability that it is lost in the bad state.
         enter: probability to go from good to bad, per sample.
         leave: probability to go from bad to good, per sample.
         duplicate: probability that a sample has a copy, with a delay of its own.
-        in_order: 1 where no sample is released before an older one, 0 where the newest wins.
+        in_order: 1: no sample is released before an older one; 0: the newest wins.
         playout_us: every sample is held at least so long, us.
     """
 
@@ -95,12 +91,7 @@ LINK_MODEL_DTYPE = np.dtype(
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns a delay that no sample of a link exceeds, us, play-out included.
-
-    Args:
-        models: what the link does.
-        traces: per model the points of its trace, or None.
-    """
+    """Returns a delay that no sample of a link exceeds, us, play-out included; traces: per model, or None."""
     reaches = []
     for model, trace in zip(models, traces, strict=True):
         bounded = {
@@ -124,14 +115,7 @@ _LOOP = int(TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Returns a draw of a distribution without memory, us, not rounded.
-
-    Args:
-        key: the link's, see `draw.link_key`.
-        sample: the sample's index.
-        purpose: DELAY, or COPY for that of a duplicate.
-        model: a row of dtype MODEL.
-    """
+    """Returns a draw of a distribution without memory, us, not rounded; purpose: DELAY, or COPY."""
     location: float = model.location
     scale: float = model.scale
     extra: float = model.extra
@@ -155,15 +139,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 
 @leaf
 def next_correlated(key: DrawKey, sample: int, correlation: float, before: float, fresh: bool) -> float:
-    """Returns the next number of an AR(1) sequence: standard normal, whatever the correlation.
-
-    Args:
-        key: the link's.
-        sample: the sample's index.
-        correlation: of a number with the one before, from 0 to below 1.
-        before: the number before.
-        fresh: True where there is none.
-    """
+    """Returns the next number of an AR(1) sequence, standard normal; a fresh one has no number before."""
     x = standard_normal(key, sample, DELAY, 0)
     if fresh:
         return x
@@ -183,25 +159,19 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     """Returns the delay of a trace, that of its last point at or before the stamp; -1: the sample is lost.
 
-    The last point lasts as long as the one before it; behind that the trace holds it or begins again.
+    The last point lasts as long as the one before it; after that the trace holds it or begins again.
     """
     first, count = model.trace_first, model.trace_count
     t_us = stamp_ns // 1000
     if model.at_end == _LOOP and count > 1:
         end_us = points[first + count - 1, 0]
         t_us %= 2 * end_us - points[first + count - 2, 0]
-    low, high = 0, count  # the last point at or before t lies in [low, high)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if points[first + middle, 0] <= t_us:
-            low = middle
-        else:
-            high = middle
-    delay_us: int = points[first + low, 1]
+    before = int(np.searchsorted(points[first : first + count, 0], t_us, side="right")) - 1
+    delay_us: int = points[first + max(before, 0), 1]
     return delay_us
 
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay in whole microseconds, from 0 to `LIMIT_US`."""
-    return int(min(max(math.floor(delay_us + 0.5), 0.0), 10_000_000.0))
+    """Returns a delay in whole microseconds, from 0 to `MAX_DELAY_US`."""
+    return int(min(max(math.floor(delay_us + 0.5), 0.0), float(MAX_DELAY_US)))

@@ -2,8 +2,8 @@
 
 Invariant: rows of alpha sum to one, the diagonal is zero, and beta is the LEFT null vector of Upsilon.
 While factors change, they are a function of time and of the ramps alone; between two rows that sum to 1
-every row does. A stale peer brings a step to rest; the way back is smooth: from the held pose to the
-peers along 3 x^2 - 2 x^3.
+every row does. A stale peer stops the reference; the return is smooth: from the held pose to the peers along
+3 x^2 - 2 x^3.
 
 Source: Eq. (6), (7), (20) of the paper. The paper takes beta = (1, 1, 1); that is the right null vector,
 and a left one only if the columns sum to one as well. The left one of an irreducible matrix is its Perron
@@ -22,12 +22,7 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_row_problem(row: Array, own: int) -> str | None:
-    """Says what is wrong with one row of alpha, or None: Eq. (7) for N sites.
-
-    Args:
-        row: shares of the peers in a site's reference, shape (N,), dimensionless.
-        own: the site's own index, whose share must be zero.
-    """
+    """Returns the problem of one row of alpha, shape (N,), of site `own`, or None: Eq. (7) for N sites."""
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
     if row[own] != 0.0:
@@ -45,7 +40,7 @@ def upsilon(alpha: Array) -> Array:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """True where every site reaches every other along the links that carry a share, alpha shape (N, N)."""
+    """True if every site reaches every other along links with a factor above 0, alpha of shape (N, N)."""
     reach = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
     for _ in range(len(alpha).bit_length()):
         reach = reach @ reach
@@ -56,10 +51,7 @@ def perron_vector(alpha: Array) -> Array:
     """Returns beta > 0 with beta' Upsilon = 0 and sum 1, shape (N,), for an irreducible alpha.
 
     By the elimination of Grassmann, Taksar and Heyman (1985): no subtraction occurs, so every entry is
-    right to a few units in its last place, also where shares differ by many orders of magnitude.
-
-    Args:
-        alpha: the dominance matrix, shape (N, N).
+    right to a few units in its last place, however many orders of magnitude the factors differ by.
 
     Raises:
         ValueError: alpha is reducible; then some site's weight would be zero, or beta not unique.
@@ -80,12 +72,11 @@ def perron_vector(alpha: Array) -> Array:
 
 
 RAMP_COLUMNS = 2
-"""A ramp is a row: start and end, ns, then the share of each peer at its end."""
+"""A ramp is a row: start and end, ns, then the dominance factor of each peer at its end."""
 
 
 @leaf
-def _between(t_ns: float, start_ns: float, end_ns: float, before: float, after: float) -> float:
-    """Returns the share at a time of one ramp."""
+def _interpolate(t_ns: float, start_ns: float, end_ns: float, before: float, after: float) -> float:
     if t_ns >= end_ns:
         return after
     return before + (after - before) * ((t_ns - start_ns) / (end_ns - start_ns))
@@ -93,15 +84,11 @@ def _between(t_ns: float, start_ns: float, end_ns: float, before: float, after: 
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Writes alpha and its derivative into every link.
+    """Writes alpha and its derivative at time t into every link.
 
-    A ramp begins where the one before it is at that time, complete or not.
-
-    Args:
-        t_ns: the time, ns since the epoch.
-        count: how many rows of `ramps` are filled; the first holds the shares at the epoch.
-        ramps: in the order of their starts, shape (R, 2 + P), see `RAMP_COLUMNS`.
-        links: one row per peer, dtype LINK.
+    The first `count` rows of `ramps`, shape (R, RAMP_COLUMNS + P), are filled, in the order of their starts;
+    row 0 holds the factors at the epoch. A ramp begins where the one before it is at that time, complete or
+    not.
     """
     for j in range(links.shape[0]):
         link: Row = links[j]
@@ -110,12 +97,12 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
         for n in range(1, count):
             if t_ns < ramps[n, 0]:
                 break
-            before = _between(
+            before = _interpolate(
                 ramps[n, 0], ramps[current, 0], ramps[current, 1], before, ramps[current, column]
             )
             current = n
         start_ns, end_ns, after = ramps[current, 0], ramps[current, 1], ramps[current, column]
-        link.alpha = _between(t_ns, start_ns, end_ns, before, after)
+        link.alpha = _interpolate(t_ns, start_ns, end_ns, before, after)
         link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
 
 
@@ -126,7 +113,7 @@ _USE, _ACT_BRAKE = int(StaleAction.USE), int(StaleAction.BRAKE)
 
 @leaf
 def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """True where a peer with a share is older than `age_ns`; before its first sample it is as old as t."""
+    """True if a peer that is followed is older than `age_ns`; before its first sample it is as old as t."""
     for j in range(links.shape[0]):
         link: Row = links[j]
         stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
@@ -137,13 +124,7 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
-    """Changes the mode where peers became stale or fresh, and the reference where the mode asks for it.
-
-    Args:
-        t_ns: the time, ns since the epoch.
-        site: the site's row; its q_des and qd_des are what the peers give, its q_held what was in force.
-        links: one row per peer, dtype LINK.
-    """
+    """Changes the mode if peers became stale or fresh, and the reference as the mode requires."""
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
     stale = any_peer_stale(t_ns, site.stale_ns, links)
@@ -173,7 +154,7 @@ def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
 def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> None:
     """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order.
 
-    While shares change, the derivative has their rates in it too.
+    While factors change, the derivative includes their rates.
     """
     if site.ramps > 1:
         apply_ramps(t_ns, site.ramps, ramps, links)

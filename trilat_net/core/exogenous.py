@@ -20,11 +20,12 @@ from .vectors import Array, Pair, Row, Vector
 
 
 class TorqueKind(IntEnum):
-    """How an actor pushes.
+    """The kinds of operators and environments.
 
     PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a damper towards a
     target that moves along a minimum-jerk path, in joint angles or in the plane. RECORDED is torque by a
-    table. VISCOUS resists motion of the joints. WALL pushes the tip out of a half-plane, and never pulls.
+    table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-plane, and never
+    pulls.
     """
 
     PULSE = 0
@@ -36,19 +37,19 @@ class TorqueKind(IntEnum):
 
 
 class TorqueSource(NamedTuple):
-    """One operator or environment; what its vectors mean depends on how it acts.
+    """One operator or environment; the meaning of its vectors depends on its kind.
 
     Attributes:
-        acts: how.
-        start_s: from when on, s since the epoch.
-        end_s: until when, s.
+        acts: its kind.
+        start_s: when it begins to act, s since the epoch.
+        end_s: when it ends, s.
         move_start_s: when its target begins to move, s.
-        move_end_s: when its target is there, s.
+        move_end_s: when its target arrives, s.
         a: PULSE: peak, N m. HAND, TASK_HAND: target before, rad or m. WALL: a point of it, m.
         b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall.
         K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (the first one).
         B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first one).
-        sampled: whether it is evaluated once a tick and held.
+        sampled: true: evaluated once a tick and held.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (n, 1 + JOINTS).
     """
 
@@ -65,23 +66,14 @@ class TorqueSource(NamedTuple):
     table: Array | None = None
 
 
-_PAIR = (JOINTS,)
+_TIMES, _PAIRS = ("start_s", "end_s", "move_start_s", "move_end_s"), ("a", "b", "K", "B")
 TORQUE_SOURCE_DTYPE = np.dtype(
     (
         np.record,
         [
-            ("acts", "i8"),
-            ("sampled", "i8"),
-            ("start_s", "f8"),
-            ("end_s", "f8"),
-            ("move_start_s", "f8"),
-            ("move_end_s", "f8"),
-            ("a", "f8", _PAIR),
-            ("b", "f8", _PAIR),
-            ("K", "f8", _PAIR),
-            ("B", "f8", _PAIR),
-            ("table_first", "i8"),
-            ("table_count", "i8"),
+            *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count")),
+            *((name, "f8") for name in _TIMES),
+            *((name, "f8", (JOINTS,)) for name in _PAIRS),
         ],
     )
 )
@@ -93,13 +85,13 @@ _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), 
 
 
 def torque_source_rows(actors: tuple[TorqueSource, ...]) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns the actors as the core has them: one row each, dtype ACTOR, and all their tables in one."""
+    """Returns the actors as the core has them: a row each, and all their tables in one."""
     rows = np.zeros(len(actors), TORQUE_SOURCE_DTYPE)
     tables = [np.zeros((0, 1 + JOINTS))]
     first = 0
     row: Row
     for row, actor in zip(rows, actors, strict=True):
-        for name in ("start_s", "end_s", "move_start_s", "move_end_s", "a", "b", "K", "B"):
+        for name in (*_TIMES, *_PAIRS):
             row[name] = getattr(actor, name)
         row.acts, row.sampled = int(actor.acts), int(actor.sampled)
         if actor.table is not None:
@@ -111,7 +103,7 @@ def torque_source_rows(actors: tuple[TorqueSource, ...]) -> tuple[TorqueSourceRo
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns how far a minimum-jerk move is: its share of the way, and the rate of that, 1/s.
+    """Returns the progress of a minimum-jerk move, 0 to 1, and its rate, 1/s.
 
     10 x^3 - 15 x^4 + 6 x^5 between start and end, after Flash and Hogan, "The coordination of arm
     movements", J. Neuroscience 5 (1985).
@@ -125,36 +117,31 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 
 
 @leaf
-def _pulse(actor: Row, t_s: float) -> Pair:
-    """Returns peak * sin^2(pi (t - start) / (end - start))."""
+def _pulse_torque(actor: Row, t_s: float) -> Pair:
     s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
     return actor.a[0] * (s * s), actor.a[1] * (s * s)
 
 
 @leaf
-def _spring(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
+def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     """Returns K (target - at) + B (its velocity - speed), per axis."""
-    share, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+    progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
     way_0, way_1 = actor.b[0] - actor.a[0], actor.b[1] - actor.a[1]
     return (
-        actor.K[0] * (actor.a[0] + share * way_0 - at[0]) + actor.B[0] * (rate * way_0 - speed[0]),
-        actor.K[1] * (actor.a[1] + share * way_1 - at[1]) + actor.B[1] * (rate * way_1 - speed[1]),
+        actor.K[0] * (actor.a[0] + progress * way_0 - at[0]) + actor.B[0] * (rate * way_0 - speed[0]),
+        actor.K[1] * (actor.a[1] + progress * way_1 - at[1]) + actor.B[1] * (rate * way_1 - speed[1]),
     )
 
 
 @leaf
-def _tabled(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns a torque between its rows, linearly; nothing before the first and behind the last."""
+def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
+    """Interpolates a table linearly; 0 before its first row and after its last."""
     first, count = actor.table_first, actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
         return 0.0, 0.0
-    low, high = first, first + count - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if table[middle, 0] <= t_s:
-            low = middle
-        else:
-            high = middle
+    before = int(np.searchsorted(table[first : first + count, 0], t_s, side="right")) - 1
+    low = first + max(min(before, count - 2), 0)
+    high = min(low + 1, first + count - 1)
     span = table[high, 0] - table[low, 0]
     x = (t_s - table[low, 0]) / span if span > 0.0 else 0.0
     return (
@@ -164,8 +151,8 @@ def _tabled(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 
 
 @leaf
-def _wall(actor: Row, at: Pair, speed: Pair) -> Pair:
-    """Returns the force of a wall on the tip, N: along its normal, and never a pull."""
+def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
+    """Returns the force of a wall on the end effector, N: along its normal, and never a pull."""
     depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
     if not depth > 0.0:
         return 0.0, 0.0
@@ -175,41 +162,35 @@ def _wall(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 
 @leaf
-def _in_the_plane(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> Pair:
-    """Returns J' F of a force at the tip: a hand's, or a wall's."""
+def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> Pair:
+    """Returns J' F of a force at the end effector: an operator's, or a wall's."""
     _, at = forward_kinematics(lengths, q)
     x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
-    force = _spring(actor, t_s, at, speed) if actor.acts == _TASK_HAND else _wall(actor, at, speed)
+    force = (
+        _spring_force(actor, t_s, at, speed) if actor.acts == _TASK_HAND else _wall_force(actor, at, speed)
+    )
     return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1]
 
 
 @leaf
 def source_torque(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable) -> Pair:
-    """Returns what one actor does to the arm at time t, N m, ON it.
+    """Returns the torque of one actor ON the arm at time t, N m.
 
     A pulse is peak * sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper,
     whose numbers are not printed.
-
-    Args:
-        t_s: time since the epoch, s.
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        lengths: of the two links, m.
-        actor: its row, dtype ACTOR.
-        table: the site's recorded torques.
     """
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0
     if actor.acts == _PULSE:
-        return _pulse(actor, t_s)
+        return _pulse_torque(actor, t_s)
     if actor.acts == _HAND:
-        return _spring(actor, t_s, q, qd)
+        return _spring_force(actor, t_s, q, qd)
     if actor.acts == _VISCOUS:
         return -actor.B[0] * qd[0], -actor.B[1] * qd[1]
     if actor.acts == _RECORDED:
-        return _tabled(actor, t_s, table)
-    return _in_the_plane(actor, t_s, q, qd, lengths)
+        return _recorded_torque(actor, t_s, table)
+    return _end_effector_torque(actor, t_s, q, qd, lengths)
 
 
 @leaf
@@ -222,17 +203,7 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> Pair:
-    """Returns what the actors do to the arm at time t, N m; -tau_x of Eq. (8).
-
-    Args:
-        t_s: time since the epoch, s.
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        lengths: of the two links, m.
-        actors: one row each, dtype ACTOR.
-        table: the site's recorded torques.
-        sampled: 1 for those that are held over a tick, 0 for the others.
-    """
+    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm, N m; -tau_x of Eq. (8)."""
     total_0 = total_1 = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]

@@ -17,21 +17,8 @@ from .vectors import Array, IntArray, Row, RowArray
 NEVER_NS = 2**63 - 1
 """The time of the next tick of a site that has made all its ticks."""
 
-PROGRESS_DTYPE = np.dtype(
-    (
-        np.record,
-        [
-            ("tick", "i8"),
-            ("t_ns", "i8"),
-            ("ticks", "i8"),
-            ("rate_hz", "i8"),
-            ("bucket", "i8"),
-            ("part", "i8"),
-            ("apart_ns", "i8"),
-            ("diverged_ns", "i8"),
-        ],
-    )
-)
+_PROGRESS = ("tick", "t_ns", "ticks", "rate_hz", "bucket", "part", "apart_ns", "diverged_ns")
+PROGRESS_DTYPE = np.dtype((np.record, [(name, "i8") for name in _PROGRESS]))
 """A site's progress: its next tick and the time of that, how many it makes in all; the bucket, and how many
 BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of rest, and when it diverged
 (-1: never)."""

@@ -20,7 +20,7 @@ R = TypeVar("R")
 
 
 def _cache_root() -> Path:
-    """The user's cache directory, by the custom of each platform."""
+    """Returns the user's cache directory by the custom of each platform."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     if sys.platform == "darwin":
@@ -29,15 +29,15 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Names the compiled code: a hash of every source file of the core and of Numba's version."""
+    """Returns a hash of every source file of the core and of Numba's version."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def _writable_cache() -> Path | None:
-    """The directory for compiled leaves, or None where nothing can be written (then: memory only)."""
+    """Returns the directory for compiled leaves, or None if it cannot be written (then: memory only)."""
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
         directory.mkdir(parents=True, exist_ok=True)
@@ -51,12 +51,12 @@ _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 
 
 def is_core_cached() -> bool:
-    """True where compiled leaves of this very core lie in the cache."""
+    """True if the cache holds compiled leaves of this version of the core."""
     return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
 
 
 _OPTIONS: Any = {"_nrt": False}
-"""No leaf makes an array: none is counted, which would cost more than the arithmetic does."""
+"""No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:

@@ -5,8 +5,8 @@ integer nanoseconds; it is in use from the receiver's first tick at or after tha
 Its real arrival has no influence if it precedes the due time. (On a measured link a sample is due at
 once, so there the arrival alone counts.)
 
-A link is a calendar. `accept_sample` files a sample under its own tick and writes into the page of the
-tick that releases it which sample is newest there; `recall_sample` reads the page of the present tick.
+A link is a calendar. `accept_sample` files a sample under its own tick and writes its number into the page
+of the tick that releases it, if none newer is there; `recall_sample` reads the page of the present tick.
 Both cost the same at any delay. Newest wins: an older sample never replaces a newer one.
 """
 
@@ -17,10 +17,12 @@ import numpy as np
 from .channel import LOST, schedule_deliveries
 from .delay import MAX_DELAY_US, DelayKind
 from .jit import leaf
-from .ticks import NS_PER_S, first_tick_at, tick_ns
+from .ticks import NS_PER_S, LinkCounts, first_tick_at, tick_ns
 from .two_link_arm import JOINTS
 from .vectors import Array, IntArray, Points, Row, RowArray, pair, put_pair
 
+_VECTORS = (("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,)), ("tau_x", "f8", (JOINTS,)))
+_CHANNEL = ("models", "model", "outage_first", "outage_count", "foreseen", "bad", "due_before")
 LINK_DTYPE = np.dtype(
     (
         np.record,
@@ -29,44 +31,17 @@ LINK_DTYPE = np.dtype(
             ("alpha_rate", "f8"),
             ("rate_hz", "i8"),
             ("used", "i8"),
-            ("q", "f8", (JOINTS,)),
-            ("qd", "f8", (JOINTS,)),
-            ("tau_x", "f8", (JOINTS,)),
-            # its channel
+            *_VECTORS,
             ("key", "u8"),
-            ("models", "i8"),
-            ("model", "i8"),
-            ("outage_first", "i8"),
-            ("outage_count", "i8"),
-            ("foreseen", "i8"),
-            ("bad", "i8"),
+            *((name, "i8") for name in _CHANNEL),
             ("memory", "f8"),
-            ("due_before", "i8"),
-            # counts since the start
-            ("accepted", "i8"),
-            ("late", "i8"),
-            ("duplicate", "i8"),
-            ("refused", "i8"),
-            ("lost", "i8"),
-            ("superseded", "i8"),
-            ("copies", "i8"),
+            *((name, "i8") for name in LinkCounts._fields),
         ],
     )
 )
 """One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and qd
 are the peer's start pose, at rest (L7)."""
-SAMPLE_DTYPE = np.dtype(
-    (
-        np.record,
-        [
-            ("due_ns", "i8"),
-            ("tick", "i8"),
-            ("q", "f8", (JOINTS,)),
-            ("qd", "f8", (JOINTS,)),
-            ("tau_x", "f8", (JOINTS,)),
-        ],
-    )
-)
+SAMPLE_DTYPE = np.dtype((np.record, [("due_ns", "i8"), ("tick", "i8"), *_VECTORS]))
 """One page per sample, a power of two of them: when the sample of that index is due, and the sample that
 waits there with its own tick (-1: none) and the peer's joint state."""
 
@@ -97,7 +72,7 @@ _MEASURED = int(DelayKind.MEASURED)
 
 
 def calendar_pages(rate_hz: int) -> int:
-    """Returns how many ticks a calendar must span: the longest delay and what may run ahead of it."""
+    """Returns the pages of a calendar: it spans the longest delay of a sample from as far ahead as any."""
     ticks = first_tick_at(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, rate_hz) + 2
     return 1 << int(ticks).bit_length()
 

@@ -28,12 +28,7 @@ DrawKey = np.uint64
 
 
 def link_key(seed: int, link: str) -> int:
-    """Returns the 64-bit key of a link's draws.
-
-    Args:
-        seed: the scenario's seed.
-        link: its name, as in "m1->s".
-    """
+    """Returns the 64-bit key of the draws of a link, named as in "m1->s"."""
     return int.from_bytes(hashlib.sha256(f"{seed}/{link}".encode()).digest()[:8], "little")
 
 
@@ -60,13 +55,9 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 
 @leaf
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
-    """Returns two numbers, uniform on the open interval (0, 1), see `unit`.
+    """Returns two numbers, uniform on the open interval (0, 1).
 
-    Args:
-        key: the link's, see `link_key`.
-        sample: the sample's index.
-        purpose: what the draw is for; draws of different purposes are independent.
-        attempt: a further counter, for methods that draw until a draw suits.
+    Draws of different purposes are independent; `attempt` counts those of a method that rejects some.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
@@ -87,13 +78,7 @@ def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> flo
     """Returns a gamma number of the given shape and scale 1.
 
     By rejection: Marsaglia and Tsang, "A Simple Method for Generating Gamma Variables", ACM TOMS 26 (2000);
-    below shape 1 by their boost from shape + 1.
-
-    Args:
-        key: the link's.
-        sample: the sample's index.
-        purpose: what the draw is for; `purpose + 1` and `purpose + 2` are used up as well.
-        shape: its shape, positive.
+    below shape 1 by their boost from shape + 1. It uses up `purpose + 1` and `purpose + 2` as well.
     """
     boost = 1.0
     k = shape

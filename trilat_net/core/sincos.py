@@ -1,8 +1,8 @@
 """Sine and cosine by plain arithmetic: the same bits on every machine, and both for the price of one.
 
 Invariant: additions and products in a fixed order, nothing of the platform's mathematics library, so an arm
-moves alike wherever doubles are. The platform's own functions differ in the last bit from one C library to
-the next, and a replay must not.
+moves alike on every machine with IEEE doubles. The platform's own functions differ in the last bit from one
+C library to the next, and a replay must not.
 
 The angle is reduced by pi/2 in three parts (Cody and Waite, "Software Manual for the Elementary Functions",
 1980); the polynomials are those of S. Moshier's Cephes library, for an eighth of a turn on either side.

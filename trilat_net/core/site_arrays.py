@@ -20,52 +20,31 @@ from .ticks import DominanceRamp, Mode, first_tick_at
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
-_VECTOR = (JOINTS,)
+_VECTOR, _ESTIMATE = (JOINTS,), (PARAMETERS,)
 _GAINS = {name: len(value) for name, value in Gains._field_defaults.items() if name != "theta_hat0"}
-"""Gains that stay as they are, and how many numbers each has; the first estimate becomes `theta_hat`."""
+"""Constant gains, and how many numbers each has; the first estimate becomes `theta_hat`."""
+_SETTINGS = ("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns")
+_STATE = ("q", "qd", "tau", "tau_before", "q_held")
+_COMPUTED = ("q_des", "qd_des", "q_followed", "felt", "on_arm", "held", "e", "ed", "r")
 SITE_DTYPE = np.dtype(
     (
         np.record,
         [
-            ("rate_hz", "i8"),
-            ("scheme", "i8"),
-            ("law", "i8"),
-            ("external", "i8"),
-            ("ramps", "i8"),
-            ("on_stale", "i8"),
-            ("stale_ns", "i8"),
-            ("return_ns", "i8"),
-            ("g", "f8"),
-            ("tau_limit", "f8"),
-            ("qd_limit", "f8"),
-            ("theta", "f8", (PARAMETERS,)),
-            *((name, "f8", (count,)) for name, count in _GAINS.items()),
+            *((name, "i8") for name in _SETTINGS),
+            *((name, "f8") for name in ("g", "tau_limit", "qd_limit")),
             ("lengths", "f8", (2,)),
-            # the state
+            ("theta", "f8", _ESTIMATE),
+            *((name, "f8", (count,)) for name, count in _GAINS.items()),
             ("mode", "i8"),
-            ("q", "f8", _VECTOR),
-            ("qd", "f8", _VECTOR),
-            ("theta_hat", "f8", (PARAMETERS,)),
-            ("tau", "f8", _VECTOR),
-            ("tau_before", "f8", _VECTOR),
-            ("Yr", "f8", (PARAMETERS,)),
-            ("Yr_before", "f8", (PARAMETERS,)),
-            ("q_held", "f8", _VECTOR),
+            *((name, "f8", _VECTOR) for name in _STATE),
+            *((name, "f8", _ESTIMATE) for name in ("theta_hat", "Yr", "Yr_before")),
             ("return_from_ns", "i8"),
-            # what a tick computes on its way
-            ("q_des", "f8", _VECTOR),
-            ("qd_des", "f8", _VECTOR),
-            ("q_followed", "f8", _VECTOR),
-            ("felt", "f8", _VECTOR),
-            ("on_arm", "f8", _VECTOR),
-            ("held", "f8", _VECTOR),
-            ("e", "f8", _VECTOR),
-            ("ed", "f8", _VECTOR),
-            ("r", "f8", _VECTOR),
+            *((name, "f8", _VECTOR) for name in _COMPUTED),
             ("Y", "f8", (JOINTS, PARAMETERS)),
         ],
     )
 )
+"""A site's settings and gains, its state (from `mode` on), and the intermediate results of a tick."""
 ARRIVAL_DTYPE = np.dtype(
     (np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", _VECTOR), ("qd", "f8", _VECTOR)])
 )

@@ -20,7 +20,7 @@ class Scheme(IntEnum):
     """How the continuous law is sampled.
 
     SECOND_ORDER extrapolates the torque to mid-period and updates the estimate by the trapezoid rule;
-    DIGITAL is zero-order hold and forward Euler, what a plain digital controller does.
+    DIGITAL is zero-order hold and forward Euler, as in a plain digital controller.
     """
 
     SECOND_ORDER = 0
@@ -30,9 +30,9 @@ class Scheme(IntEnum):
 class Law(IntEnum):
     """The control law of a site.
 
-    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate held in a box where one is given. KNOWN
-    knows gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force reflection.
-    OWN is somebody's own, in Python.
+    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate in a box if one is given. KNOWN knows
+    gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force reflection. OWN
+    is a user's law, in Python.
     """
 
     ADAPTIVE = 0
@@ -41,7 +41,7 @@ class Law(IntEnum):
 
 
 class StaleAction(IntEnum):
-    """What a site does while a peer that it follows is stale.
+    """The action of a site while a peer that it follows is stale.
 
     USE goes on with the last sample; HOLD stays at the reference that was in force; BRAKE stays where the
     arm was.
@@ -53,12 +53,12 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """When a peer counts as stale, and what follows.
+    """When a peer counts as stale, and the consequence.
 
     Attributes:
-        action: what the site does then.
-        age_ns: a sample in use that is older makes its peer stale, ns.
-        return_ns: how long the way back to the peers takes, ns.
+        action: the site's action then.
+        age_ns: a peer whose sample in use is older is stale, ns.
+        return_ns: duration of the return to the peers, ns.
     """
 
     action: StaleAction = StaleAction.USE
@@ -71,12 +71,12 @@ class LinkSetup(NamedTuple):
 
     Attributes:
         peer: the peer's name.
-        alpha: its share in this site's reference, Eq. (6), dimensionless.
+        alpha: its dominance factor in this site's reference, Eq. (6), dimensionless.
         rate_hz: the peer's tick rate, Hz.
         q0: the peer's start pose, rad, in use until its first sample is due (L7).
-        key: what the link's draws are a function of, see `draw.link_key`.
-        models: what the link does, in the order of their first stamps; the first applies from stamp 0.
-        traces: per model the points of its trace, shape (n, 2), see `delay.Points`; None where it has none.
+        key: the key of the link's draws, see `link_key`.
+        models: in the order of their first stamps; the first applies from stamp 0.
+        traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
         outages: when the link is cut: pairs of first stamp and end, ns.
     """
 
@@ -91,21 +91,21 @@ class LinkSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """A law and its numbers, diagonal gains as vectors; those of other laws are without effect.
+    """A control law and its gains, diagonal ones as vectors; those of other laws have no effect.
 
     Attributes:
-        law: which law.
+        law: the law.
         Lambda: shape (n,), 1/s.
         Kp: shape (n,), N m s/rad.
         Kd: shape (n,), N m s/rad.
         Gamma: adaptation gain per parameter, shape (5,).
         theta_hat0: the first estimate, shape (5,).
-        low: least that each estimate may be, shape (5,).
-        high: most that it may be, shape (5,).
+        low: lower bound of each estimate, shape (5,).
+        high: upper bound, shape (5,).
         known: the parameters that KNOWN takes the arm to have, shape (5,).
         K: stiffness of KNOWN, shape (n,), N m/rad.
         d: damping of KNOWN, shape (n,), N m s/rad.
-        k_f: share of what the peers feel, of KNOWN, shape (n,).
+        k_f: gain of the reflected force of KNOWN, shape (n,), dimensionless.
     """
 
     law: Law
@@ -123,27 +123,27 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All that a site is built from; nothing else influences its numbers.
+    """All that a site is built from.
 
     Attributes:
         name: the site's name.
         rate_hz: tick rate, Hz.
         scheme: how the law is sampled.
-        gains: the law and its numbers.
+        gains: the law and its gains.
         theta: true parameters of the arm, shape (5,).
         g_m_s2: gravitational acceleration, m/s^2.
         lengths_m: of the two links.
         tau_limit_nm: largest control torque of a joint, N m.
-        qd_limit_rad_s: joint speed beyond which the run has left the physics, rad/s.
+        qd_limit_rad_s: joint speed beyond which the run counts as diverged, rad/s.
         q0: start pose, rad.
         qd0: start velocity, rad/s.
         actors: operators and environments.
         links: the peers in scenario order.
-        ramps: scripted changes of the shares, in the order of their starts.
-        on_stale: what to do about a stale peer.
-        external: whether the arm is outside of the program; then it is measured, and nothing is integrated.
-        own: makes the law where it is somebody's own.
-        theta_known: whether `theta` is the arm's; of an arm outside of the program nobody may know it.
+        ramps: scripted changes of the dominance factors, in the order of their starts.
+        on_stale: the rule for a stale peer.
+        external: true: the arm is outside of the program; it is measured, and nothing is integrated.
+        own: makes the user's law, if it is one.
+        theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
     """
 
     name: str

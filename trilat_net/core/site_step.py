@@ -84,7 +84,7 @@ class Site:
         """Computes one tick and returns its record.
 
         Args:
-            tick: its number, one more than the last one's, and what came in since then.
+            tick: its number, one more than the last one's, and the input since then.
 
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals, or MAX_CHANGES changes.
@@ -167,12 +167,12 @@ class Site:
         return int(self._links[peer]["rate_hz"])
 
     def resume(self, before: TickRecord, last: TickRecord) -> None:
-        """Puts the arm and its controller where `step(last.tick)` left them, from two records in a row.
+        """Restores the arm and its controller after `step(last.tick)`, from two records in a row.
 
-        The links are left alone; see `prime`.
+        `prime` restores the links.
 
         Args:
-            before: the record of the tick before the last one; any, where the last one is tick 0.
+            before: the record of the tick before the last one; any if that is tick 0.
             last: the record of the last tick.
         """
         s: Row = self._site[0]
@@ -186,12 +186,12 @@ class Site:
         resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
-        """Puts the links where they were before tick k.
+        """Restores the links before tick k.
 
         Args:
             k: the tick that will be stepped next.
             in_use: per peer the sample in use, or None before the first.
-            waiting: arrivals that had not come into use.
+            waiting: arrivals that are not in use yet.
 
         Raises:
             ValueError: more than MAX_ARRIVALS of them wait.

@@ -15,7 +15,7 @@ from .two_link_arm import JOINTS
 
 NS_PER_S = 1_000_000_000
 BUCKETS_PER_S = 20
-"""Where a run is told by its largest values, it is by those of so many equal parts of each second."""
+"""A run that is reduced to peaks keeps them for so many equal parts of each second."""
 
 
 @leaf
@@ -41,11 +41,11 @@ _NOTHING = (0.0,) * JOINTS
 
 
 class Mode(IntEnum):
-    """What a site is doing in a tick.
+    """The mode of a site in a tick.
 
-    RUN follows its peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
+    RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
     the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN.
-    DIVERGED passed a limit, from any of them, and is final.
+    DIVERGED, past a limit, is final.
     """
 
     RUN = 1
@@ -56,14 +56,14 @@ class Mode(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """One sample as it came in.
+    """One sample as it arrived.
 
     Attributes:
         peer: index of the peer among the site's links.
         tick: the sample's tick, at the peer's rate.
         q: the peer's joint angles, rad.
         qd: its joint velocities, rad/s.
-        latency_us: how long it was under way, microseconds; telemetry, enters no formula.
+        latency_us: its time under way, microseconds; telemetry, enters no formula.
         tau_x: the exogenous torque of the peer's record, N m; laws that reflect force use it.
     """
 
@@ -76,12 +76,12 @@ class Arrival(NamedTuple):
 
 
 class DominanceRamp(NamedTuple):
-    """A site's shares in its peers, changed linearly over a time.
+    """A linear change of a site's dominance factors over a time.
 
     Attributes:
         start_ns: when it begins, ns since the epoch.
         end_ns: when it is complete, not before `start_ns`.
-        alpha: the shares at its end, per peer in scenario order.
+        alpha: the factors at its end, per peer in scenario order.
     """
 
     start_ns: int
@@ -93,10 +93,10 @@ class CoreChange(NamedTuple):
     """A change ordered from outside.
 
     Attributes:
-        text: how the record names it; whoever reads the record makes the same command of it.
-        peer: the link that it changes, by its peer's index; -1 where it changes the shares.
-        model: what that link does from then on.
-        ramp: how the shares change.
+        text: its text in the record, from which every reader derives the same change.
+        peer: the link that it changes, by its peer's index; -1 for a change of the dominance factors.
+        model: the link's model from then on.
+        ramp: the change of the dominance factors.
     """
 
     text: str
@@ -106,7 +106,7 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """What an arm outside of the program was measured to do: q, rad, and qd, rad/s."""
+    """Measured q, rad, and qd, rad/s, of an arm outside of the program."""
 
     q: Sequence[float]
     qd: Sequence[float]
@@ -117,9 +117,9 @@ class TickInput(NamedTuple):
 
     Attributes:
         k: its number.
-        arrivals: what came in since the one before, in order.
-        commands: what was ordered.
-        measured: of a site whose plant is external, its arm now; None: as it was.
+        arrivals: the samples since the tick before, in order.
+        commands: the changes ordered since then.
+        measured: the present state of an external plant; None: unchanged.
     """
 
     k: int
@@ -134,7 +134,7 @@ class TickRecord(NamedTuple):
     Attributes:
         tick: k.
         t_ns: nominal time, ns since the epoch.
-        mode: what the site was doing.
+        mode: the site's mode.
         q: joint angles, rad.
         qd: joint velocities, rad/s.
         q_des: reference q_id, Eq. (6), rad.
@@ -144,12 +144,12 @@ class TickRecord(NamedTuple):
         theta_hat: estimate of the parameters.
         used: tick of the sample in use, per peer in scenario order; -1 before the first.
         rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian
-            (peer i64, tick i64, q f64s, qd f64s) each, and behind them, where the law reflects force, their
-            tau_x; shows a changed input at its own tick.
-        cmd: texts of the commands that it took in.
-        mem: what the site remembers besides: empty in RUN and DIVERGED, else the pose that it holds, rad,
-            and when it began to return, ns since the epoch (0 where it does not yet). A site with a law of
-            somebody's own has these always, and the law's memory behind them.
+            (peer i64, tick i64, q f64s, qd f64s) each, followed by their tau_x if the law reflects force;
+            shows a changed input at its own tick.
+        cmd: texts of the changes that it took in.
+        mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it holds, rad, and
+            the time at which it began to return, ns since the epoch (0 before). A site with a user's law
+            always has these, and the law's memory after them.
     """
 
     tick: int
@@ -169,12 +169,12 @@ class TickRecord(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """What one link has counted since the start.
+    """Counts of one link since the start.
 
     Attributes:
-        accepted: samples that came.
-        late: of those, the ones that came after they were due.
-        duplicate: the ones that were there already.
+        accepted: samples that arrived.
+        late: of those, the ones that arrived after they were due.
+        duplicate: the ones that had arrived before.
         refused: the ones whose stamp was out of range.
         lost: the ones that the link's model lost.
         superseded: the ones never used, because a newer one was released before or with them.
@@ -191,7 +191,7 @@ class LinkCounts(NamedTuple):
 
 
 def describe_mode(site: str, output: TickRecord) -> str:
-    """Says that a site does something else from this tick on."""
+    """Returns the text of the event that a site changes its mode."""
     doing = {
         Mode.RUN: "follows its peers",
         Mode.HOLD: "holds its reference: a peer is stale",
@@ -202,6 +202,6 @@ def describe_mode(site: str, output: TickRecord) -> str:
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Says that a site has left the physics, where and how fast."""
+    """Returns the text of the event that a site diverged."""
     speed = max(abs(v) for v in output.qd)
     return f"{site} diverged at t = {output.t_ns * 1e-9:.3f} s: a joint moves at {speed:.4g} rad/s"

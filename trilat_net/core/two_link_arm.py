@@ -1,7 +1,9 @@
 """The planar two-link arm: inertia, Coriolis, gravity, regressor, forward dynamics and kinematics.
 
-Invariant: every dynamic term is linear in theta, Eq. (5), and takes theta, never lengths and masses. Vectors
-are read by index and returned as tuples, matrices as tuples of rows (`vectors`).
+Invariant: every dynamic term is linear in theta, Eq. (5), and takes theta, shape (5,), never lengths and
+masses. Vectors are read by index and returned as tuples, matrices as tuples of rows (`vectors`). Everywhere q
+is the joint angles, rad, qd their velocities, rad/s, g the gravitational acceleration, m/s^2, and `lengths`
+those of the two links, m.
 
 Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq. (1)-(5),
 (8), (12), (24). Angles are measured from the horizontal; the second one is relative to the first link.
@@ -21,7 +23,7 @@ PARAMETERS = 5
 
 
 class ArmLinks(NamedTuple):
-    """What the two links are made of; `parameters` turns it into theta.
+    """Lengths, masses and inertias of the two links; `theta_from_links` turns them into theta.
 
     Attributes:
         l1_m: length of the first link, m.
@@ -59,12 +61,9 @@ def theta_from_links(links: ArmLinks) -> Array:
 
 
 def is_positive_definite(theta: Array) -> bool:
-    """True where M(q) is positive definite in every pose, with a margin (Property 1).
+    """True if M(q) is positive definite in every pose, with a margin (Property 1).
 
     Its determinant, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is least for the stretched arm.
-
-    Args:
-        theta: parameters, shape (5,).
     """
     least = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
     return bool(theta[2] > 0.0 and least > 1e-9 * theta[0] * theta[2])
@@ -72,12 +71,7 @@ def is_positive_definite(theta: Array) -> bool:
 
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns M(q), two rows, kg m^2 (Section IV of the paper; Property 1).
-
-    Args:
-        theta: parameters, shape (5,).
-        q: joint angles, shape (2,), rad.
-    """
+    """Returns M(q), two rows, kg m^2 (Section IV of the paper; Property 1)."""
     _, c2 = sincos(q[1])
     across = theta[2] + theta[1] * c2
     return (theta[0] + 2.0 * theta[1] * c2, across), (across, theta[2])
@@ -85,13 +79,7 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def coriolis(theta: Vector, q: Vector, qd: Vector) -> tuple[Pair, Pair]:
-    """Returns C(q, qd), two rows, kg m^2/s, by Christoffel symbols, so that Eq. (4) holds.
-
-    Args:
-        theta: parameters, shape (5,).
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-    """
+    """Returns C(q, qd), two rows, kg m^2/s, by Christoffel symbols, so that Eq. (4) holds."""
     s2, _ = sincos(q[1])
     h = -theta[1] * s2
     return (h * qd[1], h * (qd[0] + qd[1])), (-h * qd[0], 0.0)
@@ -99,13 +87,7 @@ def coriolis(theta: Vector, q: Vector, qd: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
-    """Returns G(q), N m.
-
-    Args:
-        theta: parameters, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, shape (2,), rad.
-    """
+    """Returns G(q), N m."""
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
     outer = theta[4] * g * (c1 * c2 - s1 * s2)
@@ -117,14 +99,8 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
     """Returns Y(q, qd, v, a), two rows, with Y theta = M(q) a + C(q, qd) v + G(q).
 
     The paper prints Y(q, qd, qdd) only; Eq. (12) needs the two velocities apart: qd enters through
-    C, and v is what C multiplies. With v = qd and a = qdd this is the printed one, Eq. (5).
-
-    Args:
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        v: reference velocity, shape (2,), rad/s.
-        a: reference acceleration, shape (2,), rad/s^2.
+    C, and v is the reference velocity that C multiplies, a the reference acceleration. With v = qd and
+    a = qdd this is the printed one, Eq. (5).
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
@@ -138,14 +114,8 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
     """Returns qdd, rad/s^2: the solution of M qdd = torque - C qd - G, Eq. (8).
 
-    Written out by Cramer's rule: four of these make a step, and the sines are what they cost.
-
-    Args:
-        theta: parameters, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, shape (2,), rad.
-        qd: joint velocities, shape (2,), rad/s.
-        torque: all that acts on the joints, tau - tau_x, shape (2,), N m.
+    `torque` is the whole torque on the joints, tau - tau_x, N m. Written out by Cramer's rule: a step takes
+    four of these, and their cost is that of the sines.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
@@ -162,12 +132,7 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
 
 @leaf
 def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns where elbow and tip are, m, as (x, y), base at the origin.
-
-    Args:
-        lengths: of the two links, shape (2,), m.
-        q: joint angles, shape (2,), rad.
-    """
+    """Returns the positions of elbow and end effector, m, as (x, y), base at the origin."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
     x, y = lengths[0] * c1, lengths[0] * s1
@@ -176,12 +141,7 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns how the tip moves with the joints, m/rad: rows x and y, columns the joints.
-
-    Args:
-        lengths: of the two links, shape (2,), m.
-        q: joint angles, shape (2,), rad.
-    """
+    """Returns the end effector's Jacobian, m/rad: rows x and y, columns the joints."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
     outer_x, outer_y = lengths[1] * c12, lengths[1] * s12

@@ -17,7 +17,7 @@ Pair = tuple[float, float]
 Five = tuple[float, float, float, float, float]
 """One number per parameter."""
 Vector = Sequence[float] | Any
-"""What is read by index: a tuple, or a row of an array."""
+"""A vector to read by index: a tuple, or a row of an array."""
 
 
 @leaf
