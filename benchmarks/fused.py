@@ -12,7 +12,7 @@ import numpy as np
 from tests.theory.delay_equations import equations
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
-from trilat_net.process import count_cores, ignore_sigint, worker_pool
+from trilat_net.process import count_cores, worker_pool
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.sweep.cell_result import classify_cell
 
@@ -69,11 +69,9 @@ def _on_all_cores(real_s: float) -> list[str]:
     ]
     count = count_cores()
     with worker_pool(count) as pool:
-        with ignore_sigint():
-            list(pool.map(classify_cell, texts[:count], [0.0] * count))  # begins the processes
+        list(pool.map(classify_cell, texts[:count], [0.0] * count))  # begins the processes
         begun = time.perf_counter()
-        with ignore_sigint():
-            outcomes = list(pool.map(classify_cell, texts, [0.0] * CELLS, chunksize=8))
+        outcomes = list(pool.map(classify_cell, texts, [0.0] * CELLS, chunksize=8))
         wall_s = time.perf_counter() - begun
     words = sorted({str(outcome.verdict) for outcome in outcomes})
     speed = CELLS * real_s / wall_s / count

@@ -6,16 +6,18 @@ to the process that started them, and end with it or when it fails.
 """
 
 import gc
-import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager
-from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from typing import Any
+
+_PARENT_POLL_S = 0.5
+"""How often a worker looks whether its parent is still there."""
 
 
 @contextmanager
@@ -103,28 +105,28 @@ def count_cores() -> int:
 
 
 @contextmanager
-def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Yields some processes; hand them work within `deaf`.
+def worker_pool(count: int) -> Iterator[Executor]:
+    """Yields an executor over worker processes; all of them are gone when the block ends.
 
-    Args:
-        count: how many.
+    The processes are started afresh (never forked, so threads and compiled code are safe) and do not import
+    the caller's script. An exception in the block, Ctrl-C included, kills them in the middle of their work.
     """
-    others = multiprocessing.active_children()
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _prepare_worker)
+    from loky import ProcessPoolExecutor
+
+    warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
+    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=(os.getpid(),))
     try:
+        with ignore_sigint():
+            pool.submit(os.getpid)  # starts all processes, which inherit it
         yield pool
-    except BaseException:  # a second Ctrl-C finds them gone
-        for child in multiprocessing.active_children():
-            if child not in others:
-                child.kill()
-        raise
+        pool.shutdown()
     finally:
-        pool.shutdown(cancel_futures=True)
+        pool.shutdown(kill_workers=True)
 
 
 @contextmanager
 def ignore_sigint() -> Iterator[None]:
-    """Ignores Ctrl-C for a moment, where this thread may: processes that begin now inherit it."""
+    """Ignores Ctrl-C inside the block, in the main thread: processes that start there inherit it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -135,14 +137,13 @@ def ignore_sigint() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _prepare_worker() -> None:
-    """Leaves Ctrl-C to whoever started this process, and ends it when that one is gone."""
+def _prepare_worker(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
 
 
-def _exit_after(parent: BaseProcess) -> None:
-    parent.join()
+def _exit_after(parent: int) -> None:
+    pause = threading.Event()
+    while os.getppid() == parent:
+        pause.wait(_PARENT_POLL_S)
     os._exit(1)

@@ -22,7 +22,7 @@ from ..reporting.terminal_output import (
     sanitize,
 )
 from ..reporting.text_table import TextTable
-from .options import DurationOption, ForceOption, JsonOption, SetOption
+from .options import DurationOption, ForceOption, JsonOption, OnOption, SetOption
 
 if TYPE_CHECKING:
     from ..analysis.metrics.log_metrics import MetricComparison
@@ -98,7 +98,13 @@ _MAX_FRONT_ROWS = 8
 
 
 def run_tuning(
-    asked: "TuningPlan", folder: Path | None, jobs: int | None, *, force: bool, as_json: bool
+    asked: "TuningPlan",
+    folder: Path | None,
+    jobs: int | None,
+    *,
+    on: str | None = None,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Runs a comparison, writes it into a folder, and prints it.
 
@@ -106,18 +112,21 @@ def run_tuning(
         asked: the comparison.
         folder: where it goes; None for the next free one below runs.
         jobs: in how many processes; None for one per core.
+        on: the address of a Dask scheduler; None for processes of this machine.
         force: whether a folder that holds something may be used.
         as_json: whether to print it as JSON.
     """
     from ..files import make_results_folder
+    from ..studies.executor import count_workers
     from ..studies.tuning.tuning_figure import write_tuning
     from ..studies.tuning.tuning_tables import tuning_to_json
 
+    workers = count_workers(jobs, on)
     chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
     if not as_json:
-        _print_procedure(asked, jobs)
+        _print_procedure(asked, workers)
     with progress_bar("searching") as progress:
-        found = asked.run(jobs, progress)
+        found = asked.run(jobs, progress, on)
     paths = write_tuning(found, chosen)
     if as_json:
         print_line(json.dumps(tuning_to_json(found), indent=2, ensure_ascii=False, allow_nan=False))
@@ -127,17 +136,15 @@ def run_tuning(
             out.print(f"  {escape(str(path))}", soft_wrap=True)
 
 
-def _print_procedure(asked: "TuningPlan", jobs: int | None) -> None:
+def _print_procedure(asked: "TuningPlan", used: int) -> None:
     """Prints what is the same for all laws, and how long the search will take."""
-    from ..process import count_cores
     from ..studies.tuning.tuning_tables import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
     out.print(escape(f"{asked.base.scenario.name}, laws {laws}; the same for all:"), soft_wrap=True)
     for line in describe_procedure(asked):
         out.print(escape(f"  {line}"), soft_wrap=True)
-    used = jobs or count_cores()
-    time = _format_duration(asked.estimate_s(jobs))
+    time = _format_duration(asked.estimate_s(used))
     on = "1 core" if used == 1 else f"{used} cores"
     out.print(
         f"{asked.runs} runs on {on}: about {time} at the speed that this machine has now", soft_wrap=True
@@ -259,6 +266,7 @@ def compare_command(
             rich_help_panel=_TUNING,
         ),
     ] = None,
+    on: OnOption = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -285,6 +293,7 @@ def compare_command(
             "--duration": duration,
             "--set": overrides,
             "--jobs": jobs,
+            "--on": on,
             "--out": output,
             "--force": force or None,
         }
@@ -305,7 +314,7 @@ def compare_command(
         objective="error" if objective is None else objective,
         gravity_percent=100.0 if gravity is None else gravity,
     )
-    run_tuning(asked, output, jobs, force=force, as_json=as_json)
+    run_tuning(asked, output, jobs, on=on, force=force, as_json=as_json)
 
 
 def _refuse_tuning_options(options: Mapping[str, object]) -> None:

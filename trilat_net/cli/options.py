@@ -137,3 +137,13 @@ def resolve_connection(
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     return resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
+
+
+OnOption = Annotated[
+    str | None,
+    typer.Option(
+        "--on",
+        metavar="tcp://HOST:PORT",
+        help="Run on the workers of this Dask scheduler instead of processes of this machine.",
+    ),
+]

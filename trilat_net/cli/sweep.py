@@ -6,7 +6,7 @@ interrupted prints the command that resumes it.
 
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,17 +16,17 @@ from rich.markup import escape
 
 from ..errors import UsageError
 from ..reporting.terminal_output import err, out, print_line, print_table, progress_bar
-from .options import DurationOption, SetOption
+from .options import DurationOption, OnOption, SetOption
 from .test import parse_seeds
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
     from ..studies.sweep import FinishedSweep
     from ..studies.sweep.live_confirmation import LiveSession
-    from ..studies.sweep.sweep_cell import CellRun
     from ..studies.sweep.sweep_folder import SweepFolder
     from ..studies.sweep.sweep_plan import SweepPlan
     from ..studies.sweep.sweep_results import SweepResults
+    from ..studies.sweep.sweep_run import DurationEstimate
 
 
 _PANEL = "Maps and edges"
@@ -100,7 +100,9 @@ def check_map_options(
         raise UsageError("--tolerance is of an edge: use it with --margin")
 
 
-def map_results(path: Path, width: float | None, confirm: int | None, jobs: int | None) -> None:
+def map_results(
+    path: Path, width: float | None, confirm: int | None, jobs: int | None, on: str | None = None
+) -> None:
     """Draws the map of results, or confirms some of their cells.
 
     Args:
@@ -108,6 +110,7 @@ def map_results(path: Path, width: float | None, confirm: int | None, jobs: int 
         width: of the map, in; None for one column.
         confirm: how many cells on each side of the edge are run live; None: the map is drawn.
         jobs: in how many processes; None for one per core.
+        on: the address of a Dask scheduler; None for processes of this machine.
     """
     from ..studies.sweep import read_results
 
@@ -115,11 +118,16 @@ def map_results(path: Path, width: float | None, confirm: int | None, jobs: int 
     if confirm is not None:
         confirm_cells_live(results, confirm)
     else:
-        draw_sweep_map(True, results, path if path.is_dir() else path.parent, width, jobs)
+        draw_sweep_map(True, results, path if path.is_dir() else path.parent, width, jobs, on)
 
 
 def draw_sweep_map(
-    mapped: bool, results: "SweepResults", folder: Path, width: float | None, jobs: int | None
+    mapped: bool,
+    results: "SweepResults",
+    folder: Path,
+    width: float | None,
+    jobs: int | None,
+    on: str | None = None,
 ) -> None:
     """Draws the map of a sweep into its folder, if it is wanted: map.png, map.svg, map.md.
 
@@ -129,6 +137,7 @@ def draw_sweep_map(
         folder: where to.
         width: 3.5 or 7, in; None for one column.
         jobs: in how many processes; None for one per core.
+        on: the address of a Dask scheduler; None for processes of this machine.
     """
     if not mapped:
         return
@@ -140,7 +149,7 @@ def draw_sweep_map(
     words = [] if width is None else ["--width", f"{width:g}"]
     with progress_bar("linear analysis") as progress:
         made = build_stability_map(
-            results, (build_sweep_command(results.plan, "--map", *words),), jobs, progress
+            results, (build_sweep_command(results.plan, "--map", *words),), jobs, progress, on=on
         )
     for line in made.remarks:
         out.print(escape(f"note: {line}"), soft_wrap=True)
@@ -157,7 +166,12 @@ def margin_range_axis(margin: str) -> str:
 
 
 def print_margins(
-    asked: "SweepPlan", margin: str, tolerance: float | None, folder: Path | None, jobs: int | None
+    asked: "SweepPlan",
+    margin: str,
+    tolerance: float | None,
+    folder: Path | None,
+    jobs: int | None,
+    on: str | None = None,
 ) -> None:
     """Searches edges along one key, prints them beside theory, and writes margin.json and margin.md.
 
@@ -167,6 +181,7 @@ def print_margins(
         tolerance: how wide an edge may be, over its value; None for the usual one.
         folder: where results go; None for the next free one below runs.
         jobs: in how many processes; None for one per core.
+        on: the address of a Dask scheduler; None for processes of this machine.
     """
     from ..files import make_results_folder, write_whole
     from ..studies.sweep.margin_search import (
@@ -181,7 +196,7 @@ def print_margins(
     within = parse_search_range(margin, MARGIN_TOLERANCE if tolerance is None else tolerance)
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
     with progress_bar("searching") as progress:
-        found = search_margins(asked, within, jobs, progress)
+        found = search_margins(asked, within, jobs, progress, on)
     out.print()
     print_table(tabulate_margins(asked, within, found))
     data, text = chosen / "margin.json", chosen / "margin.md"
@@ -242,39 +257,45 @@ _LINES = 10
 """So many lines say how far a sweep is, where there is no terminal for a bar."""
 
 
-def start_sweep(asked: "SweepPlan", output: Path | None, jobs: int | None, *, yes: bool) -> "FinishedSweep":
+def start_sweep(
+    asked: "SweepPlan", output: Path | None, jobs: int | None, *, yes: bool, on: str | None = None
+) -> "FinishedSweep":
     """Runs a sweep, or goes on with it where its folder holds it."""
+    from ..studies.executor import count_workers
     from ..studies.sweep.sweep_folder import PLAN_FILE, prepare_sweep_folder
     from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
 
     if output is not None and (output / PLAN_FILE).exists():
-        return _run_rest(prepare_sweep_folder(asked, output), jobs, yes=yes)
+        return _run_rest(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
     _print_plan(asked)
-    expected = estimate_sweep(asked, jobs=jobs)
+    workers = count_workers(jobs, on)
+    expected = estimate_sweep(asked, jobs=workers)
     if not yes:
-        refuse_oversized_sweep(asked, expected, jobs)
-    return _run_in_folder(prepare_sweep_folder(asked, output), jobs, expected.seconds, expected.entries)
+        refuse_oversized_sweep(asked, expected, workers)
+    return _run_in_folder(prepare_sweep_folder(asked, output), jobs, on, expected)
 
 
-def resume_sweep(path: Path, jobs: int | None, *, yes: bool) -> "FinishedSweep":
+def resume_sweep(path: Path, jobs: int | None, *, yes: bool, on: str | None = None) -> "FinishedSweep":
     """Goes on with a sweep that was interrupted."""
     from ..studies.sweep import open_sweep_folder
 
-    return _run_rest(open_sweep_folder(path), jobs, yes=yes)
+    return _run_rest(open_sweep_folder(path), jobs, on, yes=yes)
 
 
-def _run_rest(folder: "SweepFolder", jobs: int | None, *, yes: bool) -> "FinishedSweep":
+def _run_rest(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
     """Runs what is left of a sweep."""
+    from ..studies.executor import count_workers
     from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
 
     with folder.journal() as journal:
         done = list(journal.done)
     _print_plan(folder.plan)
     out.print(f"  {len(done)} runs are done already", soft_wrap=True)
-    expected = estimate_sweep(folder.plan, done, jobs)
+    workers = count_workers(jobs, on)
+    expected = estimate_sweep(folder.plan, done, workers)
     if not yes:
-        refuse_oversized_sweep(folder.plan, expected, jobs)
-    return _run_in_folder(folder, jobs, expected.seconds, expected.entries)
+        refuse_oversized_sweep(folder.plan, expected, workers)
+    return _run_in_folder(folder, jobs, on, expected)
 
 
 def _print_plan(asked: "SweepPlan") -> None:
@@ -285,25 +306,25 @@ def _print_plan(asked: "SweepPlan") -> None:
 
 
 def _run_in_folder(
-    folder: "SweepFolder", jobs: int | None, seconds: float, known: "Sequence[CellRun]"
+    folder: "SweepFolder", jobs: int | None, on: str | None, expected: "DurationEstimate"
 ) -> "FinishedSweep":
     """Runs a sweep in its folder and shows what came of it; Ctrl-C says how to go on."""
     from ..studies.sweep import run_sweep
     from ..studies.sweep.sweep_run import format_wall_time
 
-    if seconds:
-        line = f"  about {format_wall_time(seconds)}, by some of its cells; into {folder.path}"
+    if expected.seconds:
+        line = f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}"
         out.print(escape(line), soft_wrap=True)
     try:
         with _sweep_progress() as progress:
-            swept = run_sweep(folder, jobs, progress, known)
+            swept = run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
         with folder.journal() as journal:
             done = len(journal.done)
         where = shlex.quote(str(folder.path))
         err.print(f"{done} runs are done and kept; go on with: trilat sweep --resume {where}", soft_wrap=True)
         raise
-    if not (known or swept.speed.runs):
+    if not (expected.entries or swept.speed.runs):
         out.print("nothing was left to run")
     _print_swept(swept)
     return swept
@@ -433,6 +454,7 @@ def sweep_command(
     jobs: Annotated[
         int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
     ] = None,
+    on: OnOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Run it though it is enormous.")] = False,
     overrides: SetOption = None,
     mapped: MapOption = False,
@@ -465,15 +487,15 @@ def sweep_command(
     if resume is not None:
         if scenario is not None or cell is not None:
             raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
-        swept = resume_sweep(resume, jobs, yes=yes)
-        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs)
+        swept = resume_sweep(resume, jobs, yes=yes, on=on)
+        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs, on)
     elif cell is not None:
         if scenario is None:
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
         print_cell_commands(Path(scenario), cell)
     elif scenario is not None and _is_results(scenario):
         if mapped or confirm is not None:
-            map_results(Path(scenario), width, confirm, jobs)
+            map_results(Path(scenario), width, confirm, jobs, on)
         else:
             print_sweep_results(Path(scenario))
     elif scenario is None or not (over or law or seeds or margin):
@@ -482,10 +504,10 @@ def sweep_command(
         axes = [*(over or []), *([] if margin is None else [margin_range_axis(margin)])]
         asked = _requested_plan(scenario, axes, seeds, law, duration, longest, overrides)
         if margin is not None:
-            print_margins(asked, margin, tolerance, output, jobs)
+            print_margins(asked, margin, tolerance, output, jobs, on)
             return
-        swept = start_sweep(asked, output, jobs, yes=yes)
-        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs)
+        swept = start_sweep(asked, output, jobs, yes=yes, on=on)
+        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs, on)
 
 
 def _requested_plan(

@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from ..errors import UsageError
 from ..reporting.terminal_output import err, out
-from .options import SetOption
+from .options import OnOption, SetOption
 
 if TYPE_CHECKING:
     from ..studies.trials.trial import Trial, TrialResult
@@ -46,18 +46,23 @@ def test_command(
     jobs: Annotated[
         int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
     ] = None,
+    on: OnOption = None,
     overrides: SetOption = None,
 ) -> None:
     r"""Runs scenarios and says which of their \[expect] held, by how much, and how to repeat what did not."""
     from ..files import write_whole
     from ..net.clock import SystemClock
+    from ..studies.executor import check_workers
     from ..studies.trials.trial_report import encode_junit_xml
 
+    if live and on is not None:
+        raise UsageError("--on runs in virtual time: leave it out, or --live")
+    check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
         raise UsageError(f"{junit}: cannot be written")
     batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
-    report = _run_live(batch) if live else _run_virtual(batch, jobs)
+    report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
     _show(report)
     if junit is not None:
         write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
@@ -94,7 +99,7 @@ def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: 
     ]
 
 
-def _run_virtual(batch: "list[Trial]", jobs: int | None) -> "TrialReport":
+def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
     """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
     from rich.progress import Progress
 
@@ -111,7 +116,7 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None) -> "TrialReport":
             if not to_do[source] and not out.is_terminal:
                 out.print(escape(f"{source}: ran"), soft_wrap=True)
 
-        return run_trials(batch, jobs, done)
+        return run_trials(batch, jobs, done, on)
 
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":

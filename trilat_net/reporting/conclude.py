@@ -17,7 +17,7 @@ from ..execution.verify import find_last_ticks
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
-from ..process import ignore_sigint, worker_pool
+from ..process import worker_pool
 from .summary_text import format_run_lines
 from .text_table import TextTable
 
@@ -65,8 +65,7 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
 
     lines: list[CheckLine] = []
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
-        with ignore_sigint():
-            checking = pool.submit(check_log_files, log.sources)
+        checking = pool.submit(check_log_files, log.sources)
         twin = _run_without_operators(log)
         certificate = certify(log)
         notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]

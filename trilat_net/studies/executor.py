@@ -1,77 +1,314 @@
-"""A worker pool.
+"""The worker pool of all studies: runs a function on many items, here, in worker processes or on a cluster.
 
-Maps a function over many tasks, in this process or in several, and yields results as they end.
+Any `concurrent.futures.Executor` does the work: loky's processes on this machine, a Dask cluster with
+`on="tcp://SCHEDULER:8786"`.
 
-Invariant: the number of tasks in flight is bounded, however many there are; the loss of a worker process
-raises `RunFailed` with one sentence.
+Invariant: what runs an item enters no result. The number of items in flight is bounded. An item whose worker
+died runs again, at most `MAX_LOSSES` times in all; the last times alone, so that the item that is named is
+the one that ends its workers.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import islice
-from typing import TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from ..errors import RunFailed
-from ..process import ignore_sigint, worker_pool
+from ..errors import RunFailed, UsageError
+from ..net.clock import SystemClock
+from ..process import count_cores, worker_pool
+from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-_WAITING = 2
-"""So many tasks are under way or wait, per process, besides the one that it is at: none is idle."""
+Progress = Callable[[int, int], None]
+"""Called with the numbers of items done and in all."""
+Workers = str | Executor | None
+"""What runs items: a Dask scheduler's address, an executor, or None for processes of this machine."""
+
+BATCH_S = 0.4
+"""The duration of a batch of items, about: at 20 ms an item its overhead is below 1 %."""
+MAX_BATCH = 200
+MAX_LOSSES = 3
+_BATCHES_PER_WORKER = 2
+"""One at work and one that waits, so that no worker is idle."""
+_POLL_S = 1.0
+_MAX_NAME = 200
+
+
+def ignore_progress(_done: int, _total: int) -> None:
+    """Shows no progress."""
+
+
+class _BatchResult(NamedTuple):
+    """Results of the first items of a batch, how long they took, and the error of the next one."""
+
+    results: list[Any]
+    wall_s: float
+    error: Exception | None
+
+
+def run_batch(
+    function: Callable[[T], Any], items: Sequence[T], required: WorkerRequirements | None = None
+) -> _BatchResult:
+    """Runs a function on the items of a batch, in whatever worker.
+
+    Raises:
+        UsageError: this worker does not meet the requirements.
+    """
+    if required is not None:
+        check_this_worker(required)
+    clock = SystemClock()
+    began_ns = clock.monotonic_ns()
+    results: list[Any] = []
+    error = None
+    for item in items:
+        try:
+            results.append(function(item))
+        except Exception as raised:  # raised again where the results are collected
+            error = raised
+            break
+    return _BatchResult(results, (clock.monotonic_ns() - began_ns) * 1e-9, error)
+
+
+class _Batch(NamedTuple):
+    numbers: list[int]
+    items: list[Any]
+    executor: Executor
+
+
+class _Feed(Generic[T]):
+    """The items that wait, and how many of them make the next batch."""
+
+    def __init__(self, items: Iterable[T], count: int | None, workers: int) -> None:
+        self._new = enumerate(items)
+        self._left, self._workers = count, workers
+        self._again: deque[tuple[int, T]] = deque()
+        self._suspects: deque[tuple[int, T]] = deque()
+        self._losses: Counter[int] = Counter()
+        self._runs, self._wall_s = 0, 0.0
+
+    def measure(self, runs: int, wall_s: float) -> None:
+        """Takes in the duration of a batch."""
+        self._runs, self._wall_s = self._runs + runs, self._wall_s + wall_s
+
+    def take(self, *, idle: bool) -> list[tuple[int, T]]:
+        """Returns the next batch, [] if there is none now; items under suspicion wait until all is idle."""
+        if self._suspects:
+            return [self._suspects.popleft()] if idle else []
+        if self._again:
+            return [self._again.popleft()]
+        size = min(MAX_BATCH, int(BATCH_S * self._runs / self._wall_s)) if self._wall_s > 0.0 else 1
+        if self._left is not None:  # small batches at the end leave no worker idle
+            size = min(size, self._left // (2 * self._workers * _BATCHES_PER_WORKER))
+        batch = list(islice(self._new, max(1, size)))
+        if self._left is not None:
+            self._left -= len(batch)
+        return batch
+
+    def lose(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
+        """Takes back the items of a lost batch; returns those that were lost too often."""
+        lost = []
+        for number, item in zip(batch.numbers, batch.items, strict=True):
+            self._losses[number] += losses
+            if self._losses[number] >= MAX_LOSSES:
+                lost.append((number, item))
+            elif self._losses[number] == MAX_LOSSES - 1:
+                self._suspects.append((number, item))
+            else:
+                self._again.append((number, item))
+        return lost
 
 
 class WorkerPool:
-    """Some processes, or this one.
+    """Workers of a kind, for the length of a study.
 
     Args:
-        pool: in which processes; None: in this one.
-        most: so many tasks are under way or wait.
-        kept: what is told of what is done, where a process was ended.
+        executor: runs the batches; None: this process does.
+        workers: how many work at the same time.
+        restart: returns a new executor after the loss of a worker broke the old one; None: there is none.
+        cluster: the cluster that the executor belongs to.
+        required: what every worker must have.
+        hint: what a message about a lost worker recommends.
     """
 
-    def __init__(self, pool: ProcessPoolExecutor | None, most: int, kept: str = "") -> None:
-        self._pool, self._most, self._kept = pool, most, kept
+    def __init__(
+        self,
+        executor: Executor | None,
+        workers: int,
+        restart: Callable[[], Executor] | None = None,
+        cluster: DaskCluster | None = None,
+        required: WorkerRequirements | None = None,
+        hint: str = "",
+    ) -> None:
+        self.workers = workers
+        self._executor, self._restart = executor, restart
+        self._cluster, self._required, self._hint = cluster, required, hint
 
-    def each(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[tuple[int, R]]:
-        """Yields the place of a task and what a function makes of it, as they end.
+    @property
+    def is_local(self) -> bool:
+        """True if this process runs the items."""
+        return self._executor is None
+
+    def each(
+        self,
+        function: Callable[[T], R],
+        items: Iterable[T],
+        lost: Callable[[T], R] | None = None,
+        count: int | None = None,
+    ) -> Iterator[tuple[int, R]]:
+        """Yields the number of every item and the function's result, in the order in which they end.
+
+        Args:
+            function: of a module, so that another process can import it.
+            items: their `str` names them in messages.
+            lost: gives the result of an item that ended its workers; None: that is an error.
+            count: how many items there are, if known.
 
         Raises:
-            RunFailed: a process was ended.
+            RunFailed: an item ended its workers; or there are no workers any more.
+            UsageError: a worker has not what it must have.
         """
-        if self._pool is None:
-            yield from enumerate(map(function, tasks))
+        if self._executor is None:
+            yield from enumerate(map(function, items))
             return
-        left = enumerate(tasks)
-        under_way: dict[Future[R], int] = {}
+        feed = _Feed(items, count, self.workers)
+        pending: dict[Future[_BatchResult], _Batch] = {}
         try:
-            with ignore_sigint():  # here the processes begin
-                under_way |= {self._pool.submit(function, task): n for n, task in islice(left, 1)}
             while True:
-                more = islice(left, self._most - len(under_way))
-                under_way |= {self._pool.submit(function, task): n for n, task in more}
-                if not under_way:
+                self._submit(function, feed, pending)
+                if not pending:
                     return
-                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                    yield under_way.pop(future), future.result()
-        except BrokenProcessPool:
-            raise RunFailed(
-                f"a process of the sweep was ended, or could not begin; {self._kept}perhaps with --jobs 1"
-            ) from None
+                ended = wait(pending, _POLL_S, FIRST_COMPLETED).done
+                if not ended and self._cluster is not None:
+                    self._cluster.check_alive()
+                for future in sorted(ended, key=lambda one: pending[one].numbers):
+                    yield from self._collect(future, pending.pop(future), feed, lost)
+        finally:
+            for future in pending:
+                future.cancel()
+
+    def map(
+        self, function: Callable[[T], R], items: Sequence[T], progress: Progress = ignore_progress
+    ) -> list[R]:
+        """Returns the function's results in the order of the items."""
+        results: dict[int, R] = {}
+        for number, result in self.each(function, items, count=len(items)):
+            results[number] = result
+            progress(len(results), len(items))
+        return [results[number] for number in range(len(items))]
+
+    def _submit(
+        self, function: Callable[[T], R], feed: _Feed[T], pending: dict[Future[_BatchResult], _Batch]
+    ) -> None:
+        assert self._executor is not None
+        while len(pending) < self.workers * _BATCHES_PER_WORKER:
+            batch = feed.take(idle=not pending)
+            if not batch:
+                return
+            numbers, items = map(list, zip(*batch, strict=True))
+            try:
+                future = self._executor.submit(run_batch, function, items, self._required)
+            except BrokenExecutor:
+                self._replace(self._executor)
+                future = self._executor.submit(run_batch, function, items, self._required)
+            pending[future] = _Batch(numbers, items, self._executor)
+
+    def _collect(
+        self, future: Future[_BatchResult], batch: _Batch, feed: _Feed[T], lost: Callable[[T], R] | None
+    ) -> Iterator[tuple[int, R]]:
+        """Yields the results of a batch that ended, or takes its items back."""
+        try:
+            result = future.result()
+        except BrokenExecutor:
+            self._replace(batch.executor)
+            gone = feed.lose(batch)
+        except (Exception, CancelledError) as error:
+            if self._cluster is None or not self._cluster.is_worker_loss(error):
+                raise
+            gone = feed.lose(batch, 1 if len(batch.items) > 1 else MAX_LOSSES)
+        else:
+            feed.measure(len(result.results), result.wall_s)
+            yield from zip(batch.numbers, result.results, strict=False)
+            if result.error is not None:
+                raise result.error
+            return
+        for number, item in gone:
+            if lost is None:
+                raise RunFailed(f"{name_item(item)} ended {MAX_LOSSES} worker processes{self._hint}")
+            yield number, lost(item)
+
+    def _replace(self, broken: Executor) -> None:
+        """Replaces a broken executor, once."""
+        if self._restart is None:
+            raise RunFailed(f"a worker process was ended{self._hint}") from None
+        if broken is self._executor:
+            self._executor = self._restart()
+
+
+def name_item(item: object) -> str:
+    """Returns an item's text, cut to a length that people read."""
+    text = str(item)
+    return text if len(text) <= _MAX_NAME else f"{text[:_MAX_NAME]}..."
 
 
 @contextmanager
-def open_worker_pool(jobs: int, kept: str = "try again, ") -> Iterator[WorkerPool]:
-    """Yields who works.
+def open_worker_pool(
+    jobs: int | None, on: Workers = None, *, most: int | None = None, laws: Sequence[Any] = (), hint: str = ""
+) -> Iterator[WorkerPool]:
+    """Yields the workers of a study; those that it starts are gone afterwards.
 
     Args:
-        jobs: in how many processes; one is this one.
-        kept: see `Crew`.
+        jobs: how many processes of this machine; None for one per core; 1: this process.
+        on: what runs the items, if not processes of this machine.
+        most: how many items there are: more processes are not started.
+        laws: control laws of users' own that the items need: every worker must have their files.
+        hint: what a message about a lost worker recommends.
+
+    Raises:
+        UsageError: the cluster cannot be reached, or one of its workers is not fit.
     """
-    if jobs <= 1:
-        yield WorkerPool(None, 1)
-        return
-    with worker_pool(jobs) as pool:
-        yield WorkerPool(pool, jobs * (1 + _WAITING), kept)
+    with ExitStack() as stack:
+        if isinstance(on, str):
+            cluster = stack.enter_context(DaskCluster(on))
+            required = cluster.require(laws)
+            yield WorkerPool(cluster.executor, cluster.workers, None, cluster, required, hint)
+        elif on is not None:
+            yield WorkerPool(on, getattr(on, "_max_workers", count_cores()), hint=hint)
+        else:
+            count = jobs or count_cores()
+            count = count if most is None else min(count, most)
+            yield _open_processes(stack, count, hint) if count > 1 else WorkerPool(None, 1)
+
+
+def _open_processes(stack: ExitStack, count: int, hint: str) -> WorkerPool:
+    def start() -> Executor:
+        opened: AbstractContextManager[Executor] = worker_pool(count)
+        return stack.enter_context(opened)
+
+    return WorkerPool(start(), count, start, hint=hint)
+
+
+def check_workers(jobs: int | None, on: Workers) -> None:
+    """Refuses --jobs together with --on.
+
+    Raises:
+        UsageError: both are given.
+    """
+    if on is not None and jobs is not None:
+        raise UsageError("--jobs is how many processes of this machine: leave it out with --on")
+
+
+def count_workers(jobs: int | None, on: Workers = None) -> int:
+    """Returns how many items will run at the same time; on a cluster, checks its workers.
+
+    Raises:
+        UsageError: the cluster cannot be reached, or one of its workers is not fit.
+    """
+    check_workers(jobs, on)
+    if on is None:
+        return jobs or count_cores()
+    with open_worker_pool(None, on) as pool:
+        return pool.workers

@@ -1,24 +1,17 @@
 """Runs of a sweep: the same results however they were made, and nothing twice."""
 
 from collections import Counter
-from collections.abc import Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from trilat_net.errors import RunFailed, ScenarioError, UsageError
-from trilat_net.studies.executor import WorkerPool
+from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.studies.sweep import (
     cell_result,
     open_sweep_folder,
     prepare_sweep_folder,
     run_sweep,
-    sweep_run,
 )
-from trilat_net.studies.sweep.sweep_cell import run_cell
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_run import (
     DurationEstimate,
@@ -130,50 +123,6 @@ def test_a_cell_that_cannot_run_is_named_and_what_is_done_is_kept(tmp_path: Path
     with folder.journal() as journal:
         assert sorted(journal.done) == [(n, 1) for n in range(4)]
     assert judge.texts
-
-
-class _Pool:
-    """Stands for processes; remembers how much was asked of it at a time."""
-
-    def __init__(self, *, broken: bool = False) -> None:
-        self.most = self.under_way = 0
-        self.broken = broken
-
-    def submit(self, work: Any, task: Any) -> "Future[Any]":
-        self.under_way += 1
-        self.most = max(self.most, self.under_way)
-        future: Future[Any] = Future()
-        if self.broken:
-            future.set_exception(BrokenProcessPool())
-        else:
-            future.set_result(work(task))
-        return future
-
-
-def test_few_runs_wait_at_a_time_however_many_there_are(tmp_path: Path, judge: Judge) -> None:
-    pool = _Pool()
-    sweep = asked(tmp_path, over=["control.Kd=1:300:1"])
-    asked_for: list[int] = []
-
-    def tasks() -> Iterator[Any]:
-        for number in range(300):
-            asked_for.append(number)
-            yield sweep.task(number, 1)
-
-    cells = []
-    for _, entry in WorkerPool(pool, 6).each(run_cell, tasks()):  # type: ignore[arg-type]
-        pool.under_way -= 1
-        cells.append(entry.cell)
-        assert len(asked_for) - len(cells) <= 6
-    assert sorted(cells) == list(range(300))
-    assert pool.most <= 6
-    assert len(judge.texts) == 300
-
-
-def test_a_process_that_was_ended_is_told_of_with_what_to_do(tmp_path: Path) -> None:
-    task = asked(tmp_path).task(0, 1)
-    with pytest.raises(RunFailed, match="what is done is kept: go on with --resume"):
-        list(WorkerPool(_Pool(broken=True), 2, sweep_run._RESUME_HINT).each(run_cell, [task]))  # type: ignore[arg-type]
 
 
 def test_times_are_said_as_people_say_them() -> None:

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import ScenarioError, UsageError
-from ...process import count_cores
 from ...reporting.text_table import TextTable
 from ...scenario import Scenario
-from ..executor import open_worker_pool
+from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import cell_result
 from .map_plane import label_axis
 from .stability_map import build_sweep_command, format_override, format_override_value
@@ -172,6 +171,9 @@ class MarginTask(NamedTuple):
     longest_s: float
     range: SearchRange
 
+    def __str__(self) -> str:
+        return f"the search at {', '.join(self.overrides) or 'the scenario'}, seed {self.seed}"
+
 
 MarginFinding = tuple[KeyMargin, tuple[float, ...], str, float | None]
 """Margin, linear edges, what is to be known of them, edge in closed form."""
@@ -227,7 +229,8 @@ def search_margins(
     asked: SweepPlan,
     within: SearchRange,
     jobs: int | None = None,
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Progress = ignore_progress,
+    on: Workers = None,
 ) -> list[GridPointMargin]:
     """Returns the edges of every place of a plan and every seed.
 
@@ -236,6 +239,7 @@ def search_margins(
         within: the range.
         jobs: in how many processes; None for one per core.
         progress: told how many places are done, and how many there are.
+        on: what searches them instead: a Dask scheduler's address or an executor.
 
     Raises:
         ScenarioError: some value makes no scenario.
@@ -246,13 +250,12 @@ def search_margins(
     searches = [
         MarginTask(asked.written, cell.overrides[:-1], seed, asked.longest_s, within) for cell, seed in places
     ]
-    found: dict[int, GridPointMargin] = {}
-    with open_worker_pool(min(jobs or count_cores(), len(searches))) as hands:
-        for n, told in hands.each(search_margin_task, searches):
-            cell, seed = places[n]
-            found[n] = GridPointMargin(cell._replace(values=cell.values[:-1]), seed, *told)
-            progress(len(found), len(searches))
-    return [found[n] for n in range(len(searches))]
+    with open_worker_pool(jobs, on, most=len(searches)) as pool:
+        findings = pool.map(search_margin_task, searches, progress)
+    return [
+        GridPointMargin(cell._replace(values=cell.values[:-1]), seed, *finding)
+        for (cell, seed), finding in zip(places, findings, strict=True)
+    ]
 
 
 def _seeds(asked: SweepPlan, cell: SweepCell) -> Sequence[int]:

@@ -4,13 +4,12 @@ Invariant: the runs come from the results and the lines from the plan alone; nei
 """
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ...process import count_cores
 from ...scenario import Scenario
 from ...scenario.fields import is_number
-from ..executor import open_worker_pool
+from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .map_plane import MapPanel, MapPlane, build_plane
 from .sweep_cell import SweepSource
 from .sweep_plan import MAX_EXTENSION, MAX_SCENARIO_S, SweepPlan
@@ -62,9 +61,10 @@ def build_stability_map(
     results: SweepResults,
     commands: tuple[str, ...],
     jobs: int | None = None,
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Progress = ignore_progress,
     *,
     linearly: bool = True,
+    on: Workers = None,
 ) -> StabilityMap:
     """Returns the map of results.
 
@@ -74,6 +74,7 @@ def build_stability_map(
         jobs: in how many processes the linear analysis works; None for one per core.
         progress: told how many columns of it are done, and how many there are.
         linearly: whether its line is wanted.
+        on: what does the linear analysis instead: a Dask scheduler's address or an executor.
 
     Raises:
         UsageError: there is nothing to draw, or too many panels.
@@ -88,7 +89,7 @@ def build_stability_map(
     lines = [[trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
     remarks: dict[str, None] = {}
     if linearly:
-        for some, columns in zip(lines, _columns(drawn, at, jobs, progress), strict=True):
+        for some, columns in zip(lines, _columns(drawn, at, jobs, on, progress), strict=True):
             line, why = trace_linear_analysis(columns)
             some.append(line)
             remarks |= dict.fromkeys(why)
@@ -100,15 +101,12 @@ GrowthColumn = tuple[list[float], list[str]]
 
 
 def _columns(
-    drawn: MapPlane, at: Sequence[PanelScenarios], jobs: int | None, progress: Callable[[int, int], None]
+    drawn: MapPlane, at: Sequence[PanelScenarios], jobs: int | None, on: Workers, progress: Progress
 ) -> list[list[GrowthColumn]]:
     """Returns per panel the real parts of the rightmost roots, column by column."""
     tasks = [(one, x, drawn.y.values) for one in at for x in drawn.x.values]
-    found: dict[int, GrowthColumn] = {}
-    with open_worker_pool(min(jobs or count_cores(), len(tasks))) as hands:
-        for n, column in hands.each(_column, tasks):
-            found[n] = column
-            progress(len(found), len(tasks))
+    with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+        found = pool.map(_column, tasks, progress)
     wide = len(drawn.x.values)
     return [[found[n] for n in range(first, first + wide)] for first in range(0, len(tasks), wide)]
 

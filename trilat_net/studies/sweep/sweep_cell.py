@@ -136,6 +136,9 @@ class CellTask(NamedTuple):
     seed: int
     longest_s: float
 
+    def __str__(self) -> str:
+        return f"cell {self.number} ({', '.join(self.overrides)}), seed {self.seed}"
+
 
 class CellRun(msgspec.Struct, frozen=True):
     """One run that was made.

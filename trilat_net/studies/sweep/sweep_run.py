@@ -5,14 +5,14 @@ interruptions do not enter. A run that is in the journal is never made again.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from ...errors import UsageError
 from ...files import write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
-from ..executor import WorkerPool, open_worker_pool
+from ..executor import Progress, WorkerPool, Workers, ignore_progress, open_worker_pool
 from . import cell_result
 from .sweep_cell import CellRun, run_cell
 from .sweep_folder import SweepFolder, SweepJournal, build_resume_hint
@@ -33,9 +33,7 @@ MAX_SWEEP_S = 86_400.0
 _PROBES = 7
 _PROBING_S = 3.0
 """So many runs tell how long all will take; fewer, once that has taken so long."""
-_RESUME_HINT = "what is done is kept: go on with --resume, "
-
-SweepProgress = Callable[[int, int], None]
+_RESUME_HINT = "; what is done is kept: go on with --resume"
 
 
 class DurationEstimate(NamedTuple):
@@ -146,8 +144,9 @@ def format_wall_time(seconds: float) -> str:
 def run_sweep(
     folder: SweepFolder,
     jobs: int | None = None,
-    progress: SweepProgress = lambda _done, _total: None,
+    progress: Progress = ignore_progress,
     known: Iterable[CellRun] = (),
+    on: Workers = None,
 ) -> FinishedSweep:
     """Runs what is left of a sweep, writes its results, and returns them.
 
@@ -156,6 +155,7 @@ def run_sweep(
         jobs: in how many processes; None for one per core.
         progress: told how many runs are done, and how many there are as far as is known.
         known: runs that were made already, for an estimate.
+        on: what runs the cells instead: a Dask scheduler's address or an executor.
 
     Raises:
         ScenarioError: a cell cannot run; says which. What is done is kept.
@@ -170,9 +170,9 @@ def run_sweep(
             journal.add(entry)
         before, began_ns = set(journal.done), clock.monotonic_ns()
         left = asked.cells * len(asked.seeds) - len(before)
-        count = max(1, min(jobs or count_cores(), left))
-        with open_worker_pool(count if left else 1, _RESUME_HINT) as hands:
-            _run_cells(asked, journal, hands, progress)
+        with open_worker_pool(jobs, on if left else None, most=left, hint=_RESUME_HINT) as pool:
+            count = pool.workers
+            _run_cells(asked, journal, pool, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         made = [entry for key, entry in journal.done.items() if key not in before]
         rows = build_result_rows(asked, list(journal.done.values()))
@@ -186,7 +186,7 @@ def run_sweep(
     return FinishedSweep(results, folder, speed)
 
 
-def _run_cells(asked: SweepPlan, journal: SweepJournal, hands: WorkerPool, progress: SweepProgress) -> None:
+def _run_cells(asked: SweepPlan, journal: SweepJournal, pool: WorkerPool, progress: Progress) -> None:
     """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = asked.seeds
 
@@ -195,8 +195,9 @@ def _run_cells(asked: SweepPlan, journal: SweepJournal, hands: WorkerPool, progr
         return asked.cells + random * len(others)
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
+        before = len(journal.done)
         tasks = (asked.task(*key) for key in runs if key not in journal.done)
-        for _, entry in hands.each(run_cell, tasks):
+        for _, entry in pool.each(run_cell, tasks, count=count - before):
             journal.add(entry)
             progress(len(journal.done), count)
 

@@ -92,7 +92,7 @@ class Trial(NamedTuple):
         sets = [word for text in self.overrides for word in ("--set", text)]
         return shlex.join(["trilat", *words, *sets])
 
-    def judged(self, figures: RunMetrics, wall_s: float) -> TrialResult:
+    def evaluate(self, figures: RunMetrics, wall_s: float) -> TrialResult:
         """Returns the result that figures of this trial mean."""
         return TrialResult(
             self, evaluate_expectations(self.scenario.expect, figures), figures.simulated_s, wall_s
@@ -106,7 +106,7 @@ class Trial(NamedTuple):
             figures = measure_virtual_run(self.scenario)
         except LawFailed as failed:
             return TrialResult(self, [], 0.0, (clock.monotonic_ns() - start_ns) * 1e-9, str(failed))
-        return self.judged(figures, (clock.monotonic_ns() - start_ns) * 1e-9)
+        return self.evaluate(figures, (clock.monotonic_ns() - start_ns) * 1e-9)
 
     def check(self) -> TrialResult:
         """Runs the trial in virtual time.
@@ -214,7 +214,7 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
         log = open_log(log_file)
         if not any(len(log[name]) for name in log.sites):
             raise LogError(f"{log_file}: no records")
-        result = trial.judged(measure_log(log, trial.scenario.expect), wall_s)
+        result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
         verdict = verify(log)
     except LogError as error:
         return TrialResult(trial, [], 0.0, wall_s, "; ".join([*problems, str(error)]), kept)

@@ -1,63 +1,102 @@
-"""Runs many trials in virtual time, on all cores.
+"""Runs many trials in virtual time, on all cores or on a cluster.
 
-Invariant: results come in the order of the trials, whatever the number of processes; on return, by whatever
-way, all worker processes are gone.
+Invariant: results come in the order of the trials, whatever ran them; a trial that ends its worker process
+again and again costs itself and no other.
 """
 
-import contextlib
-import os
-import queue
-import subprocess
-import sys
-import tempfile
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from ...core.jit import is_core_cached
+from ...errors import TrilatError
 from ...execution import virtual
 from ...net.clock import SystemClock
-from ...process import count_cores
-from ...scenario import Scenario
+from ...scenario import Scenario, parse_scenario
+from ...scenario.laws import ImportedLaw
+from ..executor import MAX_LOSSES, Workers, open_worker_pool
+from .measure_run import RunMetrics, measure_virtual_run
 from .trial import Trial, TrialResult, trials
 from .trial_report import TrialReport
-from .trial_worker import TrialReply
 
-POLL_S = 0.5
-"""How often who waits looks up: Ctrl-C is heard then at the latest, whichever thread it reached."""
-_IMPORT_ROOT = str(Path(__file__).resolve().parents[3])
+
+class _TrialItem(NamedTuple):
+    name: str
+    text: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class _TrialReply(msgspec.Struct):
+    """Metrics of a trial, or why there are none."""
+
+    metrics: RunMetrics | None = None
+    wall_s: float = 0.0
+    error: str = ""
+
+
+def _run_item(item: _TrialItem) -> _TrialReply:
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    try:
+        metrics = measure_virtual_run(parse_scenario(item.text))
+    except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
+        return _TrialReply(error=f"{type(error).__name__}: {error}")
+    return _TrialReply(metrics, (clock.monotonic_ns() - start_ns) * 1e-9)
 
 
 def run_trials(
     batch: Sequence[Trial],
     jobs: int | None = None,
     done: Callable[[TrialResult], None] = lambda _: None,
+    on: Workers = None,
 ) -> TrialReport:
     """Runs trials in virtual time and returns their results.
 
     Args:
-        batch: what to run.
-        jobs: in how many processes; None for one per core. One trial, or one job, runs in this process.
-        done: is told of every result as it comes.
+        batch: the trials.
+        jobs: how many processes; None for one per core. One trial, or one job, runs in this process.
+        done: called with every result as it comes.
+        on: what runs them instead: a Dask scheduler's address or an executor.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    count = min(jobs or count_cores(), len(batch))
-    if count <= 1:
-        results = []
-        for trial in batch:
-            results.append(trial.run())
-            done(results[-1])
-    else:
-        if not is_core_cached():
-            next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
-        with _TrialPool(batch, count) as crew:
-            results = crew.results(done)
-    return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+    laws = [
+        site.control
+        for trial in batch
+        for site in trial.scenario.sites.values()
+        if isinstance(site.control, ImportedLaw)
+    ]
+    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
+    items = [_TrialItem(str(batch[n]), batch[n].scenario.text) for n in longest_first]
+    results: dict[int, TrialResult] = {}
+    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+        if pool.is_local:
+            replies = ((n, batch[n].run()) for n in range(len(batch)))
+        else:
+            if not is_core_cached():
+                next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
+            replies = (
+                (longest_first[place], _result(batch[longest_first[place]], reply))
+                for place, reply in pool.each(_run_item, items, _lost_reply, len(items))
+            )
+        for n, result in replies:
+            results[n] = result
+            done(result)
+    return TrialReport([results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _lost_reply(_item: _TrialItem) -> _TrialReply:
+    return _TrialReply(error=f"its worker process ended, {MAX_LOSSES} times")
+
+
+def _result(trial: Trial, reply: _TrialReply) -> TrialResult:
+    if reply.metrics is None:
+        return TrialResult(trial, [], 0.0, reply.wall_s, reply.error)
+    return trial.evaluate(reply.metrics, reply.wall_s)
 
 
 def check(
@@ -66,6 +105,7 @@ def check(
     set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
     *,
     jobs: int | None = None,
+    on: Workers = None,
 ) -> TrialReport:
     """Runs a scenario in virtual time, once per seed, and returns the results if all of [expect] held.
 
@@ -73,153 +113,15 @@ def check(
         source: the name of a shipped scenario, a path, or a scenario.
         seeds: which seeds; none means the scenario's own.
         set: overrides, as in `{"link.delay_ms": 400}`.
-        jobs: in how many processes; None for one per core.
+        jobs: how many processes; None for one per core.
+        on: what runs them instead: a Dask scheduler's address, as in "tcp://10.0.0.5:8786", or an executor.
 
     Raises:
         ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
+        UsageError: the cluster cannot be reached, or one of its workers is not fit.
         AssertionError: something did not hold; it says what, by how much, and how to repeat it.
     """
-    report = run_trials(trials(source, seeds, set), jobs)
+    report = run_trials(trials(source, seeds, set), jobs, on=on)
     if not report.held:
         raise AssertionError(f"not as expected\n{report.text()}")
     return report
-
-
-class _TrialPool:
-    """Some processes and, for each, a thread of this one that gives it work and waits for it.
-
-    Args:
-        trials: what there is to do.
-        count: how many processes.
-    """
-
-    def __init__(self, trials: Sequence[Trial], count: int) -> None:
-        self._trials = trials
-        self._waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
-        by_length = sorted(range(len(trials)), key=lambda n: -trials[n].scenario.duration_s)
-        for n in by_length:  # the longest first, so that none is left for the end
-            self._waiting.put(n)
-        self._done: queue.SimpleQueue[tuple[int, TrialResult | Exception]] = queue.SimpleQueue()
-        self._hands = [_Worker() for _ in range(count)]
-        self._threads = [
-            threading.Thread(target=self._work, args=(hand,), daemon=True) for hand in self._hands
-        ]
-
-    def __enter__(self) -> "_TrialPool":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for hand in self._hands:
-            hand.dismiss()
-        for thread in self._threads:
-            if thread.ident is not None:
-                thread.join()
-
-    def _work(self, hand: "_Worker") -> None:
-        while True:
-            try:
-                n = self._waiting.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                self._done.put((n, hand.run(self._trials[n])))
-            except Exception as error:  # raised again where the results are waited for
-                self._done.put((n, error))
-                return
-
-    def results(self, done: Callable[[TrialResult], None]) -> list[TrialResult]:
-        """Returns every result, in the order of the trials."""
-        for (
-            thread
-        ) in self._threads:  # not before the context is entered: who is interrupted here is dismissed
-            thread.start()
-        found: dict[int, TrialResult] = {}
-        while len(found) < len(self._trials):
-            try:
-                n, result = self._done.get(timeout=POLL_S)
-            except queue.Empty:
-                continue
-            if isinstance(result, Exception):
-                raise result
-            found[n] = result
-            done(result)
-        return [found[n] for n in range(len(self._trials))]
-
-
-class _Worker:
-    """One worker process, started when it is first needed and again where it was lost."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._printed: IO[bytes] | None = None
-        self._lock = threading.Lock()
-        self._dismissed = False
-
-    def run(self, trial: Trial) -> TrialResult:
-        """Runs a trial in the worker."""
-        process = self._started()
-        if process is None or process.stdin is None or process.stdout is None:
-            return TrialResult(trial, [], 0.0, 0.0, "was not run")
-        try:
-            process.stdin.write(msgspec.json.encode(trial.scenario.text) + b"\n")
-            process.stdin.flush()
-            line = process.stdout.readline()
-        except (OSError, ValueError):  # it is gone; ValueError: dismissed in this very moment
-            line = b""
-        if not line.endswith(b"\n"):
-            return TrialResult(trial, [], 0.0, 0.0, self._lost())
-        answer = msgspec.json.decode(line, type=TrialReply)
-        if answer.figures is None:
-            return TrialResult(trial, [], 0.0, answer.wall_s, answer.error)
-        return trial.judged(answer.figures, answer.wall_s)
-
-    def _started(self) -> subprocess.Popen[bytes] | None:
-        with self._lock:
-            if self._process is None and not self._dismissed:
-                self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-                path = os.pathsep.join(filter(None, (_IMPORT_ROOT, os.environ.get("PYTHONPATH"))))
-                self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "trilat_net.studies.trials.trial_worker"],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=self._printed,
-                    env={**os.environ, "PYTHONPATH": path},
-                    start_new_session=True,  # Ctrl-C is this process's business
-                )
-            return self._process
-
-    def _lost(self) -> str:
-        """Returns how the worker ended, and forgets it."""
-        with self._lock:
-            process, printed = self._process, self._printed
-            self._process = self._printed = None
-            if process is None or printed is None:
-                return "was ended"
-            code = _wait_for_exit(process)
-            printed.seek(0)
-            lines = printed.read().decode(errors="replace").strip().splitlines()
-            printed.close()
-            return f"its process ended with code {code}" + (f": {lines[-1]}" if lines else "")
-
-    def dismiss(self) -> None:
-        """Ends the worker at once; it has nothing that needs to be kept."""
-        with self._lock:
-            self._dismissed = True
-            process, printed = self._process, self._printed
-            self._process = self._printed = None
-            if process is not None:
-                process.kill()
-                _wait_for_exit(process)
-            if printed is not None:
-                printed.close()
-
-
-def _wait_for_exit(process: subprocess.Popen[bytes]) -> int:
-    """Waits for a process, closes its pipes, and returns its exit code."""
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with contextlib.suppress(OSError):  # what it was sent and did not read
-                pipe.close()
-    return process.wait()

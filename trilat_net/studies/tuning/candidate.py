@@ -2,15 +2,12 @@
 
 Invariant: a candidate's scenario is loaded through the same settings that its command names, and its
 score is a function of the scenario alone: None for the errors of a run that does not reach its end.
-Scores come in the order of the candidates, whatever the number of processes.
 """
 
 import shlex
 from array import array
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,10 +20,9 @@ from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S, Mode, TickRecord
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
-from ...errors import RunFailed, ScenarioError
+from ...errors import ScenarioError
 from ...execution import virtual
 from ...log.record_columns import Ints
-from ...process import ignore_sigint, worker_pool
 from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
@@ -190,60 +186,20 @@ def _ending(t_s: Array, apart: Array, off: Array, e: Array) -> CandidateEnd:
     )
 
 
-CandidateTask = tuple[str, str | None]
-"""The canonical text of a candidate's scenario, and of its twin's or None."""
+class CandidateTask(NamedTuple):
+    """One candidate to be run: the canonical texts of its scenario and of its twin, and what it is called."""
+
+    text: str
+    twin_text: str | None
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
 
 
-class CandidatePool:
-    """Runs candidates.
-
-    Args:
-        pool: in which processes; None: in this one.
-    """
-
-    def __init__(self, pool: ProcessPoolExecutor | None) -> None:
-        self._pool = pool
-
-    def scores(self, tasks: Sequence[CandidateTask], done: Callable[[], None]) -> list[CandidateScore]:
-        """Returns the score of every candidate.
-
-        Args:
-            tasks: the candidates.
-            done: is told of every score as it comes.
-
-        Raises:
-            RunFailed: a process was ended.
-        """
-        if not tasks:
-            return []
-        found: list[CandidateScore] = []
-        try:
-            with ignore_sigint():
-                scores = (map if self._pool is None else self._pool.map)(
-                    measure_candidate, *zip(*tasks, strict=True)
-                )
-            for score in scores:
-                found.append(score)
-                done()
-        except BrokenProcessPool:
-            raise RunFailed(
-                "a process of the search was ended, or could not begin; try again, or with --jobs 1"
-            ) from None
-        return found
-
-
-@contextmanager
-def open_candidate_pool(jobs: int) -> Iterator[CandidatePool]:
-    """Yields who runs candidates.
-
-    Args:
-        jobs: in how many processes; one is this one.
-    """
-    if jobs <= 1:
-        yield CandidatePool(None)
-        return
-    with worker_pool(jobs) as pool:
-        yield CandidatePool(pool)
+def measure_candidate_task(task: CandidateTask) -> CandidateScore:
+    """Runs one task, in whatever process."""
+    return measure_candidate(task.text, task.twin_text)
 
 
 class TuningScenario(NamedTuple):
@@ -282,7 +238,8 @@ class TuningScenario(NamedTuple):
     def task(self) -> CandidateTask:
         """What has to be run to measure it."""
         alone = build_twin(self.scenario)
-        return self.scenario.text, None if alone is None else alone.text
+        name = ", ".join(self.overrides) or self.source
+        return CandidateTask(self.scenario.text, None if alone is None else alone.text, name)
 
     @property
     def command(self) -> str:

@@ -4,7 +4,7 @@ Invariant: the result is a function of the plan alone; neither the number of pro
 The gains that the paper prints are measured, never searched, and stand on no front.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,8 @@ from ...errors import ScenarioError, UsageError
 from ...execution import virtual
 from ...net.clock import SystemClock
 from ...process import count_cores
-from .candidate import CandidateScore, TuningScenario, load_tuning_scenario, open_candidate_pool
+from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from .candidate import CandidateScore, TuningScenario, load_tuning_scenario, measure_candidate_task
 from .consensus_pose import build_twin, check_comparable
 from .final_posture import CandidateClass
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
@@ -30,8 +31,6 @@ DEFAULT_BUDGET = 64
 MAX_BUDGET = 100_000
 MAX_TICKS = 10_000_000
 """Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites has 180 000."""
-
-TuningProgress = Callable[[int, int], None]
 
 
 class PaperGainsResult(NamedTuple):
@@ -137,13 +136,14 @@ class TuningPlan(NamedTuple):
         )
 
     def run(
-        self, jobs: int | None = None, progress: TuningProgress = lambda _done, _total: None
+        self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
     ) -> "TuningResult":
         """Searches every law and returns what was found.
 
         Args:
             jobs: in how many processes; None for one per core.
             progress: told how many candidates are done, and how many there are.
+            on: what runs the candidates instead: a Dask scheduler's address or an executor.
 
         Raises:
             RunFailed: a process was ended by somebody.
@@ -151,16 +151,14 @@ class TuningPlan(NamedTuple):
         searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
         printed = self.printed()
         measured: list[CandidateScore] = []
-        done = 0
+        total, done = len(searches) * self.budget + len(printed), 0
 
-        def one_more() -> None:
-            nonlocal done
-            done += 1
-            progress(done, len(searches) * self.budget + len(printed))
+        def show(more: int, _: int) -> None:
+            progress(done + more, total)
 
         if not is_core_cached():
             next(virtual.execute_virtual(self.base.scenario))  # compiles, once for all processes
-        with open_candidate_pool(min(jobs or count_cores(), len(searches) * self.budget)) as runners:
+        with open_worker_pool(jobs, on, most=total) as pool:
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
                 tasks = [
@@ -170,7 +168,8 @@ class TuningPlan(NamedTuple):
                 ]
                 if number == 0:
                     tasks += [candidate.task for candidate in printed.values()]
-                scores = iter(runners.scores(tasks, one_more))
+                scores = iter(pool.map(measure_candidate_task, tasks, show))
+                done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores

@@ -1,0 +1,101 @@
+"""The worker pool: every item once, in few batches, whatever becomes of its workers."""
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from trilat_net.errors import RunFailed, UsageError
+from trilat_net.studies.executor import MAX_LOSSES, WorkerPool, _Feed, count_workers, open_worker_pool
+
+
+def test_any_executor_gives_the_results_of_this_process() -> None:
+    shown: list[tuple[int, int]] = []
+    with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
+        assert pool.map(abs, range(-50, 0), lambda *one: shown.append(one)) == list(range(50, 0, -1))
+    assert shown == [(n, 50) for n in range(1, 51)]
+    with open_worker_pool(1) as pool:
+        assert list(pool.each(abs, [-3, 2])) == [(0, 3), (1, 2)]
+
+
+def test_few_items_are_taken_at_a_time_however_many_there_are() -> None:
+    taken: list[int] = []
+
+    def items() -> Iterator[int]:
+        for n in range(10**9):
+            taken.append(n)
+            yield n
+
+    with ThreadPoolExecutor(2) as threads, open_worker_pool(None, threads) as pool:
+        results = pool.each(abs, items())
+        seen = [next(results) for _ in range(20)]
+        results.close()  # type: ignore[attr-defined]
+    assert len({n for n, _ in seen}) == 20
+    assert len(taken) < 2000
+
+
+def test_batches_take_as_long_as_measured_items_allow_and_shrink_at_the_end() -> None:
+    feed = _Feed(range(2000), 2000, 2)
+    assert len(feed.take(idle=True)) == 1
+    feed.measure(10, 0.2)
+    assert len(feed.take(idle=False)) == 20
+    sizes = []
+    while batch := feed.take(idle=False):
+        sizes.append(len(batch))
+    assert sum(sizes) == 1979
+    assert sizes == sorted(sizes, reverse=True)
+    assert (sizes[0], sizes[-1]) == (20, 1)
+    feed = _Feed(range(10), None, 2)
+    feed.measure(1, 7.0)
+    assert len(feed.take(idle=False)) == 1
+
+
+def failing(n: int) -> int:
+    if n == 5:
+        raise ValueError("five")
+    return n
+
+
+def test_an_error_comes_after_the_results_before_it() -> None:
+    with ThreadPoolExecutor(1) as threads:
+        results = WorkerPool(threads, 1).each(failing, range(9))
+        assert [next(results) for _ in range(5)] == [(n, n) for n in range(5)]
+        with pytest.raises(ValueError, match="five"):
+            next(results)
+
+
+def killed_once(flag: Path, n: int) -> int:
+    if n == 7 and not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return n * n
+
+
+def killed(n: int) -> int:
+    if n == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return n * n
+
+
+def test_items_of_a_lost_worker_run_again(tmp_path: Path) -> None:
+    with open_worker_pool(2) as pool:
+        assert pool.map(partial(killed_once, tmp_path / "flag"), range(30)) == [n * n for n in range(30)]
+        assert pool.map(abs, [-1, -2]) == [1, 2]
+
+
+def test_an_item_that_ends_every_worker_is_named_or_gets_its_own_result() -> None:
+    with open_worker_pool(2, hint="; what to do") as pool:
+        with pytest.raises(RunFailed, match=f"^7 ended {MAX_LOSSES} worker processes; what to do$"):
+            pool.map(killed, range(30))
+        found = dict(pool.each(killed, range(30), lambda item: -item))
+    assert found == {n: -7 if n == 7 else n * n for n in range(30)}
+
+
+def test_jobs_belong_to_this_machine() -> None:
+    assert count_workers(3) == 3
+    with pytest.raises(UsageError, match="--jobs"):
+        count_workers(3, "tcp://127.0.0.1:1")
