@@ -3,13 +3,12 @@
 Invariant: no logic here but joining rooms: scenario, virtual time, log, execution, analysis, studies.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .execution import virtual
-from .log.log_reader import Log, open_log
+from .execution.virtual import simulate_scenario
+from .log.log_reader import Log
 from .scenario import Scenario, load_scenario
 
 
@@ -26,7 +25,4 @@ def simulate(
     Raises:
         ScenarioError: the scenario or an override is not valid.
     """
-    stream = io.BytesIO()
-    virtual.write_virtual_log(load_scenario(scenario, set), stream)
-    stream.seek(0)
-    return open_log(stream)
+    return simulate_scenario(load_scenario(scenario, set))

@@ -9,7 +9,6 @@ from tests.log_editing import edited, opened, recorded
 from trilat_net.execution.virtual_comparison import (
     compare_with_virtual,
     find_late_samples,
-    read_arrival_schedule,
     simulate_without_operators,
 )
 from trilat_net.log.log_reader import Log
@@ -88,13 +87,6 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
         assert twin.first is not None
         assert twin.first[:3] == ("m2", 70, "theta_hat[3]")
         assert twin.identical == twin.records - 1
-
-
-def test_a_schedule_is_what_the_records_list() -> None:
-    log = opened(recorded("paper"))
-    at = read_arrival_schedule(log)
-    assert at["m1"][0] == []
-    assert [entry[:2] for entry in at["m1"][50]] == [[0, 49], [1, 49]]
 
 
 def test_the_twin_without_hands_has_nobody_at_the_arms() -> None:

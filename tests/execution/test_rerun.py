@@ -49,7 +49,7 @@ def test_logs_of_every_version_with_changes_losses_and_stale_peers_are_too(
     path: Path, replace: list[str]
 ) -> None:
     again = rerun(path, replace)
-    assert not again.premise.changes
+    assert not again.request.changes
     assert not again.broken
     if again.before.session["fingerprint"] == compute_fingerprint():
         assert all_identical(again)
@@ -129,8 +129,8 @@ def test_all_sites_replaced_are_a_closed_loop() -> None:
     log = opened(recorded("free"))
     changes = {"control.Kp": 2.0}
     by_name, at_once = rerun(log, SITES, changes), rerun(log, [], changes, closed_loop=True)
-    assert by_name.premise == at_once.premise
-    assert by_name.facts() == at_once.facts()
+    assert by_name.request == at_once.request
+    assert by_name.to_json() == at_once.to_json()
 
 
 def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
@@ -200,7 +200,7 @@ def test_strange_arrivals_end_nothing(change: object) -> None:
 
 
 def test_facts_are_plain_and_name_their_units() -> None:
-    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).facts()
+    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_json()
     assert facts["mode"] == "open loop"
     assert facts["changes"] == [{"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}]
     site = facts["sites"]["s"]

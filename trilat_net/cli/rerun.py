@@ -59,7 +59,7 @@ def rerun_command(
     if output is not None:
         again.save(output, force=force)
     if as_json:
-        print_line(json.dumps({**again.facts(), "file": str(output) if output else None}, indent=2))
+        print_line(json.dumps({**again.to_json(), "file": str(output) if output else None}, indent=2))
     else:
         _show(again, output)
     if again.diverged or again.broken:
@@ -80,7 +80,7 @@ def _show(again: "Rerun", output: Path | None) -> None:
     """Prints what was asked, what became of it, and what limits the answer."""
     from ..execution.rerun_request import describe_rerun_changes as wording
 
-    asked = again.premise
+    asked = again.request
     others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
     out.print(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}", soft_wrap=True)
     for line in wording(asked) or ["nothing is changed: this is the experiment of the log"]:
@@ -120,7 +120,7 @@ def _lines(again: "Rerun") -> list[str]:
             )
         if effect.first is not None:
             first = effect.first
-            at_s = first.tick / again.premise.scenario.sites[effect.site].rate_hz
+            at_s = first.tick / again.request.scenario.sites[effect.site].rate_hz
             was, now = _values(first.logged, first.computed)
             where = f"tick {first.tick} ({at_s:.3f} s)"
             lines.append(

@@ -29,7 +29,7 @@ def verify_command(
     with progress_bar(f"executing {files[0]}") as progress:
         result = run_log_checks(log, virtual=virtual, progress=progress)
     if as_json:
-        typer.echo(json.dumps({"files": [str(file) for file in files], **result.facts()}, indent=2))
+        typer.echo(json.dumps({"files": [str(file) for file in files], **result.to_json()}, indent=2))
     else:
         for line in result.lines:
             console = out if line.passed else err

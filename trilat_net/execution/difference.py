@@ -12,20 +12,18 @@ from ..errors import LawFailed
 from ..net.messages import STATE_VECTORS, State
 
 TOLERANCE = 1e-9
-"""Where platforms differ, values a and b count as equal when |a - b| <= TOLERANCE (1 + |a|)."""
+"""Across platforms, a and b count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
 
 NumberEquality = Callable[[float, float], bool]
 
 
 class RecordDifference(NamedTuple):
-    """One field of one record that is not as it should be.
+    """A field of a record that differs from the execution.
 
     Attributes:
-        site: whose record.
-        tick: which record.
-        field: which field, with the index of the number in it.
-        logged: what the log says.
-        computed: what the execution gave.
+        field: the field, with the index of the number in it.
+        logged: its value in the log.
+        computed: its value in the execution.
     """
 
     site: str
@@ -35,41 +33,37 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
-        return (
-            f"{self.site}, tick {self.tick}, {self.field}: "
-            f"logged {_shown(self.logged)}, computed {_shown(self.computed)}"
+        logged, computed = (
+            f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
+            for value in (self.logged, self.computed)
         )
-
-
-def _shown(value: Any) -> str:
-    return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
+        return f"{self.site}, tick {self.tick}, {self.field}: logged {logged}, computed {computed}"
 
 
 def equal_bits(a: float, b: float) -> bool:
-    """True where two numbers have the same bits (-0.0 is not 0.0)."""
+    """True if two numbers have the same bits (-0.0 is not 0.0)."""
     return a.hex() == b.hex()
 
 
 def equal_to_tolerance(a: float, b: float) -> bool:
-    """True where two numbers agree as well as two platforms can be expected to."""
+    """True if two numbers agree as well as two platforms can."""
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
 def describe_law_failure(failed: LawFailed) -> RecordDifference:
-    """Returns the difference where a law from outside fails that did not when the log was made."""
+    """Returns the difference of a user law that fails now and did not when the log was made."""
     return RecordDifference(failed.site, failed.tick or 0, "record", "is there", failed.problem)
 
 
-def _equal_lists(a: Sequence[float], b: Sequence[float], same: NumberEquality) -> bool:
-    """True where two lists of numbers are as long as each other and agree."""
-    return len(a) == len(b) and all(same(float(x), float(y)) for x, y in zip(a, b, strict=True))
+def _equal_lists(a: Sequence[float], b: Sequence[float], equal: NumberEquality) -> bool:
+    return len(a) == len(b) and all(equal(float(x), float(y)) for x, y in zip(a, b, strict=True))
 
 
 _NUMBERS = struct.Struct(f"<{sum(STATE_VECTORS.values())}d").pack
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
-    """True where every computed field of a record has the same bits: the common case, looked at at once."""
+    """True if every computed field of a record has the same bits; fast, for the common case."""
     a, b = logged, computed
     return (
         _NUMBERS(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat)
@@ -83,36 +77,39 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
 
 
 def find_first_difference(
-    logged: State, computed: TickRecord, peers: tuple[str, ...], same: NumberEquality
+    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality
 ) -> RecordDifference | None:
     """Returns the first field in which a record differs from an execution, or None.
 
     Args:
         logged: the record.
-        computed: what `Site.step` returned.
+        computed: the output of `Site.step`.
         peers: the site's peers in scenario order.
-        same: when two numbers are the same.
+        equal: criterion for two numbers.
     """
 
-    def differs(field: str, a: Any, b: Any) -> RecordDifference:
+    def differ(field: str, a: Any, b: Any) -> RecordDifference:
         return RecordDifference(logged.site, logged.tick, field, a, b)
 
-    plain = (("tick", computed.tick), ("t_ns", computed.t_ns), ("mode", computed.mode.name.lower()))
-    for field, value in plain:
+    for field, value in (
+        ("tick", computed.tick),
+        ("t_ns", computed.t_ns),
+        ("mode", computed.mode.name.lower()),
+    ):
         if getattr(logged, field) != value:
-            return differs(field, getattr(logged, field), value)
+            return differ(field, getattr(logged, field), value)
     for field in STATE_VECTORS:
         for n, (a, b) in enumerate(zip(getattr(logged, field), getattr(computed, field), strict=True)):
-            if not same(float(a), b):
-                return differs(f"{field}[{n}]", float(a), b)
+            if not equal(float(a), b):
+                return differ(f"{field}[{n}]", float(a), b)
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
         if logged.used.get(peer) != used.get(peer):
-            return differs(f"used[{peer}]", logged.used.get(peer), used.get(peer))
+            return differ(f"used[{peer}]", logged.used.get(peer), used.get(peer))
     if logged.rx_crc != computed.rx_crc:
-        return differs("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
+        return differ("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
     if logged.cmd != computed.cmd:
-        return differs("cmd", logged.cmd, computed.cmd)
-    if not _equal_lists(logged.mem, computed.mem, same):
-        return differs("mem", logged.mem, computed.mem)
+        return differ("cmd", logged.cmd, computed.cmd)
+    if not _equal_lists(logged.mem, computed.mem, equal):
+        return differ("mem", logged.mem, computed.mem)
     return None

@@ -20,11 +20,11 @@ from ..scenario.laws import ImportedLaw
 
 
 def check_fusable(scenario: Scenario) -> None:
-    """Refuses what the compiled loop cannot run.
+    """Refuses a scenario that the compiled loop cannot run.
 
     Raises:
-        ScenarioError: an arm is outside of the program, a law is somebody's own Python, or a site is so much
-            slower than another that one of its ticks would take in too many samples.
+        ScenarioError: an arm is external, a law is written in Python, or a site is so much slower than
+            another that too many samples would arrive in one of its ticks.
     """
     for name, spec in scenario.sites.items():
         if spec.plant == "external":
@@ -56,14 +56,14 @@ def _largest_ratio(scenario: Scenario) -> int:
 
 
 class FusedRun:
-    """A run of all sites of a scenario, from its beginning on.
+    """A run of all sites of a scenario.
 
     Args:
         scenario: the experiment.
-        apart_rad: an |e| of this or more is not at rest, see `settled_s`.
+        apart_rad: smallest |e| that counts as not settled, see `settled_s`.
 
     Raises:
-        ScenarioError: see `check_fuses`.
+        ScenarioError: see `check_fusable`.
     """
 
     def __init__(self, scenario: Scenario, apart_rad: float = 0.01) -> None:
@@ -72,9 +72,9 @@ class FusedRun:
         self._apart_rad = apart_rad
         self._tables = stack_site_arrays([scenario.setup(name) for name in scenario.names])
         count = len(scenario.names)
-        self._courses: RowArray = np.zeros(count, PROGRESS_DTYPE)
-        self._courses["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
-        self._courses["apart_ns"] = self._courses["diverged_ns"] = -1
+        self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
+        self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
+        self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
         kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
         self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
@@ -82,51 +82,49 @@ class FusedRun:
         self.ran_s = 0.0
 
     def advance(self, until_s: float) -> None:
-        """Goes on until the run has lasted a time; a run that diverged stays where it is.
-
-        Args:
-            until_s: how long a scenario of this length would run, s.
-        """
+        """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays as it is."""
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
-        course: Row
-        for course in self._courses:
-            course.ticks = max(1, round(until_s * course.rate_hz))
-            if course.tick < course.ticks:
-                course.t_ns = tick_ns(course.tick, course.rate_hz)
+        progress: Row
+        for progress in self._progress:
+            progress.ticks = max(1, round(until_s * progress.rate_hz))
+            if progress.tick < progress.ticks:
+                progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
         buckets = math.ceil(until_s * BUCKETS_PER_S) + 1
-        grown = np.full((len(self._courses), buckets, 2), -1.0)
+        grown = np.full((len(self._progress), buckets, 2), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
-        run_until(last_ns, self._apart_rad, self._courses, self._taken, self._sent, self._peaks, self._tables)
+        run_until(
+            last_ns, self._apart_rad, self._progress, self._taken, self._sent, self._peaks, self._tables
+        )
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     @property
     def diverged_s(self) -> float | None:
-        """When the first site left its limits, s, or None."""
-        ends = [int(at) for at in self._courses["diverged_ns"] if at >= 0]
+        """Time at which the first site left its limits, s, or None."""
+        ends = [int(at) for at in self._progress["diverged_ns"] if at >= 0]
         return min(ends) / NS_PER_S if ends else None
 
     @property
     def settled_s(self) -> float | None:
-        """Since when every |e| is below `apart_rad`, s; None where one is not at the end."""
-        last = max(range(len(self._courses)), key=lambda n: int(self._courses[n]["apart_ns"]))
-        course: Row = self._courses[last]
-        if course.apart_ns < 0:
+        """Time from which on every |e| is below `apart_rad`, s; None if one is not at the end."""
+        last = max(range(len(self._progress)), key=lambda n: int(self._progress[n]["apart_ns"]))
+        progress: Row = self._progress[last]
+        if progress.apart_ns < 0:
             return 0.0
-        ended = course.apart_ns == tick_ns(course.tick - 1, course.rate_hz)
-        return None if ended else float(course.apart_ns) / NS_PER_S
+        ended = progress.apart_ns == tick_ns(progress.tick - 1, progress.rate_hz)
+        return None if ended else float(progress.apart_ns) / NS_PER_S
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest |e|, rad, and |qd|, rad/s, of every site's buckets until now, shape (buckets, 2) each.
+        """Largest |e|, rad, and |qd|, rad/s, per 50 ms bucket of each site, shape (buckets, 2) each.
 
-        -1 where a bucket has no record of that site; the last one may be incomplete.
+        -1 marks a bucket without a record of that site; the last one may be incomplete.
         """
         return tuple(
-            self._peaks[n, : (int(course["tick"]) - 1) * BUCKETS_PER_S // int(course["rate_hz"]) + 1]
-            for n, course in enumerate(self._courses)
+            self._peaks[n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1]
+            for n, progress in enumerate(self._progress)
         )
 
     @property
@@ -146,9 +144,9 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Every site's last record, floats in the order of `kernel.EMITTED`, shape (N, 17)."""
+        """Last record of each site, floats in the order of `kernel.EMITTED`, shape (N, 17)."""
         rows = [
-            self._sent[n, (int(course["tick"]) - 1) % self._sent.shape[1]]["row"]
-            for n, course in enumerate(self._courses)
+            self._sent[n, (int(progress["tick"]) - 1) % self._sent.shape[1]]["row"]
+            for n, progress in enumerate(self._progress)
         ]
         return np.array(rows)

@@ -15,13 +15,7 @@ from .virtual_comparison import RecordComparison, compare_with_virtual
 
 
 class CheckLine(NamedTuple):
-    """What a check of a log showed, in words.
-
-    Attributes:
-        label: what was checked.
-        text: how it came out.
-        passed: whether it is as it should be.
-    """
+    """The result of one check of a log, in words: its subject, its outcome, and whether it passed."""
 
     label: str
     text: str
@@ -31,93 +25,84 @@ class CheckLine(NamedTuple):
 MAX_GAPS_NAMED = 60
 """Gaps that a line names."""
 RECORDS_LABEL = "records"
-"""The label of the line that says how many records there are."""
+"""Label of the line with the number of records."""
 
 
 class LogCheckReport(NamedTuple):
-    """What executing a log again showed.
+    """The result of executing a log again.
 
     Attributes:
-        verdict: every site executed from its records.
+        result: every site executed from its records.
         lines: that and the other checks, a line each.
     """
 
-    verdict: VerifyResult
+    result: VerifyResult
     lines: list[CheckLine]
 
     @property
     def passed(self) -> bool:
-        """True where every execution agreed with the log, complete or not."""
+        """True if every execution agreed with the log, complete or not."""
         return all(line.passed for line in self.lines)
 
-    def facts(self) -> dict[str, Any]:
-        """Returns the same for a program: every gap, and the first difference with both values."""
-        verdict, first = self.verdict, self.verdict.first
+    def to_json(self) -> dict[str, Any]:
+        """Returns the report for a program: every gap, and the first difference with both values."""
+        result, first = self.result, self.result.first
         return {
             "passed": self.passed,
-            "whole_run": verdict.whole_run,
-            "records": verdict.records,
-            "identical": verdict.identical,
-            "differing": verdict.differing,
-            "unjudged": verdict.unjudged,
-            "gaps": [{"site": site, "first": a, "last": b} for site, a, b in verdict.gaps],
+            "whole_run": result.whole_run,
+            "records": result.records,
+            "identical": result.identical,
+            "differing": result.differing,
+            "unjudged": result.unjudged,
+            "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
             "first_difference": None
             if first is None
-            else {
-                "site": first.site,
-                "tick": first.tick,
-                "field": first.field,
-                "logged": repr(first.logged),
-                "computed": repr(first.computed),
-            },
+            else {**first._asdict(), "logged": repr(first.logged), "computed": repr(first.computed)},
             "checks": [line._asdict() for line in self.lines],
         }
 
 
 def run_log_checks(log: Log, *, virtual: bool, progress: Progress | None = None) -> LogCheckReport:
-    """Returns what executing a log again showed.
+    """Executes a log again, and compares it with virtual time if `virtual` is set.
 
-    Args:
-        log: the log.
-        virtual: whether to compare it with virtual time as well.
-        progress: told how many records are done, and how many there are.
+    An incomplete log is reported and does not fail: its execution shows nothing wrong.
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: a law from outside is not there.
+        ScenarioError: the file of a user law does not exist.
     """
-    verdict = verify(log, progress)
-    lines = list(_checks(log, verdict, virtual=virtual, progress=progress))
-    # whether a log is complete is not what its execution shows: reported, and no failure of it
+    result = verify(log, progress)
+    lines = list(_checks(log, result, virtual=virtual, progress=progress))
     return LogCheckReport(
-        verdict, [line._replace(passed=True) if line.label == RECORDS_LABEL else line for line in lines]
+        result, [line._replace(passed=True) if line.label == RECORDS_LABEL else line for line in lines]
     )
 
 
 def check_log_files(sources: Sequence[str]) -> list[CheckLine]:
-    """Returns a line per check of a log in files; a law from outside that is not there is one that failed."""
+    """Returns a line per check of a log in files; a user law whose file does not exist fails one."""
     log = open_log(*sources)
     try:
         return list(_checks(log, verify(log), virtual=True))
-    except ScenarioError as error:  # a law from outside that is not there
+    except ScenarioError as error:
         return [_records_line(log), CheckLine("executed again", f"cannot be: {error}", False)]
 
 
 def _checks(
-    log: Log, verdict: VerifyResult, *, virtual: bool, progress: Progress | None = None
+    log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None = None
 ) -> Iterator[CheckLine]:
+    recorded = _describe_recorded_sites(log)
     yield _records_line(log)
-    yield from (CheckLine("law from outside", str(law), True) for law in find_user_laws(log.scenario))
-    yield _verify_line(verdict, _recorded_sites(log))
+    yield from (CheckLine("user law", str(law), True) for law in find_user_laws(log.scenario))
+    yield _verify_line(result, recorded)
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield CheckLine("scenario", "is not the one whose hash the log names: it was changed", False)
-    if virtual and (standing := _recorded_sites(log)):
-        yield CheckLine("virtual time", f"is another run: {standing} as recorded, and did not react", True)
+    if virtual and recorded:
+        yield CheckLine("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
     elif virtual:
         twins = compare_with_virtual(log, progress)
         yield _virtual_line("virtual time fed with the log's arrivals", twins.fed, None)
         why = "a link was measured, not modelled" if log.scenario.measured else ""
-        why = "an arm was outside of the program" if log.scenario.external else why
+        why = "an arm was external" if log.scenario.external else why
         if why and log.driver != "virtual":
             yield CheckLine("plain virtual time", f"is another run: {why}", True)
             return
@@ -128,14 +113,13 @@ def _checks(
 
 
 def _records_line(log: Log) -> CheckLine:
-    """Says how many records there are of how many."""
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
     have = sum(len(log[name]) for name in log.sites)
     want = sum(made.get(name, 0) for name in log.sites)
     silent = [name for name in log.sites if name not in made]
     text = f"{have}/{want} in the file" if not silent else f"{have} in the file"
     if silent:
-        text += f"; {', '.join(silent)} never said how many ticks were made"
+        text += f"; {', '.join(silent)} did not report the number of its ticks"
     if log.damaged:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
@@ -143,30 +127,30 @@ def _records_line(log: Log) -> CheckLine:
     return CheckLine(RECORDS_LABEL, text, not silent and have == want and log.complete)
 
 
-def _recorded_sites(log: Log) -> str:
-    """Says which sites an open-loop rerun did not execute, if the log is one; "" where all can be."""
+def _describe_recorded_sites(log: Log) -> str:
+    """Names the sites that an open-loop rerun did not execute, with their verb; "" if there are none."""
     others = [name for name in log.sites if name not in find_executed_sites(log)]
     return f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
 
 
-def _verify_line(verdict: VerifyResult, standing: str) -> CheckLine:
-    how = "whole runs, bit for bit" if verdict.whole_run else "tick by tick to 1e-9: another platform made it"
-    text = f"{verdict.identical}/{verdict.records} records identical ({how})"
-    if verdict.gaps:
-        text += f"; no records of {_gaps_text(verdict.gaps)}"
-    if standing:
-        text += f"; {standing} as recorded, against other samples than the file has"
-    if verdict.unjudged:
-        text += f"; {verdict.unjudged} behind gaps could not be judged"
-    if verdict.first:
-        text += f"; {verdict.differing} differ, the first: {verdict.first}"
-    if not verdict.records:
+def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
+    how = "whole runs, bit for bit" if result.whole_run else "tick by tick to 1e-9: another platform made it"
+    text = f"{result.identical}/{result.records} records identical ({how})"
+    if result.gaps:
+        text += f"; no records of {_gaps_text(result.gaps)}"
+    if recorded:
+        text += f"; {recorded} as recorded, against other samples than the file has"
+    if result.unjudged:
+        text += f"; {result.unjudged} behind gaps could not be judged"
+    if result.first:
+        text += f"; {result.differing} differ, the first: {result.first}"
+    if not result.records:
         return CheckLine("executed again", "no records to execute", False)
-    return CheckLine("executed again", text, verdict.passed)
+    return CheckLine("executed again", text, result.passed)
 
 
 def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Names every gap, by site; of very many the first ones."""
+    """Names every gap by site, up to MAX_GAPS_NAMED."""
     texts = []
     left = MAX_GAPS_NAMED
     for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):
@@ -179,7 +163,7 @@ def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
 
 
 def _virtual_line(label: str, comparison: RecordComparison, late_from: int | None) -> CheckLine:
-    """A difference is excused only from the tick at which the first late sample was due."""
+    """Excuses a difference only from the tick at which the first late sample was due."""
     first = comparison.first
     text = f"{comparison.identical}/{comparison.records} records identical"
     if first is None:

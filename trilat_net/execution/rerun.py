@@ -8,7 +8,6 @@ network of the log. Without changes both give the log, bit for bit. Both sides o
 same instants: records of the log that the rerun executed too.
 """
 
-import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_log import write_rerun_log
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .verify import find_executed_sites, find_user_laws
+from .virtual import open_in_memory
 from .virtual_network import Deliveries
 
 
@@ -45,23 +45,23 @@ class LogAndRerun(NamedTuple):
 
 
 class SiteEffect(NamedTuple):
-    """What became of one site. Figures are None where nothing could be compared.
+    """The effect of a rerun on one site. Figures are None if nothing could be compared.
 
     Attributes:
-        site: which site.
-        executed: ticks that were executed.
-        compared: of those, the ones of whose time there is a record in the log.
-        identical: of those, the ones of which every computed field has the same bits (where something is
-            changed: but for the sum of what arrived).
+        site: the site.
+        executed: executed ticks.
+        compared: of those, the ones at whose time the log has a record.
+        identical: of those, the ones of which every computed field has the same bits (with changes: except
+            the CRC of the arrivals).
         stands: records of the log that stand, since too little is known to execute them.
-        assumed: ticks executed that have no record: what arrived then is assumed.
-        lacking: samples that arrived and are not in the log: without them.
-        first: the first difference, or None; where rates changed there is none to tell.
-        diverged_at_s: when it left its limits; None where it did not.
-        q_rms_rad: root mean square of q here minus q in the log, of the joint where it is largest.
+        assumed: executed ticks without a record: their arrivals are assumed.
+        lacking: samples that arrived and are not in the log.
+        first: the first difference, or None; also None if rates changed.
+        diverged_at_s: time at which it left its limits, or None.
+        q_rms_rad: root mean square of q minus q in the log, of the joint for which it is largest.
         q_max_rad: the largest such difference.
-        q_max_at_s: when that was.
-        error_rms_rad: root mean square of e, Eq. (9), of the joint where it is largest.
+        q_max_at_s: its time.
+        error_rms_rad: root mean square of e, Eq. (9), of the joint for which it is largest.
         error_max_rad: largest |e|.
         torque_max_nm: largest |tau|, Eq. (13).
     """
@@ -84,12 +84,12 @@ class SiteEffect(NamedTuple):
 
 
 class LinkEffect(NamedTuple):
-    """How old the sample in use was on one link of a site that was executed, where both had one.
+    """Age of the sample in use on one link of an executed site, over the ticks at which both had one.
 
     Attributes:
         link: as in "m1->s".
-        age_mean_ms: averaged over the ticks, ms.
-        age_max_ms: the largest, ms.
+        age_mean_ms: mean over the ticks, ms.
+        age_max_ms: maximum, ms.
     """
 
     link: str
@@ -98,47 +98,57 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True where samples were of another age than in the log."""
+        """True if samples had another age than in the log."""
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
 
 def compare_site_rerun(
-    log: Log, premise: RerunRequest, actor: RerunSite, came: Deliveries, made: Sequence[RerunTick]
+    log: Log, request: RerunRequest, site: RerunSite, deliveries: Deliveries, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns what became of one site, and of the links that it receives over.
+    """Returns the effect of a rerun on one site, and on the links over which it receives.
 
     Args:
         log: the log.
-        premise: what was asked of it.
-        actor: the site, at the end.
-        came: what came to it.
-        made: its ticks, in order.
+        request: the rerun.
+        site: the site after its last tick.
+        deliveries: its arrivals.
+        ticks: its ticks, in order.
     """
-    before, executed = log[actor.name], [one for one in made if not one.stands]
-    rate_hz = premise.scenario.sites[actor.name].rate_hz
-    after = SiteLog(actor.name, before.peers, rate_hz, [one.payload for one in executed], "rerun")
+    before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
+    rate_hz = request.scenario.sites[site.name].rate_hz
+    after = SiteLog(site.name, before.peers, rate_hz, [tick.payload for tick in executed], "rerun")
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     last = executed[-1] if executed else None
-    counted = SiteEffect(
-        actor.name,
+    effect = SiteEffect(
+        site.name,
         executed=len(executed),
         compared=len(rows),
-        identical=sum(one.same for one in executed),
-        stands=len(made) - len(executed),
-        assumed=sum(one.tick in came.unrecorded for one in executed),
-        lacking=actor.lacking,
-        first=actor.first,
+        identical=sum(tick.same for tick in executed),
+        stands=len(ticks) - len(executed),
+        assumed=sum(tick.tick in deliveries.unrecorded for tick in executed),
+        lacking=site.lacking,
+        first=site.first,
         diverged_at_s=last.t_ns / NS_PER_S if last is not None and last.mode is Mode.DIVERGED else None,
     )
     if not len(rows):
-        return counted, []
-    links = _link_effects(log, premise, before, after, rows, rows_here)
-    with np.errstate(over="ignore"):  # a stranger's log holds any finite numbers
-        return _with_figures(counted, before, after, rows, rows_here), links
+        return effect, []
+    links = _compare_links(log, request, before, after, rows, rows_here)
+    with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
+        moved = after.q[rows_here] - before.q[rows]
+        place = int(np.abs(moved).max(axis=1).argmax())
+        errors, torques = (before.e[rows], after.e[rows_here]), (before.tau[rows], after.tau[rows_here])
+        return effect._replace(
+            q_rms_rad=_rms(moved),
+            q_max_rad=_largest(moved),
+            q_max_at_s=float(before.t_s[rows[place]]),
+            error_rms_rad=LogAndRerun(*map(_rms, errors)),
+            error_max_rad=LogAndRerun(*map(_largest, errors)),
+            torque_max_nm=LogAndRerun(*map(_largest, torques)),
+        ), links
 
 
 def _rms(values: Array) -> float:
-    """Returns the root mean square of the column where it is largest; squares of no number overflow."""
+    """Returns the largest root mean square of any column, without overflow of squares."""
     largest = _largest(values)
     if not 0.0 < largest < np.inf:
         return largest
@@ -149,37 +159,18 @@ def _largest(values: Array) -> float:
     return float(np.abs(values).max())
 
 
-def _with_figures(
-    counted: SiteEffect, before: SiteLog, after: SiteLog, rows: Ints, rows_here: Ints
-) -> SiteEffect:
-    """Returns a site's effect with its figures, of the rows of both that are of the same times."""
-    moved = after.q[rows_here] - before.q[rows]
-    place = int(np.abs(moved).max(axis=1).argmax())
-    errors = (before.e[rows], after.e[rows_here])
-    return counted._replace(
-        q_rms_rad=_rms(moved),
-        q_max_rad=_largest(moved),
-        q_max_at_s=float(before.t_s[rows[place]]),
-        error_rms_rad=LogAndRerun(*map(_rms, errors)),
-        error_max_rad=LogAndRerun(*map(_largest, errors)),
-        torque_max_nm=LogAndRerun(_largest(before.tau[rows]), _largest(after.tau[rows_here])),
-    )
-
-
-def _link_effects(
-    log: Log, premise: RerunRequest, before: SiteLog, after: SiteLog, rows: Ints, rows_here: Ints
+def _compare_links(
+    log: Log, request: RerunRequest, before: SiteLog, after: SiteLog, rows: Ints, rows_here: Ints
 ) -> list[LinkEffect]:
-    """Returns how old samples were on the links of a site; nothing of one that had none in use."""
     found = []
     for peer in before.peers:
-        then_ms = 1e3 * before.age_s(peer, log.scenario.sites[peer].rate_hz)[rows]
-        now_ms = 1e3 * after.age_s(peer, premise.scenario.sites[peer].rate_hz)[rows_here]
-        both = ~(np.isnan(then_ms) | np.isnan(now_ms))
-        if not both.any():
-            continue
-        mean = LogAndRerun(float(then_ms[both].mean()), float(now_ms[both].mean()))
-        largest = LogAndRerun(float(then_ms[both].max()), float(now_ms[both].max()))
-        found.append(LinkEffect(f"{peer}->{before.name}", mean, largest))
+        before_ms = 1e3 * before.age_s(peer, log.scenario.sites[peer].rate_hz)[rows]
+        after_ms = 1e3 * after.age_s(peer, request.scenario.sites[peer].rate_hz)[rows_here]
+        both = ~(np.isnan(before_ms) | np.isnan(after_ms))
+        if both.any():
+            mean = LogAndRerun(float(before_ms[both].mean()), float(after_ms[both].mean()))
+            largest = LogAndRerun(float(before_ms[both].max()), float(after_ms[both].max()))
+            found.append(LinkEffect(f"{peer}->{before.name}", mean, largest))
     return found
 
 
@@ -188,61 +179,53 @@ _REPR_LENGTH = 120
 
 @dataclass(frozen=True, repr=False)
 class Rerun:
-    """A log and what became of it.
+    """A log and its rerun.
 
     Attributes:
         before: the log.
-        premise: what was asked of it.
-        made: every tick that was made, in the order in which they were.
-        sites: per site that was executed what it changed.
-        links: the same of the links that these sites receive over.
+        request: the sites and changes of the rerun.
+        ticks: every executed tick, in order of execution.
+        sites: per executed site the effect.
+        links: the effect on the links over which these sites receive.
     """
 
     before: Log
-    premise: RerunRequest
-    made: list[RerunTick]
+    request: RerunRequest
+    ticks: list[RerunTick]
     sites: dict[str, SiteEffect]
     links: dict[str, LinkEffect]
 
     def __repr__(self) -> str:
-        asked = self.premise
-        changed = "; ".join(describe_rerun_changes(asked)) or "nothing changed"
-        words = f"{asked.mode}, {', '.join(asked.replaced)} executed afresh, {changed}"
+        changed = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
+        words = f"{self.request.mode}, {', '.join(self.request.replaced)} executed, {changed}"
         return f"<Rerun of {self.before.source}: {words[:_REPR_LENGTH]}>"
 
     @cached_property
     def after(self) -> Log:
-        """The rerun as a log: the sites that were executed, and the others as they were recorded."""
-        stream = io.BytesIO()
-        self.write(stream)
-        stream.seek(0)
-        return open_log(stream)
+        """The rerun as a log: the executed sites, and the others as recorded."""
+        return open_in_memory(self.write)
 
     def write(self, stream: Sink) -> None:
-        """Writes the same into a stream, which stays open.
+        """Writes the rerun as a log into a stream, which stays open.
 
         Raises:
             LogRefused: the disk refused.
         """
-        write_rerun_log(self.before, self.premise, self.made, stream)
+        write_rerun_log(self.before, self.request, self.ticks, stream)
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the same into a file, with the channels that viewers read.
-
-        Args:
-            path: the file.
-            force: whether it may replace one.
+        """Writes the rerun as a log with standard channels into a file; `force` lets it replace one.
 
         Raises:
             UsageError: the file exists, or cannot be made.
             LogRefused: the disk refused.
         """
         with open_new_log(path, force=force) as stream:
-            write_rerun_log(self.before, self.premise, self.made, stream, VIZ_HZ)
+            write_rerun_log(self.before, self.request, self.ticks, stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
-        """True where a site left its limits that had not left them in the log."""
+        """True if a site left its limits that had not left them in the log."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -250,34 +233,37 @@ class Rerun:
 
     @property
     def identical(self) -> bool:
-        """True where every record that was compared has the same bits as in the log."""
+        """True if every compared record has the same bits as in the log."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
     def broken(self) -> bool:
-        """True where it should have been the log, bit for bit, and is not."""
+        """True if the rerun must equal the log, bit for bit, and does not."""
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
-        whole = set(self.premise.replaced) <= set(find_executed_sites(self.before))
-        return same_platform and whole and not self.premise.changes and not self.identical
+        whole = set(self.request.replaced) <= set(find_executed_sites(self.before))
+        return same_platform and whole and not self.request.changes and not self.identical
 
     @property
     def notes(self) -> list[str]:
-        """What limits the answer, a sentence each."""
-        return list(_notes(self))
+        """Limits of the answer, a sentence each."""
+        return list(_describe_limits(self))
 
-    def facts(self) -> dict[str, Any]:
-        """Returns all that there is to say of it, ready for JSON; keys end in their unit."""
+    def to_json(self) -> dict[str, Any]:
+        """Returns all results, ready for JSON; keys end in their unit."""
         return {
             "log": self.before.source,
-            "mode": self.premise.mode,
-            "replaced": list(self.premise.replaced),
-            "recorded": list(self.premise.recorded),
-            "changes": [changed._asdict() for changed in self.premise.changes],
-            "without_effect": [changed.key for changed in self.premise.without_effect],
+            "mode": self.request.mode,
+            "replaced": list(self.request.replaced),
+            "recorded": list(self.request.recorded),
+            "changes": [changed._asdict() for changed in self.request.changes],
+            "without_effect": [changed.key for changed in self.request.without_effect],
             "identical": self.identical,
             "diverged": self.diverged,
-            "sites": {name: _site_facts(effect) for name, effect in self.sites.items()},
-            "links": {name: _pairs(effect._asdict()) for name, effect in self.links.items()},
+            "sites": {
+                name: {**_nested_json(effect._asdict()), "first": effect.first and effect.first._asdict()}
+                for name, effect in self.sites.items()
+            },
+            "links": {name: _nested_json(effect._asdict()) for name, effect in self.links.items()},
             "notes": self.notes,
         }
 
@@ -290,99 +276,89 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log afresh and compares them with it.
+    """Executes sites of a log again and compares them with it.
 
     Args:
-        log: the log, or where it is.
-        replace: which sites; the others stand as recorded and do not react.
-        set: what is otherwise for them, as in `{"control.Kd": 5}`.
-        closed_loop: executes all of them.
-        progress: told now and then how many ticks are made, and how many there will be at most.
+        log: the log, or its path.
+        replace: the sites to execute; the others stay as recorded and do not react.
+        set: their changes, as in `{"control.Kd": 5}`.
+        closed_loop: executes all sites.
+        progress: called now and then with the ticks done and the most there will be.
 
     Raises:
         LogError: the log cannot be read, or does not tell enough.
-        UsageError: it is not said which sites, or in two ways.
+        UsageError: the sites are not named, or in two ways.
         ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)
-    asked = resolve_rerun_request(before, names, set, closed_loop=closed_loop)
+    request = resolve_rerun_request(before, names, set, closed_loop=closed_loop)
     with process.pause_gc():
-        performance = RerunExecution(before, asked)
-        made = list(performance.run(progress))
-        by_site: dict[str, list[RerunTick]] = {name: [] for name in asked.replaced}
-        for one in made:
-            by_site[one.site].append(one)
+        execution = RerunExecution(before, request)
+        ticks = list(execution.run(progress))
+        by_site: dict[str, list[RerunTick]] = {name: [] for name in request.replaced}
+        for tick in ticks:
+            by_site[tick.site].append(tick)
         sites: dict[str, SiteEffect] = {}
         links: dict[str, LinkEffect] = {}
-        for name, ticks in by_site.items():
-            site, over = compare_site_rerun(
-                before, asked, performance.actors[name], performance.came[name], ticks
-            )
-            sites[name] = site
+        for name, own in by_site.items():
+            site, deliveries = execution.sites[name], execution.deliveries[name]
+            sites[name], over = compare_site_rerun(before, request, site, deliveries, own)
             links |= {link.link: link for link in over}
-    return Rerun(before, asked, made, sites, links)
+    return Rerun(before, request, ticks, sites, links)
 
 
-def _site_facts(effect: SiteEffect) -> dict[str, Any]:
-    first = effect.first
-    return {**_pairs(effect._asdict()), "first": None if first is None else first._asdict()}
-
-
-def _known(value: Any) -> Any:
-    """Returns a figure as JSON can hold it: one beyond all numbers is not known."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _pairs(facts: dict[str, Any]) -> dict[str, Any]:
-    """Returns facts with every pair spelt out."""
+def _nested_json(values: dict[str, Any]) -> dict[str, Any]:
+    """Returns values with every pair spelt out and every number beyond JSON as None."""
     return {
-        key: _pairs(value._asdict()) if hasattr(value, "_asdict") else _known(value)
-        for key, value in facts.items()
+        key: _nested_json(value._asdict())
+        if hasattr(value, "_asdict")
+        else None
+        if isinstance(value, float) and not math.isfinite(value)
+        else value
+        for key, value in values.items()
     }
 
 
-def _notes(again: Rerun) -> Iterator[str]:
-    log, asked = again.before, again.premise
-    if asked.recorded and asked.changes:
-        sites = " and ".join(asked.recorded)
-        are, do = ("are", "they do") if len(asked.recorded) > 1 else ("is", "it does")
+def _describe_limits(again: Rerun) -> Iterator[str]:
+    log, request = again.before, again.request
+    if request.recorded and request.changes:
+        sites = " and ".join(request.recorded)
+        are, do = ("are", "they do") if len(request.recorded) > 1 else ("is", "it does")
         yield f"{sites} {are} as recorded: nothing is changed there, and {do} not react"
-    if others := [name for name in asked.replaced if name not in find_executed_sites(log)]:
+    if others := [name for name in request.replaced if name not in find_executed_sites(log)]:
         yield f"this file is a rerun itself: its {', '.join(others)} met samples that are not in it"
-    if not asked.changes and not again.identical and log.session.get("fingerprint") != compute_fingerprint():
+    foreign = log.session.get("fingerprint") != compute_fingerprint()
+    if foreign and not request.changes and not again.identical:
         yield "the log was made with another platform's arithmetic: equal bits cannot be expected"
     if not log.complete:
-        yield "the log was not finished: executed as far as it goes"
-    for law in find_user_laws(asked.scenario):
-        if law.changed and any(site in asked.replaced for site in law.sites):
+        yield "the log was not finished: it is executed as far as it goes"
+    for law in find_user_laws(request.scenario):
+        if law.changed and any(site in request.replaced for site in law.sites):
             yield f"executed as its file is now: {law}"
-    yield from _later_changes(again)
+    yield from _describe_later_changes(again)
     for effect in again.sites.values():
-        yield from _execution_notes(effect)
+        name = effect.site
+        if effect.stands:
+            yield f"{name}: {effect.stands} records stand as they are: too little is known to execute them"
+        if effect.assumed:
+            yield f"{name}: {effect.assumed} ticks have no record in the log: their arrivals are assumed"
+        if effect.lacking:
+            yield f"{name}: {effect.lacking} samples that arrived are not in the log: executed without them"
+        if not effect.executed:
+            yield f"{name}: nothing could be executed"
 
 
-def _later_changes(again: Rerun) -> Iterator[str]:
-    """Says where a link or a row that is otherwise is changed during the run: then that counts."""
-    keys = [changed.key for changed in again.premise.changes]
-    changes = [c.link or c.dominance for c in again.premise.scenario.timeline]
-    for name in again.premise.replaced:
+def _describe_later_changes(again: Rerun) -> Iterator[str]:
+    """Yields a note for every changed link or row that changes during the run too: then that holds."""
+    keys = [changed.key for changed in again.request.changes]
+    during = [change.link or change.dominance for change in again.request.scenario.timeline]
+    for name in again.request.replaced:
         for commands in again.before.commands(name).values():
             for command in commands:
                 peer = again.before[name].peers[command.peer]
-                changes.append(name if command.peer < 0 else f"{peer}->{name}")
-    for about in dict.fromkeys(changes):
-        prefix = f"links.{about}." if "->" in about else f"dominance.{about}."
+                during.append(name if command.peer < 0 else f"{peer}->{name}")
+    for owner in dict.fromkeys(during):
+        prefix = f"links.{owner}." if "->" in owner else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys):
-            yield f"{about} is changed during the run, in the log as here: from then on that counts"
-
-
-def _execution_notes(effect: SiteEffect) -> Iterator[str]:
-    if effect.stands:
-        yield f"{effect.site}: {effect.stands} records stand as they are: too little is known to execute them"
-    if effect.assumed:
-        yield f"{effect.site}: {effect.assumed} ticks have no record in the log: what arrived then is assumed"
-    if effect.lacking:
-        yield f"{effect.site}: {effect.lacking} samples that arrived are not in the log: done without them"
-    if not effect.executed:
-        yield f"{effect.site}: nothing could be executed"
+            yield f"{owner} changes during the run, in the log as here: from then on that holds"

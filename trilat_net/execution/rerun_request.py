@@ -12,7 +12,7 @@ import msgspec
 
 from ..errors import ScenarioError, UsageError
 from ..log.log_reader import Log
-from ..scenario import Scenario, SiteSpec, find_owner, find_site, load_scenario, parse_scenario
+from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
 
@@ -20,12 +20,12 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 
 
 class ChangedValue(NamedTuple):
-    """One value that the rerun has otherwise.
+    """One value that the rerun changes.
 
     Attributes:
         key: its dotted path in the resolved scenario.
-        before: what the log has.
-        after: what the rerun has.
+        before: its value in the log.
+        after: its value in the rerun.
     """
 
     key: str
@@ -35,15 +35,15 @@ class ChangedValue(NamedTuple):
 
 @dataclass(frozen=True)
 class RerunRequest:
-    """A rerun, as it is meant.
+    """A rerun: its sites, its scenario and its changes.
 
     Attributes:
-        original: the experiment of the log.
-        scenario: what holds in it: changed for the sites that are executed, the log's for the others.
-        replaced: the sites that are executed, in scenario order.
+        original: the scenario of the log.
+        scenario: the scenario of the rerun: changed for the executed sites, the log's for the others.
+        replaced: the executed sites, in scenario order.
         recorded: the others.
-        changes: what is otherwise than in the log.
-        without_effect: what was asked for besides, of sites that stand as recorded.
+        changes: the changed values.
+        without_effect: requested changes of recorded sites, which change nothing.
     """
 
     original: Scenario
@@ -54,29 +54,24 @@ class RerunRequest:
     without_effect: list[ChangedValue] = field(default_factory=list)
 
     @property
-    def closed(self) -> bool:
-        """True where every site is executed: then each reacts to the others."""
-        return not self.recorded
-
-    @property
     def mode(self) -> str:
-        """In a word: "closed loop" or "open loop"."""
-        return "closed loop" if self.closed else "open loop"
+        """The mode in words: "closed loop" if every site is executed, so that each reacts to the others."""
+        return "open loop" if self.recorded else "closed loop"
 
 
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Returns what is asked of a log, checked.
+    """Checks a request for a rerun and resolves its scenario.
 
     Args:
         log: the log.
         replace: the sites to execute.
-        overrides: what to change, as `load` takes it.
-        closed_loop: whether to execute all of them.
+        overrides: the changes, as `load_scenario` takes them.
+        closed_loop: whether to execute all sites.
 
     Raises:
-        UsageError: it is not said which sites to execute, or in two ways.
+        UsageError: the sites are not named, or in two ways.
         ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
     """
     original = log.scenario
@@ -85,13 +80,14 @@ def resolve_rerun_request(
         raise UsageError("--closed-loop executes every site: leave out --replace, or --closed-loop")
     if not closed_loop and not replace:
         hint = f"--replace NAME (of {', '.join(names)}), or --closed-loop for all of them"
-        raise UsageError(f"which sites are to be executed afresh? Give {hint}")
+        raise UsageError(f"which sites shall be executed? Give {hint}")
     for name in replace:
         find_site(original, name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
     _check_arms(original, replaced)
     recorded = tuple(name for name in names if name not in replaced)
-    for key in _keys(overrides):
+    for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
+        key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
         _check_key(key, replaced, recorded)
     wanted = load_scenario(original, overrides)
     _check_frame(original, wanted, recorded)
@@ -102,29 +98,22 @@ def resolve_rerun_request(
 
 
 def _check_arms(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to execute afresh a site whose arm was outside of the program."""
+    """Refuses to execute a site whose arm is external."""
     for name in original.external:
         if name in replaced:
             others = ", ".join(other for other in original.names if other not in original.external)
             raise ScenarioError(
-                "is external: how that arm would have moved otherwise is not known; execute others afresh"
+                "is external: how that arm would have moved otherwise is not known; execute other sites"
                 + (f", as in --replace {others.split(', ')[0]}" if others else ""),
                 path=f"sites.{name}.plant",
             )
 
 
-def _keys(overrides: RerunOverrides) -> list[str]:
-    """Returns the keys that overrides name; what is none is refused where they are read."""
-    if isinstance(overrides, Mapping):
-        return list(overrides)
-    return [text.partition("=")[0].strip() for text in overrides]
-
-
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a key that a rerun has no use for, and one of a site that stands as recorded."""
+    """Refuses a key that has no effect in a rerun, or that belongs to a recorded site."""
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
-        raise ScenarioError("is nothing that is executed: a rerun has no use for it", path=key)
+        raise ScenarioError("is nothing that is executed: it has no effect in a rerun", path=key)
     if group == "rate_hz" or rest.endswith(".rate_hz"):
         if recorded:
             raise ScenarioError(
@@ -135,7 +124,7 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
     member = rest.partition(".")[0]
     concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(group, "")
     if concerned in recorded:
-        why = f"{concerned} stands as recorded" + (
+        why = f"{concerned} stays as recorded" + (
             ", and a link belongs to its receiver" if group == "links" else ""
         )
         only = ", ".join(replaced)
@@ -145,7 +134,7 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 
 
 def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
-    """Refuses other sites, and a run beyond the end of the log."""
+    """Refuses other sites, other rates in an open loop, and a run beyond the end of the log."""
     if wanted.names != original.names:
         raise ScenarioError(f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites")
     if wanted.duration_s > original.duration_s:
@@ -162,18 +151,18 @@ def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) 
 
 
 def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> Scenario:
-    """Returns the wanted scenario, with all that belongs to recorded sites as it was."""
+    """Returns the wanted scenario with everything that belongs to recorded sites as in the original."""
 
-    def chosen(name: str) -> Scenario:
+    def source(name: str) -> Scenario:
         return original if name in recorded else wanted
 
     timeline = [change for change in original.timeline if find_owner(change) in recorded]
     timeline += [change for change in wanted.timeline if find_owner(change) not in recorded]
     joined = msgspec.structs.replace(
         wanted,
-        sites={name: chosen(name).sites[name] for name in original.names},
-        dominance={name: chosen(name).dominance[name] for name in original.names},
-        links={name: chosen(name.partition("->")[2]).links[name] for name in original.links},
+        sites={name: source(name).sites[name] for name in original.names},
+        dominance={name: source(name).dominance[name] for name in original.names},
+        links={name: source(name.partition("->")[2]).links[name] for name in original.links},
         timeline=tuple(sorted(timeline, key=lambda change: change.at_s)),
     )
     return parse_scenario(joined.text, original.name)
@@ -182,10 +171,9 @@ def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
     """Returns every value in which two scenarios differ."""
     before, after = (dict(_leaves(msgspec.to_builtins(scenario), "")) for scenario in (original, other))
-    keys = [*before, *(key for key in after if key not in before)]
     return [
         ChangedValue(key, before.get(key), after.get(key))
-        for key in keys
+        for key in before | after
         if before.get(key) != after.get(key)
     ]
 
@@ -199,68 +187,57 @@ def _leaves(value: Any, path: str) -> list[tuple[str, Any]]:
 _VALUE_LENGTH = 60
 
 
-def describe_rerun_changes(premise: RerunRequest) -> list[str]:
-    """Returns what is otherwise, a line for each thing, with all that it is of."""
-    owners: dict[str, list[str]] = {}
-    for what, owner, how in _parts(premise):
-        owners.setdefault(f"{what}\n{how}", []).append(owner)
-    found = []
-    for words, of in owners.items():
-        what, how = words.split("\n")
-        if what == "link":
-            every = len(of) == len(premise.scenario.links)
-            found.append(f"{'every link' if every else ', '.join(of)}: {how}")
+def describe_rerun_changes(request: RerunRequest) -> list[str]:
+    """Returns the changes in words, a line for each, with all its owners."""
+    owners: dict[tuple[str, str], list[str]] = {}
+    for subject, owner, change in _describe_parts(request):
+        owners.setdefault((subject, change), []).append(owner)
+    lines = []
+    for (subject, change), names in owners.items():
+        if subject == "link":
+            every = len(names) == len(request.scenario.links)
+            lines.append(f"{'every link' if every else ', '.join(names)}: {change}")
         else:
-            found.append(f"{what}{' of ' + ', '.join(of) if all(of) else ''}: {how}")
-    return found
+            lines.append(f"{subject}{' of ' + ', '.join(names) if all(names) else ''}: {change}")
+    return lines
 
 
-def _parts(premise: RerunRequest) -> Iterator[tuple[str, str, str]]:
-    """Yields what is otherwise, of which site or link, and how."""
-    told: set[str] = set()
-    for changed in premise.changes:
+def _describe_parts(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
+    """Yields every change: subject, the site or link that owns it, and both values in words."""
+    done: set[str] = set()
+    for changed in request.changes:
         group, _, rest = changed.key.partition(".")
         owner, _, key = rest.partition(".")
-        whole = _whole(premise, group, owner, key)
+        whole = _describe_whole(request, group, owner, key)
         if whole is None:
-            named = group == "sites"
-            yield (key, owner, _values(changed)) if named else (changed.key, "", _values(changed))
-        elif f"{group}.{owner}" not in told:
-            told.add(f"{group}.{owner}")
+            values = f"{_shorten(changed.before)} -> {_shorten(changed.after)}"
+            yield (key, owner, values) if group == "sites" else (changed.key, "", values)
+        elif f"{group}.{owner}" not in done:
+            done.add(f"{group}.{owner}")
             yield whole
 
 
-def _whole(premise: RerunRequest, group: str, owner: str, key: str) -> tuple[str, str, str] | None:
-    """Returns a link, or a law of another kind, as a whole; None where one value says it all."""
-    before, after = premise.original, premise.scenario
+def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> tuple[str, str, str] | None:
+    """Describes a link, or a law of another kind, as a whole; None if single values say it all."""
+    before, after = request.original, request.scenario
     if group == "links":
-        words = [_link(scenario, owner) for scenario in (before, after)]
-        return None if words[0] == words[1] else ("link", owner, " -> ".join(words))
+        links = [scenario.links[owner].describe() for scenario in (before, after)]
+        return None if links[0] == links[1] else ("link", owner, " -> ".join(links))
     if group == "sites" and key.startswith("control."):
-        laws = [_law(scenario.sites[owner]) for scenario in (before, after)]
-        kinds = [scenario.sites[owner].control.__struct_config__.tag for scenario in (before, after)]
-        return None if kinds[0] == kinds[1] else ("control", owner, " -> ".join(laws))
+        laws = [scenario.sites[owner].control for scenario in (before, after)]
+        kinds = [law.__struct_config__.tag for law in laws]
+        return None if kinds[0] == kinds[1] else ("control", owner, " -> ".join(map(_describe_law, laws)))
     return None
 
 
-def _link(scenario: Scenario, name: str) -> str:
-    return scenario.links[name].describe()
-
-
-def _law(site: SiteSpec) -> str:
+def _describe_law(law: msgspec.Struct) -> str:
     """Returns a law and its gains in a few words."""
-    gains = {key: _short(value) for key, value in msgspec.to_builtins(site.control).items() if key != "law"}
-    return (
-        f"{site.control.__struct_config__.tag} ({', '.join(f'{key} {text}' for key, text in gains.items())})"
-    )
+    gains = [f"{key} {_shorten(value)}" for key, value in msgspec.to_builtins(law).items() if key != "law"]
+    return f"{law.__struct_config__.tag} ({', '.join(gains)})"
 
 
-def _values(changed: ChangedValue) -> str:
-    return f"{_short(changed.before)} -> {_short(changed.after)}"
-
-
-def _short(value: object) -> str:
-    """Returns a value as a person wants to read it; a list of equal numbers as one of them."""
+def _shorten(value: object) -> str:
+    """Returns a value in a few characters; a list of equal numbers as one of them."""
     if value is None or value == () or value == []:
         return "none"
     if isinstance(value, list | tuple) and isinstance(value[0], dict):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.site_step import MAX_CHANGES, Site
-from ..core.ticks import MAX_ARRIVALS, Arrival, CoreChange, TickInput, TickRecord
+from ..core.ticks import MAX_ARRIVALS, CoreChange, TickInput
 from ..errors import LawFailed, ScenarioError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
@@ -30,18 +30,18 @@ from .difference import (
     equal_to_tolerance,
     find_first_difference,
 )
-from .resumption import Resumption, read_output, read_plant_state
+from .resumption import ArrivalEntry, RecordedInputs, read_output, read_plant_state
 
 
 @dataclass(slots=True)
 class VerifyResult:
-    """What an execution from a log showed.
+    """The result of executing a log again.
 
     Attributes:
-        whole_run: True where runs were executed whole and bits compared; False where tick by tick, to 1e-9.
+        whole_run: True if whole runs were executed and bits compared; False if tick by tick, to 1e-9.
         records: records in the log.
         identical: records of which every computed field agreed.
-        unjudged: records that nothing could be said of, behind gaps.
+        unjudged: records behind gaps that could not be judged.
         differing: records that differ.
         first: the first difference, by tick and then by site.
         gaps: missing ticks: (site, first, last).
@@ -57,23 +57,23 @@ class VerifyResult:
 
     @property
     def passed(self) -> bool:
-        """True where no record differs."""
+        """True if no record differs."""
         return self.first is None
 
-    def differ(self, difference: RecordDifference) -> None:
-        """Books a record that differs."""
+    def add_difference(self, difference: RecordDifference) -> None:
+        """Counts a record that differs."""
         self.differing += 1
         if self.first is None or difference.tick < self.first.tick:
             self.first = difference
 
 
 class LoggedUserLaw(NamedTuple):
-    """A law that a log names.
+    """A user law that a log names.
 
     Attributes:
-        code: where it is, as in "package.module:Law".
-        sites: whose law it is.
-        changed: how its file differs from the one that ran; "" where it does not.
+        code: the law, as in "package.module:Law".
+        sites: the sites that it controls.
+        changed: how its file differs from the one that ran; "" if it does not.
     """
 
     code: str
@@ -81,19 +81,15 @@ class LoggedUserLaw(NamedTuple):
     changed: str
 
     def __str__(self) -> str:
-        told = f"its file was changed, {self.changed}" if self.changed else "its file is the one that ran"
-        return f"{self.code} of {', '.join(self.sites)}; {told}"
+        file = f"its file was changed, {self.changed}" if self.changed else "its file is the one that ran"
+        return f"{self.code} of {', '.join(self.sites)}; {file}"
 
 
 def find_user_laws(scenario: Scenario, source: str = "") -> list[LoggedUserLaw]:
-    """Returns the laws from outside of a scenario; nothing of them runs.
-
-    Args:
-        scenario: as a log holds it.
-        source: what errors call it.
+    """Returns the user laws of a scenario without running any code of theirs; `source` is for errors.
 
     Raises:
-        ScenarioError: the file of one is not there.
+        ScenarioError: the file of a law does not exist.
     """
     laws: dict[tuple[str, str], tuple[ImportedLaw, list[str]]] = {}
     for name, spec in scenario.sites.items():
@@ -111,17 +107,16 @@ def find_user_laws(scenario: Scenario, source: str = "") -> list[LoggedUserLaw]:
 
 
 PROGRESS_EVERY = 256
-"""Records after which one is told how many are done."""
+"""Records between two reports of progress."""
 
 
 class SiteVerifier:
     """One site, executed from its records.
 
-    While it is `assured`, the site's state follows from the records before. It is lost at a gap, and when a
-    sample comes into use that the log lacks; two records in a row bring it back. What arrived inside a gap
-    is not known: samples that no record lists are taken to have come in it (`assumed`), and as long as one
-    of them is in use a difference counts as unjudged. So it does when the sample in use is one that
-    arrived but whose own record is missing (`lacking`).
+    While it is `certain`, the site's state follows from the records before. A gap ends that, and so does the
+    use of a sample that the log lacks; two consecutive records restore it. Arrivals inside a gap are unknown:
+    samples that no record lists are assumed to have arrived there, and while one of them is in use a
+    difference counts as unjudged. The same holds for a sample that arrived but whose own record is missing.
     """
 
     def __init__(
@@ -131,187 +126,148 @@ class SiteVerifier:
         changes: Mapping[int, Sequence[str]],
         by_tick: Mapping[str, Mapping[int, State]],
         ends: Mapping[str, int],
-        verdict: VerifyResult,
+        result: VerifyResult,
     ) -> None:
         self._site = Site(scenario.setup(site_log.name))
-        self._scenario, self._log = scenario, site_log
+        self._scenario, self._log, self._result = scenario, site_log, result
         self._external = site_log.name in scenario.external
         self._law_failed = False
-        self._changes = sorted(changes.items())
-        self._peers = site_log.peers
-        self._by_tick = [by_tick[peer] for peer in site_log.peers]
+        self._samples = [by_tick[peer] for peer in site_log.peers]
         self._ends = [ends[peer] for peer in site_log.peers]
         self._own_end = ends[site_log.name]
-        self._verdict = verdict
-        self._same = equal_bits if verdict.whole_run else equal_to_tolerance
-        self._assured = True
-        self._resumption = Resumption(site_log, self._by_tick, self._ends)
+        self._equal = equal_bits if result.whole_run else equal_to_tolerance
+        self._certain = True
+        self._inputs = RecordedInputs(site_log, self._samples, self._ends, changes)
 
-    def run(self, told: Callable[[int], None] | None = None) -> None:
-        """Executes every record.
-
-        Args:
-            told: told now and then how many are done.
-        """
-        verdict, states = self._verdict, self._log.states
+    def run(self, report: Callable[[int], None] | None = None) -> None:
+        """Executes every record; `report` gets the number of records of all sites so far, now and then."""
+        result, states, name = self._result, self._log.states, self._log.name
         expected = 0
         for n, state in enumerate(states):
-            if told is not None and n % PROGRESS_EVERY == 0:
-                told(n)
-            verdict.records += 1
+            if report is not None and n % PROGRESS_EVERY == 0:
+                report(result.records)
+            result.records += 1
             if state.tick == expected - 1:
-                verdict.differ(RecordDifference(state.site, state.tick, "tick", state.tick, expected))
+                result.add_difference(RecordDifference(state.site, state.tick, "tick", state.tick, expected))
                 continue
             if state.tick != expected:
-                verdict.gaps.append((self._log.name, expected, state.tick - 1))
-                self._assured = False
+                result.gaps.append((name, expected, state.tick - 1))
+                self._certain = False
             expected = state.tick + 1
             try:
-                if self._law_failed or (not self._assured and not self._resume(n)):
-                    verdict.unjudged += 1
-                    continue
-                self._judge(n, state)
+                if self._law_failed or not (self._certain or self._resume(n)):
+                    result.unjudged += 1
+                else:
+                    self._verify_record(n, state)
             except LawFailed as failed:
                 self._law_failed = True
-                verdict.differ(describe_law_failure(failed)._replace(tick=state.tick))
+                result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
         if expected <= self._own_end:
-            verdict.gaps.append((self._log.name, expected, self._own_end))
-
-    def _judge(self, n: int, state: State) -> None:
-        """Steps one tick and compares."""
-        verdict = self._verdict
-        states = self._log.states
-        if not verdict.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
-            before, last = (read_output(states[m], self._peers) for m in (n - 2, n - 1))
-            self._site.resume(before, last)
-        arrivals, missing = self._arrivals(state)
-        commands, strange = self._commands(state.tick)
-        tick = TickInput(state.tick, arrivals, commands, read_plant_state(state) if self._external else None)
-        if missing is not None and missing.field != "":
-            strange = strange or missing
-        if strange is not None:
-            verdict.differ(strange)
-            self._site.step(tick)
-            return
-        output = self._site.step(tick)
-        if missing is not None:  # the log lacks a sample that came in: its CRC cannot be checked
-            output = output._replace(rx_crc=state.rx_crc)
-        if state.boot != states[0].boot:
-            verdict.differ(RecordDifference(self._log.name, state.tick, "boot", state.boot, states[0].boot))
-        elif state.site != self._log.name:
-            verdict.differ(RecordDifference(self._log.name, state.tick, "site", state.site, self._log.name))
-        elif equal_record(state, output, self._peers):
-            verdict.identical += 1
-        elif difference := find_first_difference(state, output, self._peers, self._same):
-            self._book(state, output, difference)
-        else:
-            verdict.identical += 1
-
-    def _commands(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that have not been ordered yet; one that is none differs."""
-        commands: list[CoreChange] = []
-        while self._changes and self._changes[0][0] <= tick:
-            named, texts = self._changes.pop(0)
-            for text in texts:
-                try:
-                    commands.append(parse_core_change(self._scenario, self._log.name, text))
-                except ScenarioError:
-                    valid = "a change of one of its links or of its shares"
-                    return commands, RecordDifference(self._log.name, named, "cmd", text, valid)
-        return commands[:MAX_CHANGES], None
-
-    def _book(self, state: State, output: TickRecord, difference: RecordDifference) -> None:
-        if self._resumption.in_doubt(state, output):
-            self._verdict.unjudged += 1
-            self._assured = False
-        else:
-            self._verdict.differ(difference)
-
-    def _arrivals(self, state: State) -> tuple[list[Arrival], RecordDifference | None]:
-        """Returns what a record says came in, with the samples of its peers' records.
-
-        A sample that no record of the log can be is a difference; one whose record is merely missing is
-        told by a difference without a field.
-        """
-        arrivals: list[Arrival] = []
-        lacking = None
-        for peer, tick, latency_us in state.rx:
-            if not 0 <= peer < len(self._peers):
-                return arrivals, RecordDifference(
-                    state.site, state.tick, "rx (peer)", peer, "an index of a peer"
-                )
-            sample = self._by_tick[peer].get(tick)
-            if sample is not None:
-                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x))
-            elif 0 <= tick <= self._ends[peer]:
-                self._resumption.lacking[peer].add(tick)
-                lacking = RecordDifference(state.site, state.tick, "", tick, None)
-            else:
-                valid = f"a tick from 0 to {self._ends[peer]}"
-                return arrivals, RecordDifference(
-                    state.site, state.tick, f"rx[{self._peers[peer]}]", tick, valid
-                )
-        return arrivals[:MAX_ARRIVALS], lacking
+            result.gaps.append((name, expected, self._own_end))
 
     def _resume(self, n: int) -> bool:
-        """Brings the site to where record n finds it, if the two records before it stand in a row."""
-        if not self._resumption.possible(n):
+        if not self._inputs.can_resume(n):
             return False
-        for command in self._commands(self._log.states[n].tick - 1)[0]:  # given in the gap
-            self._site.order(command)
-        self._resumption.place(self._site, n)
-        self._assured = True
+        for change in self._parse_changes(self._log.states[n].tick - 1)[0]:  # ordered in the gap
+            self._site.order(change)
+        self._inputs.resume(self._site, n)
+        self._certain = True
         return True
+
+    def _verify_record(self, n: int, state: State) -> None:
+        """Executes the tick of record n and compares the result with the record."""
+        result, states, peers = self._result, self._log.states, self._log.peers
+        if not result.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
+            self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
+        entries, invalid = self._check_arrivals(state)
+        arrivals, lacking = self._inputs.arrivals(entries)
+        changes, invalid_change = self._parse_changes(state.tick)
+        plant = read_plant_state(state) if self._external else None
+        output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
+        if lacking:  # the CRC of a sample that the log lacks cannot be checked
+            output = output._replace(rx_crc=state.rx_crc)
+        difference = invalid_change or invalid or self._compare_sender(state)
+        if difference is None and not equal_record(state, output, peers):
+            difference = find_first_difference(state, output, peers, self._equal)
+            if difference is not None and self._inputs.in_doubt(state, output):
+                result.unjudged += 1
+                self._certain = False
+                return
+        if difference is None:
+            result.identical += 1
+        else:
+            result.add_difference(difference)
+
+    def _compare_sender(self, state: State) -> RecordDifference | None:
+        boot, name = self._log.states[0].boot, self._log.name
+        if state.boot != boot:
+            return RecordDifference(name, state.tick, "boot", state.boot, boot)
+        return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
+
+    def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
+        """Returns the changes up to a tick that were not executed yet; an invalid one is a difference."""
+        changes: list[CoreChange] = []
+        for named, text in self._inputs.take_changes(tick):
+            try:
+                changes.append(parse_core_change(self._scenario, self._log.name, text))
+            except ScenarioError:
+                valid = "a change of one of its links or of its shares"
+                return changes, RecordDifference(self._log.name, named, "cmd", text, valid)
+        return changes[:MAX_CHANGES], None
+
+    def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
+        """Returns the arrivals of a record up to the first that no peer can have sent, which differs."""
+        for n, (peer, tick, _) in enumerate(state.rx):
+            if not 0 <= peer < len(self._samples):
+                invalid = RecordDifference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
+                return state.rx[:n], invalid
+            if tick not in self._samples[peer] and not 0 <= tick <= self._ends[peer]:
+                valid, where = f"a tick from 0 to {self._ends[peer]}", f"rx[{self._log.peers[peer]}]"
+                return state.rx[:n], RecordDifference(state.site, state.tick, where, tick, valid)
+        return state.rx, None
 
 
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Entry of a session's metadata, of a log that a rerun wrote: the sites whose records follow from it."""
+"""Entry of the session's metadata in a log that a rerun wrote: the sites that it executed."""
 
 
 def verify(log: Log, progress: Progress | None = None) -> VerifyResult:
-    """Executes every site of a log again.
-
-    Args:
-        log: the log.
-        progress: told how many records are done, and how many there are.
+    """Executes every site of a log again; `progress` gets the records done and their total.
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: a law from outside is not there.
+        ScenarioError: the file of a user law does not exist.
     """
-    verdict = VerifyResult(whole_run=log.session.get("fingerprint") == compute_fingerprint())
+    result = VerifyResult(whole_run=log.session.get("fingerprint") == compute_fingerprint())
     with process.pause_gc():
         by_tick = {name: log[name].by_tick for name in log.sites}
         ends = find_last_ticks(log)
         sites = find_executed_sites(log)
         total = sum(len(log[name]) for name in sites)
+        report = None if progress is None else lambda done: progress(done, total)
         for name in sites:
-            told = None if progress is None else _offset_progress(progress, verdict.records, total)
-            SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, ends, verdict).run(told)
-    return verdict
-
-
-def _offset_progress(progress: Progress, before: int, total: int) -> Callable[[int], None]:
-    return lambda done: progress(before + done, total)
+            verifier = SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, ends, result)
+            verifier.run(report)
+    return result
 
 
 def find_executed_sites(log: Log) -> tuple[str, ...]:
     """Returns the sites whose records can be executed from the file.
 
-    All of them, but in an open-loop rerun: there the others stand as they were recorded against sites that
-    were otherwise.
+    All of them, except in an open-loop rerun: the records of its other sites were made against sites that the
+    file does not hold.
     """
     named = log.session.get(EXECUTED_SITES_KEY)
     return tuple(name for name in log.sites if named is None or name in named.split())
 
 
 def find_last_ticks(log: Log) -> dict[str, int]:
-    """Returns the last tick that each site is known to have made, -1 where nothing is known.
+    """Returns the last tick that each site is known to have made, -1 if none is known.
 
-    By its own word at the end; where it never said one, by its records and by what its peers had from it.
+    The event at its end tells; without one, its records and those of its peers.
     """
     most = {name: log.scenario.ticks(name) for name in log.sites}
-    said = {
+    announced = {
         event.member: min(max(event.ticks, 0), most[event.member]) - 1
         for event in log.events
         if event.kind == "end" and event.member in most
@@ -319,10 +275,10 @@ def find_last_ticks(log: Log) -> dict[str, int]:
     last = {name: max((state.tick for state in log[name].states[-1:]), default=-1) for name in log.sites}
     for name in log.sites:
         peers = log[name].peers
-        if said.keys() >= set(peers):
+        if announced.keys() >= set(peers):
             continue
         for state in log[name].states:
             for peer, tick, _ in state.rx:
                 if 0 <= peer < len(peers) and tick < most[peers[peer]]:
                     last[peers[peer]] = max(last[peers[peer]], tick)
-    return {name: said.get(name, known) for name, known in last.items()}
+    return {name: announced.get(name, known) for name, known in last.items()}

@@ -6,40 +6,31 @@ runs of one scenario and seed give the same file, byte for byte.
 
 import bisect
 import hashlib
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from .. import process
 from ..core.site_step import Site
-from ..core.ticks import (
-    NS_PER_S,
-    Arrival,
-    CoreChange,
-    Mode,
-    PlantState,
-    TickInput,
-    TickRecord,
-    describe_divergence,
-    describe_mode,
-)
+from ..core.ticks import NS_PER_S, Arrival, CoreChange, Mode, PlantState, TickInput, TickRecord
 from ..errors import LawFailed, ScenarioError
-from ..log.accounting import Account
 from ..log.log_file import open_new_log
+from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
 from ..log.mcap_writer import Sink
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..net import topics
 from ..net.loop_stats import LoopStats
-from ..net.messages import Event
-from ..net.wire import encode, encode_state
+from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
+from .site_channels import SiteChannels, SiteEntry
 from .virtual_network import Network, PromptNetwork
 
 
 class SiteTick(NamedTuple):
-    """One tick of one site: who, what it took in, and its record."""
+    """One tick of one site: the site, its arrivals and its record."""
 
     site: Site
     arrivals: list[Arrival]
@@ -47,24 +38,22 @@ class SiteTick(NamedTuple):
 
 
 ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
-"""Per site and tick the commands that come in then."""
+"""Per site and tick the changes that take effect then."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
-"""Per site whose arm is outside of the program, and per tick, what that arm was measured to do."""
+"""Per site with an external arm, and per tick, the measured state of that arm."""
 
 
 def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
-    """Refuses what virtual time cannot run, before anything is written of it.
+    """Refuses a scenario that virtual time cannot run, before anything is written.
 
     Args:
         scenario: the experiment.
-        as_named: whether laws from outside must be the ones that it names by their hashes.
+        as_named: whether the files of user laws must have the hashes that the scenario names.
 
     Raises:
-        ScenarioError: an arm is outside of the program, or a law from outside cannot be made, or its file is
-            not the one that the scenario names.
+        ScenarioError: an arm is external, or a user law cannot be made, or its file has another hash.
     """
-    for name in scenario.external:
-        raise _external_error(name)
+    _refuse_external(scenario, {})
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
             if as_named:
@@ -72,12 +61,14 @@ def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
             Site(scenario.setup(name))
 
 
-def _external_error(site: str) -> ScenarioError:
-    return ScenarioError(
-        "is external: that arm is outside of the program, and virtual time has none; run it live, or "
-        "simulate it with plant = 'simulated'",
-        path=f"sites.{site}.plant",
-    )
+def _refuse_external(scenario: Scenario, measured: PlantSchedule) -> None:
+    for name in scenario.external:
+        if name not in measured:
+            raise ScenarioError(
+                "is external: that arm is outside of the program, and virtual time has none; run it live, or "
+                "simulate it with plant = 'simulated'",
+                path=f"sites.{name}.plant",
+            )
 
 
 def execute_virtual(
@@ -94,18 +85,16 @@ def execute_virtual(
 
     Args:
         scenario: the experiment.
-        network: what joins the sites; by default every sample arrives at the next tick.
-        commands: what is ordered from outside.
-        measured: what arms outside of the program were measured to do.
+        network: the network; by default every sample arrives at the next tick.
+        commands: changes ordered during the run.
+        measured: states of external arms.
         ends: the last tick of sites that make fewer than the scenario has.
 
     Raises:
-        ScenarioError: an arm is outside of the program, and nobody measured it.
-        LawFailed: a law from outside did.
+        ScenarioError: an arm is external and `measured` lacks it.
+        LawFailed: a user law failed.
     """
-    for name in scenario.external:
-        if name not in measured:
-            raise _external_error(name)
+    _refuse_external(scenario, measured)
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     sites = [Site(scenario.setup(name)) for name in scenario.names]
     ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
@@ -130,56 +119,29 @@ def execute_virtual(
 
 
 def virtual_boot(scenario: Scenario, site: str) -> int:
-    """Returns the boot that a site has in virtual time: a function of scenario and name."""
+    """Returns the boot of a site in virtual time: a function of scenario and name."""
     return int.from_bytes(hashlib.sha256(f"{scenario.sha256}/{site}".encode()).digest()[:8], "big")
 
 
 class _SiteLogWriter:
-    """One site's side of the log that a virtual run writes."""
+    """Writes one site's channels of a virtual run."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         self._boot = virtual_boot(scenario, site.name)
-        self._site = site
-        self._writer = writer
+        self._site, self._writer = site, writer
         self._stats = LoopStats(site, self._boot, [scenario.sites[p].rate_hz for p in site.peers])
-        self._keys = {
-            channel: topics.key(scenario.name, site.name, channel)
-            for channel in (topics.STATE, topics.LINK, topics.EVENT)
-        }
-        self._accounts = {channel: Account() for channel in self._keys}
-        self._mode = Mode.RUN
-        self.ticks = 0
+        self.channels = SiteChannels(scenario.name, site.name, self._boot, site.peers, site.rate_hz)
 
-    def write(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        """Writes one record, and what goes with it."""
+    def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
         site, t_ns, k = self._site, output.t_ns, output.tick
         payload = encode_state(site.name, self._boot, site.peers, output, arrivals, 0, 0)
-        self._accounts[topics.STATE].take(k)
-        self._writer.add(self._keys[topics.STATE], payload, t_ns, t_ns, k, output)
-        self.ticks = k + 1
-        if self._stats.due(k):
-            stats = self._stats.take(output)
-            self._accounts[topics.LINK].take(self._accounts[topics.LINK].received)
-            self._writer.add(self._keys[topics.LINK], encode(stats), t_ns, t_ns, k, stats)
-        if output.mode is not self._mode:
-            self._mode = output.mode
-            diverged = output.mode is Mode.DIVERGED
-            text = describe_divergence if diverged else describe_mode
-            self.say("diverged" if diverged else "mode", text(site.name, output), t_ns)
+        record = SiteEntry(site.name, t_ns, t_ns, topics.STATE, k, k, payload, output)
+        stats = self._stats.take(output) if self._stats.due(k) else None
+        for entry in self.channels.tick(record, output, stats):
+            self.write(entry)
 
-    def say(self, kind: str, text: str, t_ns: int) -> None:
-        """Writes one event."""
-        n = self._accounts[topics.EVENT].received
-        event = Event(
-            member=self._site.name, boot=self._boot, n=n, kind=kind, text=text, t_ns=t_ns, ticks=self.ticks
-        )
-        self._accounts[topics.EVENT].take(n)
-        self._writer.add(self._keys[topics.EVENT], encode(event), t_ns, t_ns, n, event)
-
-    def accounts(self) -> dict[str, str]:
-        """Returns the accounts of its channels, by topic."""
-        texts = {channel: account.as_text() for channel, account in self._accounts.items()}
-        return {f"/{self._keys[channel]}": f"{text}, overflowed 0" for channel, text in texts.items()}
+    def write(self, entry: SiteEntry) -> None:
+        self.channels.write(entry, self._writer)
 
 
 def write_virtual_log(
@@ -191,23 +153,23 @@ def write_virtual_log(
     *,
     as_named: bool = True,
 ) -> bool:
-    """Runs a scenario in virtual time and writes its log, which is finished whatever ends the run.
+    """Runs a scenario in virtual time and writes its log, which is finished however the run ends.
 
     Args:
         scenario: the experiment.
-        stream: where the log goes; stays open.
-        network: what joins the sites.
-        stopped: True once the run was asked to end; then the file is finished with what there is.
-        views_hz: messages a second of the standard channels beside the log's own, see `log.views`.
-        as_named: whether laws from outside must be the ones that the scenario names by their hashes.
+        stream: destination of the log; stays open.
+        network: the network; by default every sample arrives at the next tick.
+        stopped: polled; True ends the run, and the file is finished with the ticks so far.
+        views_hz: rate of the standard channels, Hz, see `log.ros2.viz_channels`.
+        as_named: see `check_virtual`.
 
     Returns:
-        True where the run stayed within its limits, False where it diverged.
+        True if the run stayed within its limits, False if it diverged.
 
     Raises:
         LogError: the disk refused.
-        ScenarioError: virtual time cannot run it; then nothing is written.
-        LawFailed: a law from outside did; the log says so.
+        ScenarioError: virtual time cannot run the scenario; nothing is written.
+        LawFailed: a user law failed; the log holds an event with the reason.
     """
     check_virtual(scenario, as_named=as_named)
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
@@ -219,25 +181,26 @@ def write_virtual_log(
             for site, arrivals, output in execute_virtual(scenario, network):
                 if site.name not in members:
                     members[site.name] = _SiteLogWriter(scenario, site, writer)
-                members[site.name].write(arrivals, output)
+                members[site.name].tick(arrivals, output)
                 within &= output.mode is not Mode.DIVERGED
                 t_ns = output.t_ns
                 if stopped():
                     break
     except LawFailed as failed:
         if failed.site not in members:
-            nobody = Site(scenario.setup(failed.site)._replace(own=None))
-            members[failed.site] = _SiteLogWriter(scenario, nobody, writer)
-        members[failed.site].say("failed", str(failed), t_ns)
+            without_law = Site(scenario.setup(failed.site)._replace(own=None))
+            members[failed.site] = _SiteLogWriter(scenario, without_law, writer)
+        member = members[failed.site]
+        member.write(member.channels.new_event("failed", str(failed), t_ns))
         raise
-    finally:  # whatever ends the run leaves a file that is finished
+    finally:  # the file is finished however the run ends
         try:
-            for name, member in members.items():
+            for member in members.values():
                 if not writer.ended:
-                    member.say("end", f"{name} made {member.ticks} ticks", t_ns)
+                    member.write(member.channels.end(t_ns))
         finally:
             writer.finish(
-                {topic: text for member in members.values() for topic, text in member.accounts().items()}
+                {key: text for member in members.values() for key, text in member.channels.accounts().items()}
             )
     return within
 
@@ -250,20 +213,26 @@ def record_virtual(
     stopped: Callable[[], bool] = lambda: False,
     views_hz: float = VIZ_HZ,
 ) -> bool:
-    """Runs a scenario in virtual time into a file; False where the run diverged.
-
-    Args:
-        scenario: the experiment.
-        path: the file.
-        force: whether it may replace one.
-        stopped: True once the run was asked to end.
-        views_hz: messages a second of the standard channels, see `log.views`; 0 for none.
+    """Runs a scenario in virtual time into a file, see `write_virtual_log`; `force` lets it replace one.
 
     Raises:
         UsageError: the file exists, or cannot be made.
-        LogRefused: the disk refused; says what is kept.
-        ScenarioError: virtual time cannot run it; then there is no file.
-        LawFailed: a law from outside did; the file is finished, with what was before.
+        LogRefused: the disk refused; the error names what is kept.
+        ScenarioError: virtual time cannot run the scenario; there is no file.
+        LawFailed: a user law failed; the file is finished with the ticks before.
     """
     with open_new_log(path, force=force) as stream:
         return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz)
+
+
+def simulate_scenario(scenario: Scenario, *, as_named: bool = True) -> Log:
+    """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
+    return open_in_memory(lambda stream: write_virtual_log(scenario, stream, as_named=as_named))
+
+
+def open_in_memory(write: Callable[[io.BytesIO], object]) -> Log:
+    """Opens the log that a function writes into memory."""
+    stream = io.BytesIO()
+    write(stream)
+    stream.seek(0)
+    return open_log(stream)

@@ -17,6 +17,7 @@ import numpy as np
 from ..core.ticks import NS_PER_S, Arrival, TickRecord
 from ..errors import LogError
 from ..log.site_log import SiteLog
+from .resumption import ArrivalEntry
 
 
 class Network(Protocol):
@@ -33,7 +34,7 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Every sample is there at the first tick of the receiver after its stamp.
+    """Every sample arrives at the first tick of the receiver after its stamp.
 
     Args:
         rates: tick rate of every site, Hz, in scenario order.
@@ -55,7 +56,7 @@ class PromptNetwork:
             queue.append(output)
 
     def ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """See `Network`. In order of time, always."""
+        """See `Network`: in order of time, always true."""
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
@@ -71,16 +72,16 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Samples arrive when a log says that they did; what they carry comes from the running sites.
+    """Samples arrive where a log says that they did; their content comes from the running sites.
 
     Args:
-        schedule: per receiver and tick the arrivals: (index of the peer, tick, latency us), in order.
-        peers: per receiver its peers in scenario order.
+        schedule: per site and tick the arrivals, as in a record's `rx`.
+        peers: per site its peers in scenario order.
     """
 
     def __init__(
         self,
-        schedule: Mapping[str, Mapping[int, Sequence[Sequence[int]]]],
+        schedule: Mapping[str, Mapping[int, Sequence[ArrivalEntry]]],
         peers: Mapping[str, Sequence[str]],
     ) -> None:
         self._schedule = schedule
@@ -92,35 +93,28 @@ class RecordedNetwork:
         self._sent[sender, output.tick] = output
 
     def ready(self, receiver: str, k: int) -> bool:
-        """See `Network`. A loop that was late took in samples of ticks that lie ahead of its own."""
+        """See `Network`. A loop that was late received samples of ticks ahead of its own."""
         peers = self._peers[receiver]
-        return all((peers[index], tick) in self._sent for index, tick, _ in self._listed(receiver, k))
-
-    def _listed(self, receiver: str, k: int) -> Sequence[Sequence[int]]:
-        return self._schedule[receiver].get(k, ())
+        return all((peers[j], tick) in self._sent for j, tick, _ in self._schedule[receiver].get(k, ()))
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """See `Network`. A sample that was never sent (the log names none of its sender's) stays away."""
+        """See `Network`. A sample that its sender never made does not arrive."""
         arrivals = []
-        for index, tick, latency_us in self._listed(receiver, k):
-            sample = self._sent.get((self._peers[receiver][index], tick))
+        for j, tick, latency_us in self._schedule[receiver].get(k, ()):
+            sample = self._sent.get((self._peers[receiver][j], tick))
             if sample is not None:
-                arrivals.append(Arrival(index, tick, sample.q, sample.qd, latency_us, sample.tau_x))
+                arrivals.append(Arrival(j, tick, sample.q, sample.qd, latency_us, sample.tau_x))
         return arrivals
 
 
-ArrivalEntry = Sequence[int]
-"""As in a record's `rx`: index of the peer, tick of its sample, us."""
-
-
 class Deliveries(NamedTuple):
-    """What comes to one site.
+    """The arrivals of one site.
 
     Attributes:
-        at: per tick what arrives, in order.
-        unrecorded: ticks between the first record and the last without one: what arrives then is assumed.
+        at: per tick the arrivals, in order.
+        unrecorded: ticks between the first record and the last without one: their arrivals are assumed.
         first: the first tick that has a record.
-        last: the last one, -1 where there is none.
+        last: the last one, -1 if there is none.
     """
 
     at: dict[int, Sequence[ArrivalEntry]]
@@ -130,31 +124,30 @@ class Deliveries(NamedTuple):
 
 
 class PeerTicks(NamedTuple):
-    """What there is to know of a peer: its tick rate, Hz, and the last tick that it made."""
+    """The tick rate of a peer, Hz, and the last tick that it made."""
 
     rate_hz: int
     last: int
 
 
 def recorded_deliveries(part: SiteLog) -> Deliveries:
-    """Returns what came to a site, by its records alone."""
+    """Returns the arrivals of a site that its records list."""
     counts, rows = part.arrivals
     entries = rows.tolist()
-    stops = np.cumsum(counts).tolist()
     at: dict[int, Sequence[ArrivalEntry]] = {}
     start = 0
-    for tick, stop in zip(part.tick.tolist(), stops, strict=True):
+    for tick, stop in zip(part.tick.tolist(), np.cumsum(counts).tolist(), strict=True):
         at[tick] = [entry for entry in entries[start:stop] if 0 <= entry[0] < len(part.peers)]
         start = stop
     return Deliveries(at, frozenset(), min(at, default=0), max(at, default=-1))
 
 
 def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveries:
-    """Returns what came to a site at every tick from its first record to its last.
+    """Returns the arrivals of a site at every tick from its first record to its last.
 
-    At ticks without a record come those samples that no record lists and that can have come there: after
-    they were sent, behind the last one before them that a record lists, before the first one after them, as
-    near as can be to when they would have come by the median of their link.
+    At ticks without a record those samples arrive that no record lists and that can have arrived there: after
+    they were sent, after the last earlier sample that a record lists, before the first later one, as near as
+    possible to the median delay of their link.
 
     Args:
         part: the site's records.
@@ -174,27 +167,27 @@ def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveri
     missing = [tick for tick in range(known.first, known.last) if tick not in at]
     assumed: dict[int, list[list[int]]] = {}
     for peer, sender in enumerate(senders):
-        for tick, entry in _assumed(known, missing, part.rate_hz, peer, sender):
+        for tick, entry in _assume_arrivals(known, missing, part.rate_hz, peer, sender):
             assumed.setdefault(tick, []).append(entry)
-    filled = at | {tick: sorted(came) for tick, came in assumed.items()}
+    filled = at | {tick: sorted(entries) for tick, entries in assumed.items()}
     return known._replace(at=filled, unrecorded=frozenset(missing))
 
 
-def _first_ticks(came: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns of every sample of a peer that came when it first did: the tick, and the us of its entry."""
+def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
+    """Returns, for every sample of a peer that arrived, its first tick of arrival and the us of its entry."""
     first: dict[int, tuple[int, int]] = {}
-    for k in sorted(came.at):
-        for j, tick, us in came.at[k]:
+    for k in sorted(deliveries.at):
+        for j, tick, us in deliveries.at[k]:
             if j == peer and tick >= 0:
                 first.setdefault(tick, (k, us))
     return first
 
 
-def _assumed(
+def _assume_arrivals(
     known: Deliveries, missing: list[int], rate_hz: int, peer: int, sender: PeerTicks
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields at which missing tick each sample of a peer came that no record lists."""
-    first = _first_ticks(known, peer)
+    """Yields the missing tick at which each sample of a peer arrived that no record lists, and its entry."""
+    first = _find_first_arrivals(known, peer)
     listed = sorted(first)
     lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // sender.rate_hz for m in listed]
     lag_ns = median_low(lags_ns) if lags_ns else NS_PER_S // rate_hz
@@ -206,42 +199,39 @@ def _assumed(
             continue
         place = bisect_left(listed, m)
         before = first[listed[place - 1]][0] if place else known.first
-        behind = first[listed[place]][0] if place < len(listed) else known.last
-        sent = m * rate_hz // sender.rate_hz + 1  # nothing comes before it was sent
-        tick = _nearest(missing, due, max(min(before, behind), sent), max(before, behind))
-        if tick is not None:
-            yield tick, [peer, m, delay_us]
-
-
-def _nearest(missing: list[int], due: int, low: int, high: int) -> int | None:
-    """Returns the missing tick from `low` to `high` that is nearest to `due`, or None."""
-    start, stop = bisect_left(missing, low), bisect_left(missing, high + 1)
-    if start >= stop:
-        return None
-    place = min(max(bisect_left(missing, due), start), stop - 1)
-    before = max(place - 1, start)
-    return min(missing[place], missing[before], key=lambda tick: abs(tick - due))
+        after = first[listed[place]][0] if place < len(listed) else known.last
+        sent = m * rate_hz // sender.rate_hz + 1  # nothing arrives before it was sent
+        start = bisect_left(missing, max(min(before, after), sent))
+        stop = bisect_left(missing, max(before, after) + 1)
+        if start < stop:
+            nearest = min(max(bisect_left(missing, due), start), stop - 1)
+            candidates = (missing[nearest], missing[max(nearest - 1, start)])
+            yield min(candidates, key=lambda tick: abs(tick - due)), [peer, m, delay_us]
 
 
 def retime_deliveries(
-    came: Deliveries, rate_hz: int, new_rate_hz: int, rates_hz: Sequence[int], new_rates_hz: Sequence[int]
+    deliveries: Deliveries,
+    rate_hz: int,
+    new_rate_hz: int,
+    rates_hz: Sequence[int],
+    new_rates_hz: Sequence[int],
 ) -> Deliveries:
-    """Returns the same network for sites that tick at other rates.
+    """Returns the arrivals over the same network for sites that tick at other rates.
 
-    A sample is under way for as long as the last sample of the log that was not stamped later, from its
-    stamp to the tick that took it in; where that one never came, it does not come either.
+    A sample is under way for as long as the last sample of the log that was not stamped later, from its stamp
+    to the tick that received it; if that one never arrived, neither does this one.
 
     Args:
-        came: what came to a site by the log.
+        deliveries: the arrivals of a site by the log.
         rate_hz: its rate in the log.
         new_rate_hz: its rate in the rerun.
         rates_hz: per peer the rate in the log.
         new_rates_hz: per peer the rate in the rerun.
     """
-    end_ns = came.last * NS_PER_S // rate_hz
+    end_ns = deliveries.last * NS_PER_S // rate_hz
     at: dict[int, list[ArrivalEntry]] = {}
     for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
-        first = _first_ticks(came, peer)
+        first = _find_first_arrivals(deliveries, peer)
         for m in range(end_ns * new_hz // NS_PER_S + 1):
             stamp_ns = m * NS_PER_S // new_hz
             model = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S

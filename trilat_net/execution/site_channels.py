@@ -1,0 +1,140 @@
+"""The channels of one site in a log that an execution writes: records, link statistics, events.
+
+Invariant: messages of older schema versions are written in the present one; a message of the present version
+keeps its bytes.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ..core.ticks import Arrival, Mode, TickRecord, describe_divergence, describe_mode
+from ..log.accounting import Account
+from ..log.log_layout import SITE_CHANNELS
+from ..log.log_writer import LogWriter
+from ..net import topics
+from ..net.loop_stats import ticks_per_stats
+from ..net.messages import VERSION, Event, LinkStats, State
+from ..net.wire import encode, encode_state
+from .resumption import read_output
+
+SENT_TIME_SINCE = 2
+"""First schema version whose records hold their sending time."""
+LAST_LOG_NS = (1 << 64) - 1
+"""Last time stamp of a file; a damaged log may hold any time."""
+
+
+class SiteEntry(NamedTuple):
+    """One message of the file.
+
+    Attributes:
+        site: its site.
+        t_ns: its time, ns since the epoch; entries are written in this order.
+        sent_ns: its sending time on the sender's clock.
+        channel: its channel, as in "state".
+        sequence: its sequence number in the file.
+        number: its number in its channel, for the account.
+        payload: its bytes.
+        message: its content.
+    """
+
+    site: str
+    t_ns: int
+    sent_ns: int
+    channel: str
+    sequence: int
+    number: int
+    payload: bytes
+    message: Any
+
+
+class SiteChannels:
+    """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts.
+
+    Args:
+        session: the session of the log that is written.
+        site: the site.
+        boot: its process start.
+        peers: its peers in scenario order.
+        rate_hz: its tick rate.
+    """
+
+    def __init__(self, session: str, site: str, boot: int, peers: tuple[str, ...], rate_hz: int) -> None:
+        self.peers = peers
+        self._site, self._boot = site, boot
+        self._every = ticks_per_stats(rate_hz)
+        self._keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
+        self._accounts = {channel: Account() for channel in SITE_CHANNELS}
+        self._mode = Mode.RUN
+        self._events = 0
+        self._t_ns = 0
+        self.ticks = 0
+
+    def tick(self, record: SiteEntry, output: TickRecord, stats: LinkStats | None) -> Iterator[SiteEntry]:
+        """Yields the entries of an executed tick: record, statistics if there are any, change of mode."""
+        self.ticks, self._t_ns = output.tick + 1, output.t_ns
+        yield record
+        if stats is not None:
+            yield self.stats(stats)
+        if output.mode is not self._mode:
+            self._mode = output.mode
+            if output.mode is Mode.DIVERGED:
+                yield self.new_event("diverged", describe_divergence(self._site, output), output.t_ns)
+            else:
+                yield self.new_event("mode", describe_mode(self._site, output), output.t_ns)
+
+    def end(self, t_ns: int | None = None) -> SiteEntry:
+        """Returns the entry of the event that ends the site's run, by default at its last tick."""
+        when_ns = self._t_ns if t_ns is None else t_ns
+        return self.new_event("end", f"{self._site} made {self.ticks} ticks", when_ns)
+
+    def new_event(self, kind: str, text: str, t_ns: int) -> SiteEntry:
+        """Returns the entry of a new event of the site."""
+        n = self._events
+        self._events += 1
+        event = Event(
+            member=self._site, boot=self._boot, n=n, kind=kind, text=text, t_ns=t_ns, ticks=self.ticks
+        )
+        return self.event(event, n)
+
+    def record(self, state: State, payload: bytes) -> SiteEntry:
+        """Returns the entry of a record of the source log."""
+        sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
+        if state.v != VERSION:
+            arrivals = [Arrival(peer, tick, (), (), us) for peer, tick, us in state.rx]
+            output = read_output(state, self.peers)
+            late_us, busy_us = state.late_us, state.busy_us
+            payload = encode_state(
+                state.site, state.boot, self.peers, output, arrivals, late_us, busy_us, sent_ns, state.echo
+            )
+        return SiteEntry(
+            self._site, state.t_ns, sent_ns, topics.STATE, state.tick, state.tick, payload, state
+        )
+
+    def stats(self, stats: LinkStats) -> SiteEntry:
+        """Returns the entry of link statistics."""
+        payload = encode(stats if stats.v == VERSION else msgspec.structs.replace(stats, v=VERSION))
+        number = stats.tick // self._every
+        return SiteEntry(self._site, stats.t_ns, stats.t_ns, topics.LINK, stats.tick, number, payload, stats)
+
+    def event(self, event: Event, n: int) -> SiteEntry:
+        """Returns the entry of an event; `n` is its number if it has none of its own."""
+        numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=n)
+        payload = encode(msgspec.structs.replace(numbered, v=VERSION))
+        t_ns = max(event.t_ns, 0)
+        return SiteEntry(self._site, t_ns, t_ns, topics.EVENT, numbered.n, numbered.n, payload, numbered)
+
+    def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
+        """Writes an entry into a log."""
+        self._accounts[entry.channel].take(entry.number)
+        log_ns = min(max(0, epoch_unix_ns + entry.t_ns), LAST_LOG_NS)
+        key = self._keys[entry.channel]
+        writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
+
+    def accounts(self) -> dict[str, str]:
+        """Returns the accounts of its channels, by topic."""
+        return {
+            f"/{self._keys[channel]}": f"{account.as_text()}, overflowed 0"
+            for channel, account in self._accounts.items()
+        }
