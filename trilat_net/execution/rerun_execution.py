@@ -149,8 +149,9 @@ class RerunSite:
 
     def _execute(self, n: int | None) -> RerunTick:
         """Steps the site and compares the result with record n of the log."""
-        arrivals, lacking = self._inputs.arrivals(self.entries)
-        self.lacking += lacking
+        arrivals, missing = self._inputs.arrivals(self.entries)
+        self._inputs.add_lacking(missing)
+        self.lacking += len(missing)
         changes = [change for _, change in self._inputs.take_changes(self.k)]
         output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes))
         stats = self._stats.take(output) if self._stats.due(self.k) else None
@@ -158,7 +159,7 @@ class RerunSite:
         if n is not None:
             state, peers = self._part.states[n], self._part.peers
             # arrivals have another CRC if peers are changed or the log lacks a sample
-            comparable = output._replace(rx_crc=state.rx_crc) if self._changed or lacking else output
+            comparable = output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
             same = equal_record(state, comparable, peers)
             if not same and not self._changed and self._inputs.in_doubt(state, output):
                 return self._keep(n)

@@ -57,7 +57,7 @@ def write_rerun_log(
     entries |= {name: _encode_executed(executed, channels[name]) for name, executed in by_site.items()}
     for entry in merge(*entries.values(), key=lambda entry: entry.t_ns):
         channels[entry.site].write(entry, writer, epoch_unix_ns)
-    writer.finish({key: text for each in channels.values() for key, text in each.accounts().items()})
+    writer.finish({key: text for each in channels.values() for key, text in each.describe_accounts().items()})
 
 
 def _read_epoch_unix_ns(log: Log) -> int:
@@ -102,5 +102,6 @@ def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iter
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         output = read_output(state, channels.peers)
-        yield from channels.tick(channels.record(state, tick.payload), output, tick.stats)
+        yield channels.record(state, tick.payload)
+        yield from channels.follow(output, tick.stats)
     yield channels.end()

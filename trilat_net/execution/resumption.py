@@ -101,18 +101,24 @@ class RecordedInputs(Generic[Change]):
             taken += [(named, change) for change in changes]
         return taken
 
-    def arrivals(self, entries: Sequence[ArrivalEntry]) -> tuple[list[Arrival], int]:
-        """Returns the arrivals that entries list, and how many more there were whose record is missing."""
+    def arrivals(self, entries: Sequence[ArrivalEntry]) -> tuple[list[Arrival], list[ArrivalEntry]]:
+        """Returns the arrivals that entries list, and the entries whose sample no record holds."""
         arrivals: list[Arrival] = []
-        lacking = 0
-        for peer, tick, latency_us in entries:
-            sample = self._samples[peer].get(tick)
+        missing: list[ArrivalEntry] = []
+        samples = self._samples
+        for entry in entries:
+            peer, tick, latency_us = entry
+            sample = samples[peer].get(tick) if 0 <= peer < len(samples) else None
             if sample is None:
-                lacking += 1
-                self.lacking[peer].add(tick)
+                missing.append(entry)
             else:
                 arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x))
-        return arrivals, lacking
+        return arrivals, missing
+
+    def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
+        """Notes samples that arrived and whose own record is missing."""
+        for peer, tick, _ in entries:
+            self.lacking[peer].add(tick)
 
     def can_resume(self, n: int) -> bool:
         """True if the two records before record n are consecutive and the samples in use are known."""
@@ -134,7 +140,8 @@ class RecordedInputs(Generic[Change]):
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))
-            arrived, _ = self.arrivals([(j, tick, 0) for tick in sorted(certain | self.assumed[j])])
+            arrived, missing = self.arrivals([(j, tick, 0) for tick in sorted(certain | self.assumed[j])])
+            self.add_lacking(missing)
             waiting += arrived
         site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
         site.resume(before, last)

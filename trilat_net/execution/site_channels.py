@@ -4,7 +4,7 @@ Invariant: messages of older schema versions are written in the present one; a m
 keeps its bytes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import msgspec
@@ -65,16 +65,18 @@ class SiteChannels:
         self._site, self._boot = site, boot
         self._every = ticks_per_stats(rate_hz)
         self._keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
-        self._accounts = {channel: Account() for channel in SITE_CHANNELS}
+        self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self._mode = Mode.RUN
         self._events = 0
         self._t_ns = 0
         self.ticks = 0
 
-    def tick(self, record: SiteEntry, output: TickRecord, stats: LinkStats | None) -> Iterator[SiteEntry]:
-        """Yields the entries of an executed tick: record, statistics if there are any, change of mode."""
+    def follow(self, output: TickRecord, stats: LinkStats | None) -> Iterable[SiteEntry]:
+        """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
         self.ticks, self._t_ns = output.tick + 1, output.t_ns
-        yield record
+        return () if stats is None and output.mode is self._mode else self._follow(output, stats)
+
+    def _follow(self, output: TickRecord, stats: LinkStats | None) -> Iterator[SiteEntry]:
         if stats is not None:
             yield self.stats(stats)
         if output.mode is not self._mode:
@@ -127,14 +129,14 @@ class SiteChannels:
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
         """Writes an entry into a log."""
-        self._accounts[entry.channel].take(entry.number)
+        self.accounts[entry.channel].take(entry.number)
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), LAST_LOG_NS)
         key = self._keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
 
-    def accounts(self) -> dict[str, str]:
+    def describe_accounts(self) -> dict[str, str]:
         """Returns the accounts of its channels, by topic."""
         return {
             f"/{self._keys[channel]}": f"{account.as_text()}, overflowed 0"
-            for channel, account in self._accounts.items()
+            for channel, account in self.accounts.items()
         }

@@ -179,12 +179,16 @@ class SiteVerifier:
         result, states, peers = self._result, self._log.states, self._log.peers
         if not result.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
             self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
-        entries, invalid = self._check_arrivals(state)
-        arrivals, lacking = self._inputs.arrivals(entries)
+        arrivals, missing = self._inputs.arrivals(state.rx)
+        invalid = None
+        if missing:
+            entries, invalid = self._check_arrivals(state)
+            arrivals, missing = self._inputs.arrivals(entries)
+            self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
         plant = read_plant_state(state) if self._external else None
         output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
-        if lacking:  # the CRC of a sample that the log lacks cannot be checked
+        if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
         difference = invalid_change or invalid or self._compare_sender(state)
         if difference is None and not equal_record(state, output, peers):

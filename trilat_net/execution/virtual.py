@@ -130,14 +130,16 @@ class _SiteLogWriter:
         self._boot = virtual_boot(scenario, site.name)
         self._site, self._writer = site, writer
         self._stats = LoopStats(site, self._boot, [scenario.sites[p].rate_hz for p in site.peers])
+        self._key = topics.key(scenario.name, site.name, topics.STATE)
         self.channels = SiteChannels(scenario.name, site.name, self._boot, site.peers, site.rate_hz)
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
         site, t_ns, k = self._site, output.t_ns, output.tick
         payload = encode_state(site.name, self._boot, site.peers, output, arrivals, 0, 0)
-        record = SiteEntry(site.name, t_ns, t_ns, topics.STATE, k, k, payload, output)
+        self.channels.accounts[topics.STATE].take(k)
+        self._writer.add(self._key, payload, t_ns, t_ns, k, output)
         stats = self._stats.take(output) if self._stats.due(k) else None
-        for entry in self.channels.tick(record, output, stats):
+        for entry in self.channels.follow(output, stats):
             self.write(entry)
 
     def write(self, entry: SiteEntry) -> None:
@@ -200,7 +202,11 @@ def write_virtual_log(
                     member.write(member.channels.end(t_ns))
         finally:
             writer.finish(
-                {key: text for member in members.values() for key, text in member.channels.accounts().items()}
+                {
+                    key: text
+                    for member in members.values()
+                    for key, text in member.channels.describe_accounts().items()
+                }
             )
     return within
 
