@@ -147,7 +147,7 @@ class LinkSummary(NamedTuple):
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
     """True where a link was said to give every sample one and the same delay, and to lose none."""
     (_, link), *later = states
-    exact = link.delay().kind == DelayKind.CONSTANT and not (link.loss or link.duplicate or link.outages_s)
+    exact = link.core().kind == DelayKind.CONSTANT and not (link.loss or link.duplicate or link.outages_s)
     return exact and not later
 
 

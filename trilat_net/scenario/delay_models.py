@@ -14,24 +14,17 @@ from msgspec import Meta
 from ..core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd
 from ..core.vectors import Points
 from .delay_traces import parse_trace
-from .fields import Frozen
+from .fields import Frozen, KeyProblem
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
-"""No delay is longer."""
+"""The longest delay."""
 
 MAX_OUTAGES = 1000
-"""Most outages of a link: each sample is held against all of them."""
+"""Most outages of a link: each sample is compared with all of them."""
 
 Milliseconds = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
-
-
-class LinkProblem(NamedTuple):
-    """What is wrong with a link: the key, and why."""
-
-    key: str
-    problem: str
 
 
 class DelayMoments(NamedTuple):
@@ -41,8 +34,16 @@ class DelayMoments(NamedTuple):
     deviation_ms: float
 
 
+def ms_to_us(milliseconds: float) -> int:
+    """Returns a time in whole microseconds (L4)."""
+    return round(milliseconds * 1_000)
+
+
+_SURE = (DelayKind.CONSTANT, DelayKind.SINE, DelayKind.TRACE, DelayKind.MEASURED)
+
+
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """What every model has besides its delay.
+    """A directed link; a subclass states its delay in the methods that begin with an underscore.
 
     Attributes:
         loss: share of samples that are lost in the long run.
@@ -62,34 +63,41 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     order: Literal["newest", "in_order"] = "newest"
     playout_ms: Milliseconds = 0.0
 
-    def delay(self) -> LinkModel:
+    def _delay(self) -> LinkModel:
         """Returns the delay alone, as the core has it."""
         raise NotImplementedError
 
-    def moments(self) -> DelayMoments:
-        """Returns what the model states of its delay, before play-out, order and the cut at `LIMIT_MS`."""
+    def _moments(self) -> tuple[float, float]:
+        """Returns mean and standard deviation of the delay, ms."""
         raise NotImplementedError
 
-    def reach_ms(self) -> float:
-        """Returns how far its delays go, ms: three deviations above the mean where they have no end."""
-        mean_ms, deviation_ms = self.moments()
+    def _reach_ms(self) -> float:
+        """Returns the longest delay, ms: three deviations above the mean if there is none."""
+        mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms
+
+    def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns a problem of the model's own keys."""
+        return None
+
+    def _describe_delay(self) -> str:
+        mean_ms, deviation_ms = self._moments()
+        return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
+
+    def moments(self) -> DelayMoments:
+        """Returns the moments of the stated delay, before play-out, order and the cut at `MAX_DELAY_MS`."""
+        return DelayMoments(*self._moments())
 
     @property
     def random(self) -> bool:
-        """True where anything of it is drawn."""
-        drawn = self.delay().kind not in (
-            DelayKind.CONSTANT,
-            DelayKind.SINE,
-            DelayKind.TRACE,
-            DelayKind.MEASURED,
-        )
+        """True if anything of it is drawn."""
+        drawn = self._delay().kind not in _SURE
         return drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
-        """True where nothing is injected."""
-        return self.delay().kind == DelayKind.MEASURED
+        """True if nothing is injected."""
+        return self._delay().kind == DelayKind.MEASURED
 
     @property
     def points(self) -> Points | None:
@@ -97,13 +105,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def core(self, from_ns: int = 0) -> LinkModel:
-        """Returns what the core builds the link from.
-
-        Args:
-            from_ns: the first stamp that it applies to, ns since the epoch.
-        """
-        good, bad, enter, leave = self._chain()
-        return self.delay()._replace(
+        """Returns the core's model of the link, which applies from the stamp `from_ns` on, ns."""
+        good, bad, enter, leave = self._loss_chain()
+        return self._delay()._replace(
             from_ns=from_ns,
             loss_good=good,
             loss_bad=bad,
@@ -114,7 +118,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             playout_us=ms_to_us(self.playout_ms),
         )
 
-    def _chain(self) -> tuple[float, float, float, float]:
+    def _loss_chain(self) -> tuple[float, float, float, float]:
         """Returns the chain of losses: loss in good and bad state, probability to enter and leave the bad.
 
         In the bad state a sample is lost with h = `loss_bad`, in the good one never. A run of losses goes
@@ -127,38 +131,38 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         bad = self.loss / self.loss_bad
         return 0.0, self.loss_bad, leave * bad / (1.0 - bad), leave
 
-    def fault(self) -> LinkProblem | None:
-        """Returns what is wrong with it that no range of a single key shows."""
+    def find_problem(self) -> KeyProblem | None:
+        """Returns a problem that no range of a single key shows, or None."""
+        if problem := self._find_delay_problem():
+            return problem
         for n, (start_s, end_s) in enumerate(self.outages_s):
             if end_s <= start_s:
-                return LinkProblem(
-                    f"outages_s[{n}]", f"must end after it begins, reads {start_s:g} to {end_s:g}"
-                )
-        if (reach_ms := self.reach_ms()) > MAX_DELAY_MS:
-            problem = f"its delays reach {reach_ms:g} ms; beyond {MAX_DELAY_MS:g} ms they would be cut off"
-            return LinkProblem("model", problem)
+                text = f"must end after it begins, reads {start_s:g} to {end_s:g}"
+                return KeyProblem(f"outages_s[{n}]", text)
+        if (reach_ms := self._reach_ms()) > MAX_DELAY_MS:
+            text = f"its delays reach {reach_ms:g} ms; beyond {MAX_DELAY_MS:g} ms they would be cut off"
+            return KeyProblem("model", text)
         if self.loss_burst and self.loss:
-            return self._burst_fault()
+            return self._find_burst_problem()
         return None
 
-    def _burst_fault(self) -> LinkProblem | None:
+    def _find_burst_problem(self) -> KeyProblem | None:
         if self.loss_burst < 1.0:
-            return LinkProblem("loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}")
+            return KeyProblem("loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}")
         if self.loss >= self.loss_bad:
-            return LinkProblem(
-                "loss", f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}"
-            )
-        _, _, enter, leave = self._chain()
+            text = f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}"
+            return KeyProblem("loss", text)
+        _, _, enter, leave = self._loss_chain()
         if leave <= 0.0:
             longest = 1.0 / (1.0 - self.loss_bad)
-            return LinkProblem("loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}")
+            return KeyProblem("loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}")
         if enter > 1.0:
-            return LinkProblem("loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}")
+            return KeyProblem("loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}")
         return None
 
     def describe(self) -> str:
-        """Returns what it does, in a few words, with the mean and deviation that its model states."""
-        words = [self._words()]
+        """Returns the link in a few words, with the mean and deviation that its model states."""
+        words = [self._describe_delay()]
         if self.loss:
             bursts = f" in bursts of {self.loss_burst:g}" if self.loss_burst else ""
             words.append(f"loss {100 * self.loss:g} %{bursts}")
@@ -170,15 +174,6 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         if self.playout_ms:
             words.append(f"play-out {self.playout_ms:g} ms")
         return ", ".join(words)
-
-    def _words(self) -> str:
-        mean_ms, deviation_ms = self.moments()
-        return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
-
-
-def ms_to_us(milliseconds: float) -> int:
-    """Returns a time in whole microseconds (L4)."""
-    return round(milliseconds * 1_000)
 
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
@@ -198,23 +193,20 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
     delay_ms: Milliseconds
     half_width_ms: Milliseconds
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms)
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: half the width over the root of 3."""
-        return DelayMoments(self.delay_ms, self.half_width_ms / math.sqrt(3.0))
+    def _moments(self) -> tuple[float, float]:
+        """Half the width over the root of 3."""
+        return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
-    def reach_ms(self) -> float:
-        """See `LinkBase`."""
+    def _reach_ms(self) -> float:
         return self.delay_ms + self.half_width_ms
 
-    def fault(self) -> LinkProblem | None:
-        """See `LinkBase`."""
+    def _find_delay_problem(self) -> KeyProblem | None:
         if self.half_width_ms > self.delay_ms:
-            return LinkProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
-        return LinkBase.fault(self)
+            return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
+        return None
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
@@ -228,16 +220,15 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     delay_ms: Milliseconds
     deviation_ms: Deviation
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms)
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: of the normal distribution truncated at zero."""
+    def _moments(self) -> tuple[float, float]:
+        """Of the normal distribution truncated at zero."""
         a = -self.delay_ms / self.deviation_ms
         hazard = _density(a) / _probability(-a)
         deviation_ms = self.deviation_ms * math.sqrt(1.0 + a * hazard - hazard * hazard)
-        return DelayMoments(self.delay_ms + self.deviation_ms * hazard, deviation_ms)
+        return self.delay_ms + self.deviation_ms * hazard, deviation_ms
 
 
 class GammaDelay(LinkBase, frozen=True, kw_only=True, tag="gamma"):
@@ -251,18 +242,16 @@ class GammaDelay(LinkBase, frozen=True, kw_only=True, tag="gamma"):
     delay_ms: PositiveMilliseconds
     deviation_ms: Deviation
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`: shape m^2 / s^2, scale s^2 / m."""
+    def _delay(self) -> LinkModel:
+        """Shape m^2 / s^2, scale s^2 / m."""
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`."""
-        return DelayMoments(self.delay_ms, self.deviation_ms)
+    def _moments(self) -> tuple[float, float]:
+        return self.delay_ms, self.deviation_ms
 
-    def fault(self) -> LinkProblem | None:
-        """See `LinkBase`."""
-        return _spread_fault(self.delay_ms, self.deviation_ms) or LinkBase.fault(self)
+    def _find_delay_problem(self) -> KeyProblem | None:
+        return _find_spread_problem(self.delay_ms, self.deviation_ms)
 
 
 class LogNormalDelay(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
@@ -276,23 +265,21 @@ class LogNormalDelay(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
     delay_ms: PositiveMilliseconds
     deviation_ms: Deviation
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`: sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
+    def _delay(self) -> LinkModel:
+        """Sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
         return LinkModel(kind=DelayKind.LOG_NORMAL, location=location, scale=math.sqrt(variance))
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`."""
-        return DelayMoments(self.delay_ms, self.deviation_ms)
+    def _moments(self) -> tuple[float, float]:
+        return self.delay_ms, self.deviation_ms
 
-    def fault(self) -> LinkProblem | None:
-        """See `LinkBase`."""
-        return _spread_fault(self.delay_ms, self.deviation_ms) or LinkBase.fault(self)
+    def _find_delay_problem(self) -> KeyProblem | None:
+        return _find_spread_problem(self.delay_ms, self.deviation_ms)
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
-    """A floor and one of two exponential distributions: what mobile networks show.
+    """A floor and one of two exponential distributions, as in mobile networks.
 
     Attributes:
         floor_ms: least delay, ms.
@@ -306,8 +293,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
     slow_ms: Milliseconds
     slow_share: Probability
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(
             kind=DelayKind.HYPER_EXPONENTIAL,
             location=1e3 * self.floor_ms,
@@ -316,12 +302,12 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
             weight=self.slow_share,
         )
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: a mixture's second moment is the mixture of theirs, 2 a^2 and 2 b^2."""
+    def _moments(self) -> tuple[float, float]:
+        """A mixture's second moment is the mixture of theirs, 2 a^2 and 2 b^2."""
         fast, slow, share = self.fast_ms, self.slow_ms, self.slow_share
         above = (1.0 - share) * fast + share * slow
         square = 2.0 * ((1.0 - share) * fast * fast + share * slow * slow)
-        return DelayMoments(self.floor_ms + above, math.sqrt(square - above * above))
+        return self.floor_ms + above, math.sqrt(square - above * above)
 
 
 class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
@@ -337,8 +323,7 @@ class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
     deviation_ms: Deviation
     correlation: Correlation
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(
             kind=DelayKind.AR1,
             location=1e3 * self.delay_ms,
@@ -346,22 +331,21 @@ class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
             weight=self.correlation,
         )
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: of max(0, x) for a normal x, in a form in which nothing large cancels."""
+    def _moments(self) -> tuple[float, float]:
+        """Of max(0, x) for a normal x, in a form in which nothing large cancels."""
         m, s = self.delay_ms, self.deviation_ms
         a = m / s
         above, below, density = _probability(a), _probability(-a), _density(a)
         variance = above + a * above * a * below + a * density * (below - above) - density * density
-        return DelayMoments(m * above + s * density, s * math.sqrt(max(variance, 0.0)))
+        return m * above + s * density, s * math.sqrt(max(variance, 0.0))
 
 
-def _spread_fault(delay_ms: float, deviation_ms: float) -> LinkProblem | None:
-    """Returns what is wrong with a deviation beside its mean: out of these bounds it is hardly meant."""
+def _find_spread_problem(delay_ms: float, deviation_ms: float) -> KeyProblem | None:
+    """Returns the problem of a deviation that is out of proportion to its mean."""
     if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
         return None
-    return LinkProblem(
-        "deviation_ms", f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
-    )
+    text = f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
+    return KeyProblem("deviation_ms", text)
 
 
 def _density(x: float) -> float:
@@ -377,15 +361,13 @@ def _probability(x: float) -> float:
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
     """No delay: a sample is in use from the next tick on."""
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel()
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`."""
-        return DelayMoments(0.0, 0.0)
+    def _moments(self) -> tuple[float, float]:
+        return 0.0, 0.0
 
-    def _words(self) -> str:
+    def _describe_delay(self) -> str:
         return "no delay"
 
 
@@ -398,15 +380,14 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
     delay_ms: Milliseconds
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`; in whole microseconds (L4)."""
+    def _delay(self) -> LinkModel:
+        """In whole microseconds (L4)."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`."""
-        return DelayMoments(self.delay_ms, 0.0)
+    def _moments(self) -> tuple[float, float]:
+        return self.delay_ms, 0.0
 
-    def _words(self) -> str:
+    def _describe_delay(self) -> str:
         return f"{self.delay_ms:g} ms"
 
 
@@ -425,8 +406,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
     period_s: Annotated[float, Meta(gt=0.0, le=1e6)]
     phase_rad: Annotated[float, Meta(ge=-1e3, le=1e3)] = 0.0
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(
             kind=DelayKind.SINE,
             location=1e3 * self.delay_ms,
@@ -435,26 +415,24 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
             weight=self.phase_rad,
         )
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: over whole periods."""
-        return DelayMoments(self.delay_ms, self.amplitude_ms / math.sqrt(2.0))
+    def _moments(self) -> tuple[float, float]:
+        """Over whole periods."""
+        return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
-    def reach_ms(self) -> float:
-        """See `LinkBase`."""
+    def _reach_ms(self) -> float:
         return self.delay_ms + self.amplitude_ms
 
-    def fault(self) -> LinkProblem | None:
-        """See `LinkBase`."""
+    def _find_delay_problem(self) -> KeyProblem | None:
         if self.amplitude_ms > self.delay_ms:
-            return LinkProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
-        return LinkBase.fault(self)
+            return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
+        return None
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Delays by time, from a file; resolved, it holds them itself.
+    """Delays by time, from a file; a resolved scenario holds them itself.
 
     Attributes:
-        trace: its points, "t_us delay_us, ...", "lost" in the place of a delay.
+        trace: its points, "t_us delay_us, ...", "lost" in place of a delay.
         at_end: "hold" the last delay, or "loop".
     """
 
@@ -463,49 +441,46 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
     @property
     def points(self) -> Points:
-        """See `LinkBase`."""
+        """The points of the trace."""
         return parse_trace(self.trace)
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: over one pass, by time; lost samples have no delay."""
+    def _moments(self) -> tuple[float, float]:
+        """Over one pass, by time; lost samples have no delay."""
         t_us, delay_us = self.points.T
         lasts_us = np.diff(t_us, append=2 * t_us[-1] - t_us[-2] if len(t_us) > 1 else t_us[-1] + 1)
         weights = np.where(delay_us >= 0, lasts_us, 0)
         if not weights.any():
-            return DelayMoments(math.nan, math.nan)
+            return math.nan, math.nan
         mean = float(np.average(delay_us, weights=weights))
         variance = float(np.average((delay_us - mean) ** 2, weights=weights))
-        return DelayMoments(mean / 1e3, math.sqrt(variance) / 1e3)
+        return mean / 1e3, math.sqrt(variance) / 1e3
 
-    def reach_ms(self) -> float:
-        """See `LinkBase`: that of its points, which are within bounds."""
+    def _reach_ms(self) -> float:
+        """That of its points, which are within bounds."""
         return float(self.points[:, 1].max()) / 1e3
 
-    def fault(self) -> LinkProblem | None:
-        """See `LinkBase`."""
+    def _find_delay_problem(self) -> KeyProblem | None:
         try:
             parse_trace(self.trace)
         except ValueError as error:
-            return LinkProblem("trace", str(error))
-        return LinkBase.fault(self)
+            return KeyProblem("trace", str(error))
+        return None
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """None is injected: a sample is in use as soon as it has come over the real network."""
+    """Injects no delay: a sample is in use as soon as it arrives over the real network."""
 
-    def delay(self) -> LinkModel:
-        """See `LinkBase`."""
+    def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.MEASURED)
 
-    def moments(self) -> DelayMoments:
-        """See `LinkBase`: the network's, not known beforehand."""
-        return DelayMoments(math.nan, math.nan)
+    def _moments(self) -> tuple[float, float]:
+        """The network's, not known beforehand."""
+        return math.nan, math.nan
 
-    def _words(self) -> str:
+    def _describe_delay(self) -> str:
         return "measured"
 
 
@@ -523,4 +498,4 @@ Link = (
     | NoInjectedDelay
 )
 DELAY_MODELS: dict[str, type[LinkBase]] = {str(kind.__struct_config__.tag): kind for kind in get_args(Link)}
-"""The models by their names."""
+"""The models by name."""

@@ -10,7 +10,7 @@ times and delays are whole microseconds.
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -30,32 +30,28 @@ _LOST = "lost"
 TracePoint = tuple[float, float]
 """A time, s, and a delay, ms; a delay of infinity is a sample lost."""
 
-TraceReader = Callable[[Path, str], Sequence[TracePoint]]
+_LOG_READER = "trilat_net.log.log_reader", "read_link_delays"
+"""Reads the delays of a log; it is above this package."""
 
 
-def _csv_rows(path: Path, link: str) -> list[TracePoint]:  # noqa: ARG001 - a table is of one link
+def _read_csv(path: Path) -> list[TracePoint]:
     rows: list[TracePoint] = []
-    begun = False
+    first = True
     with path.open(newline="", encoding="utf-8-sig") as stream:
         for number, cells in enumerate(csv.reader(stream), start=1):
             if not any(cells) or cells[0].lstrip().startswith("#"):
                 continue
-            first, begun = not begun, True
-            if first and _is_head(cells):
+            is_head = first and len(cells) == 2 and not any(map(_is_number, cells))
+            first = False
+            if is_head:
                 continue
             try:
                 time_text, delay_text = (cell.strip() for cell in cells)
                 rows.append((float(time_text), math.inf if delay_text == _LOST else float(delay_text)))
             except ValueError:
-                raise ValueError(
-                    f"line {number} reads {','.join(cells)!r}; a line is t_s,delay_ms or t_s,{_LOST}"
-                ) from None
+                text = f"line {number} reads {','.join(cells)!r}; a line is t_s,delay_ms or t_s,{_LOST}"
+                raise ValueError(text) from None
     return rows
-
-
-def _is_head(cells: Sequence[str]) -> bool:
-    """True of two cells that are no numbers."""
-    return len(cells) == 2 and not any(map(_is_number, cells))
 
 
 def _is_number(cell: str) -> bool:
@@ -66,30 +62,21 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-_ELSEWHERE = {".mcap": "trilat_net.log.log_reader:read_link_delays"}
-"""Readers that lie above this package, by the ends of files' names."""
-
-
-def _reader(path: Path) -> TraceReader:
-    if path.suffix not in _ELSEWHERE:
-        return _csv_rows
-    module, _, name = _ELSEWHERE[path.suffix].partition(":")
-    reader: TraceReader = getattr(import_module(module), name)
-    return reader
-
-
 def read_trace(path: Path, link: str) -> str:
-    """Returns the text of a trace.
+    """Returns the text of the trace in a file.
 
     Args:
         path: a table `t_s,delay_ms`, or a log, whose name ends in .mcap.
-        link: which link of a log, as in "m1->s".
+        link: the link of a log, as in "m1->s".
 
     Raises:
-        ScenarioError: the file cannot be read, or what it holds is no trace.
+        ScenarioError: the file cannot be read, or holds no trace.
     """
     try:
-        return format_trace(_reader(path)(path, link))
+        if path.suffix != ".mcap":
+            return format_trace(_read_csv(path))
+        module, name = _LOG_READER
+        return format_trace(getattr(import_module(module), name)(path, link))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, csv.Error) as error:  # UnicodeDecodeError is a ValueError
@@ -125,12 +112,19 @@ def format_trace(rows: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Returns the points of a trace, shape (n, 2), see `core.delay.Points`.
+    """Returns the points of a trace, shape (n, 2), see `core.vectors.Points`.
 
     Raises:
-        ValueError: the text is none of `text_of`.
+        ValueError: the text is not one of `format_trace`.
     """
-    points: Points = np.array(list(_pairs(text.split(", "))), dtype=np.int64).reshape(-1, 2)
+    pairs = []
+    for part in text.split(", "):
+        t_text, _, delay_text = part.partition(" ")
+        try:
+            pairs.append((int(t_text), LOST if delay_text == _LOST else int(delay_text)))
+        except ValueError:
+            raise ValueError(f"reads {part[:40]!r} where a point is 't_us delay_us'") from None
+    points: Points = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     t_us, delay_us = points.T
     if not 0 < len(points) <= MAX_TRACE_POINTS or t_us[0] != 0 or np.any(np.diff(t_us) <= 0):
         raise ValueError(f"must be 1 to {MAX_TRACE_POINTS} points in order, the first at 0")
@@ -138,12 +132,3 @@ def parse_trace(text: str) -> Points:
         raise ValueError(f"its delays must be from 0 to {MAX_DELAY_US} us, or {_LOST!r}")
     points.flags.writeable = False
     return points
-
-
-def _pairs(parts: Iterable[str]) -> Iterable[tuple[int, int]]:
-    for part in parts:
-        t_us, _, delay_us = part.partition(" ")
-        try:
-            yield int(t_us), LOST if delay_us == _LOST else int(delay_us)
-        except ValueError:
-            raise ValueError(f"reads {part[:40]!r} where a point is 't_us delay_us'") from None

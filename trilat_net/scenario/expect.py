@@ -11,26 +11,27 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from .fields import check_keys, field_names, suggest_nearest
+from .fields import KeyProblem, NotNegative, PlaneVector, Positive, check_keys, field_names, suggest_nearest
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
-LeastMost = Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(min_length=2, max_length=2)]
+LeastMost = PlaneVector
+JointPose = PlaneVector  # of an expectation: two angles, never one for both
 
 _WHERE = ("from_s", "to_s", "site")
 ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
-"""Quantities that all sites together have."""
+"""Quantities of all sites together."""
 
 
 class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """What must hold of the ticks from one time to another, as [least, most] of each quantity.
+    """Expectations of the ticks from one time to another, as [least, most] of each quantity.
 
     A wall's force is that of the scenario's walls at the logged state, along their normals; of several it is
-    the sum. Where a run ends before the window does, nothing of it is measured, and nothing holds.
+    the sum. If a run ends before the window does, nothing of it is measured, and nothing holds.
 
     Attributes:
         from_s: nominal time of its first tick, s.
-        to_s: its end, s; a tick at that time is no longer in it.
-        site: of which site; left out: of all, which only the first three quantities allow.
+        to_s: its end, s; it does not include a tick at that time.
+        site: the site; left out: all, which only the first three quantities allow.
         error_peak_rad: largest |e| of a joint.
         speed_peak_rad_s: largest speed of a joint.
         torque_peak_nm: largest control torque of a joint.
@@ -61,64 +62,46 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     @property
     def asked(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Yields what is asked: quantity, and its least and most."""
+        """Yields each quantity with a limit, and its least and most."""
         for key in WINDOW_QUANTITIES:
             if (limits := getattr(self, key)) is not None:
                 yield key, limits
 
 
 WINDOW_QUANTITIES: tuple[str, ...] = tuple(key for key in field_names(ExpectWindow) if key not in _WHERE)
-"""What can be asked of a window."""
+"""The quantities of a window."""
 
 
 def check_window_keys(written: Any) -> None:
-    """Refuses keys that a window does not have, as its author wrote them.
-
-    Args:
-        written: the value of `windows`; what is no list of tables is refused later.
-
-    Raises:
-        ScenarioError: with the path of the key and the nearest valid one.
-    """
+    """Refuses keys that a window does not have; what is no list of tables is refused later."""
     for n, table in enumerate(written if isinstance(written, list) else []):
         check_keys(table, field_names(ExpectWindow), f"expect.windows[{n}]")
 
 
-def find_window_problem(window: ExpectWindow, sites: Sequence[str]) -> tuple[str, str] | None:
-    """Returns what no run of a scenario could meet: (key, problem), or None; the key "" is the window itself.
-
-    Args:
-        window: what is expected.
-        sites: names of the scenario's sites.
-    """
+def find_window_problem(window: ExpectWindow, sites: Sequence[str]) -> KeyProblem | None:
+    """Returns a window's problem that no run of a scenario with these sites could meet, or None."""
+    names = f"its sites are {', '.join(sites)}"
     if window.to_s <= window.from_s:
-        return "to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}"
+        return KeyProblem("to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}")
     if window.site and window.site not in sites:
-        return (
-            "site",
-            f"no site {window.site!r}{suggest_nearest(window.site, sites)}; its sites are {', '.join(sites)}",
-        )
-    asked = dict(window.asked)
-    if not asked:
-        return "", f"asks nothing; it may ask {', '.join(WINDOW_QUANTITIES)}"
-    for key, (least, most) in asked.items():
+        return KeyProblem("site", f"no site {window.site!r}{suggest_nearest(window.site, sites)}; {names}")
+    limits = dict(window.asked)
+    if not limits:
+        return KeyProblem("", f"asks nothing; it may ask {', '.join(WINDOW_QUANTITIES)}")
+    for key, (least, most) in limits.items():
         if not window.site and key not in ALL_SITES_QUANTITIES:
-            return "site", f"is missing: {key} is of one site; its sites are {', '.join(sites)}"
+            return KeyProblem("site", f"is missing: {key} is of one site; {names}")
         if least > most:
-            return key, f"must be [least, most], is [{least:g}, {most:g}]"
+            return KeyProblem(key, f"must be [least, most], is [{least:g}, {most:g}]")
     return None
 
 
-NotNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
-Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
-JointPose = Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(min_length=2, max_length=2)]
-
 END_WINDOW_S = 1.0
-"""The end of a run, where a key speaks of it: its last second."""
+"""The length of the end of a run that a key means, s."""
 
 
 class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """What must hold of every run of a scenario, for every seed.
+    """Expectations of every run of a scenario, for every seed.
 
     The error of a site is e = q_i - q_id, Eq. (9); |e| is taken per joint. "Largest" and "smallest" are over
     all sites (or links), joints and ticks of the run. A run that diverged ends there: its figures are of the
@@ -126,12 +109,12 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     Attributes:
         stable: true: no site diverges and the envelope of the largest |e| does not grow; false: one of the
-            two happens. A run too short to tell fails both, see `analysis.envelope`.
+            two happens. A run too short to decide fails both, see `analysis.run_end`.
         synchronised_by_s: from this time to the end of the run the largest |e| stays below
             `synchronised_rad`.
-        synchronised_rad: what counts as synchronised, rad.
+        synchronised_rad: the limit of |e| below which the sites are synchronised, rad.
         peak_error_max_rad: largest |e| of the run.
-        peak_error_min_rad: the same figure, from below: what must be seen to happen.
+        peak_error_min_rad: the same figure, from below.
         rms_error_max_rad: root mean square of e over the run, of the worst joint of any site.
         end_error_max_rad: largest |e| of the last second.
         end_error_min_rad: the same figure, from below.
@@ -142,13 +125,13 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         peak_torque_max_nm: largest control torque of a joint.
         peak_speed_max_rad_s: largest speed of a joint.
         age_max_ms: largest age of the sample in use (now minus its stamp), from the first sample of a link
-            on; a link that never had one fails.
+            on; a link that never has one fails.
         mean_age_max_ms: that age, averaged over a link's ticks; of the link where it is largest.
         mean_age_min_ms: the same average, of the link where it is smallest, from below.
-        late_samples_max: samples of all links that came in too late to be used as their link meant them.
+        late_samples_max: samples of all links that arrived after they were due.
         no_gaps: true: there is a record of every tick, from 0 to the last that any site had to make; false
             asks nothing.
-        windows: what stretches of the run must show, see `Window`.
+        windows: expectations of parts of the run, see `ExpectWindow`.
     """
 
     stable: bool | None = None
@@ -173,24 +156,19 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def asks(self) -> bool:
-        """True where at least one key asks something; a tolerance alone does not."""
+        """True if at least one key states an expectation; a tolerance alone does not."""
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
 
-def find_expect_problem(expect: Expect, sites: Sequence[str]) -> tuple[str, str] | None:
-    """Returns what no run of a scenario could meet: (key below `expect`, problem), or None.
-
-    Args:
-        expect: what is expected.
-        sites: names of the scenario's sites.
-    """
+def find_expect_problem(expect: Expect, sites: Sequence[str]) -> KeyProblem | None:
+    """Returns the problem, below `expect`, that no run of a scenario with these sites could meet, or None."""
     for name in expect.end_pose_rad:
         if name not in sites:
-            return f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}"
-    for n, one in enumerate(expect.windows):
-        if found := find_window_problem(one, sites):
-            return f"windows[{n}]{'.' * bool(found[0])}{found[0]}", found[1]
+            return KeyProblem(f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}")
+    for n, window in enumerate(expect.windows):
+        if found := find_window_problem(window, sites):
+            return found._replace(key=f"windows[{n}].{found.key}".rstrip("."))
     for least, most in (
         ("peak_error_min_rad", "peak_error_max_rad"),
         ("end_error_min_rad", "end_error_max_rad"),
@@ -198,5 +176,5 @@ def find_expect_problem(expect: Expect, sites: Sequence[str]) -> tuple[str, str]
     ):
         low, high = getattr(expect, least), getattr(expect, most)
         if low is not None and high is not None and low > high:
-            return least, f"must be at most {most} = {high:g}, is {low:g}"
+            return KeyProblem(least, f"must be at most {most} = {high:g}, is {low:g}")
     return None

@@ -1,20 +1,19 @@
-"""Fields of a scenario.
+"""Fields of a scenario: the base of its types, ranges of its numbers, and checks of an author's tables.
 
-The base of its types, ranges of its numbers, and checks of tables as people write them.
-
-Invariant: an error names the path of the key in the shape in which it was written, and the nearest valid
-name. No quantity of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic far from
-its limits.
+Invariant: an error names the path of the key as the author wrote it, and the nearest valid name. No quantity
+of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic far from its limits.
 """
 
 import difflib
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, TypeGuard
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, NamedTuple, TypeGuard, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
+from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
 
 
@@ -27,35 +26,61 @@ MAX_QUANTITY = 1e9
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
-Joints = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
-PositiveJoints = Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)]
-NotNegativeJoints = Annotated[tuple[NotNegative, ...], Meta(min_length=2, max_length=2)]
-Parameters = Annotated[tuple[Real, ...], Meta(min_length=5, max_length=5)]
-NotNegativeParameters = Annotated[tuple[NotNegative, ...], Meta(min_length=5, max_length=5)]
+_EXPANDS = {"expands": True}
+_PER_JOINT = Meta(min_length=JOINTS, max_length=JOINTS, extra=_EXPANDS)
+_PER_PARAMETER = Meta(min_length=PARAMETERS, max_length=PARAMETERS, extra=_EXPANDS)
+Joints = Annotated[tuple[Real, ...], _PER_JOINT]
+PositiveJoints = Annotated[tuple[Positive, ...], _PER_JOINT]
+NotNegativeJoints = Annotated[tuple[NotNegative, ...], _PER_JOINT]
+Parameters = Annotated[tuple[Real, ...], _PER_PARAMETER]
+NotNegativeParameters = Annotated[tuple[NotNegative, ...], _PER_PARAMETER]
+PlaneVector = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
 RateHz = Annotated[int, Meta(ge=1, le=20_000)]
 
 TomlTable = dict[str, Any]
+StructType = type[msgspec.Struct]
+
+
+class KeyProblem(NamedTuple):
+    """A key that cannot be as it is, below the table that is checked ("": the table itself), and why."""
+
+    key: str
+    problem: str
+
+
+@cache
+def _vector_lengths(kind: StructType) -> Mapping[str, int]:
+    """Returns the keys of a type for which one number may stand for all, and how many these are."""
+    return {
+        key: int(meta.min_length or 0)
+        for key, hint in get_type_hints(kind, include_extras=True).items()
+        for meta in getattr(hint, "__metadata__", ())
+        if isinstance(meta, Meta) and meta.extra == _EXPANDS
+    }
+
+
+def expand_vectors(table: TomlTable, kind: StructType) -> TomlTable:
+    """Returns a table with every single number written out as the vector that its type has."""
+    lengths = _vector_lengths(kind)
+    return {
+        key: [value] * lengths[key] if key in lengths and is_number(value) else value
+        for key, value in table.items()
+    }
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """True where what an author wrote is a number; true and false are none."""
+    """True for a number as an author writes it; true and false are none."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Returns "; did you mean ...?", or "" where nothing valid is near."""
+    """Returns "; did you mean ...?", or "" if nothing valid is near."""
     match = difflib.get_close_matches(word, valid, n=1, cutoff=0.5)
     return f"; did you mean {match[0]!r}?" if match else ""
 
 
 def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
-    """Returns the table if it is one and has no key but the valid ones.
-
-    Args:
-        table: what the author wrote.
-        valid: the keys that it may have.
-        path: what errors call it.
-    """
+    """Returns the table if it is one and has no key but the valid ones; errors call it `path`."""
     if not isinstance(table, dict):
         raise ScenarioError("must be a table", path=path)
     for key in table:
@@ -66,20 +91,20 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
     return table
 
 
-def field_names(kind: type[msgspec.Struct]) -> tuple[str, ...]:
-    """Returns the keys that a type has."""
+def field_names(kind: StructType) -> tuple[str, ...]:
+    """Returns the keys of a type."""
     return kind.__struct_fields__
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Refuses a word that is none of the valid ones."""
+    """Refuses a word that is not valid."""
     if word not in valid:
         hint = suggest_nearest(str(word), valid)
         raise ScenarioError(f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path)
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Refuses a number that is not finite, or has more than 64 bits, however deep it lies."""
+    """Refuses a number that is not finite, or has more than 64 bits, at any depth."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
     if isinstance(value, int) and not -(2**63) <= value < 2**63:

@@ -16,11 +16,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from msgspec import Meta, field
+from msgspec.structs import asdict
 
 from ..core.site_setup import Gains, Law
+from ..core.two_link_arm import PARAMETERS
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
 from ..errors import ScenarioError
@@ -38,16 +40,16 @@ LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 _METHODS = ("torque", "memory", "recall")
 
 _imported: dict[str, str] = {}
-"""Per module that a law came from the hash that its file had when it was imported."""
+"""Per imported module of a law the hash of its file at that time."""
 
 
 class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
-    """A law from outside.
+    """A user's law.
 
     Attributes:
-        code: where it is, as in "package.module:Law".
+        code: its place, as in "package.module:Law".
         source_sha256: hash of the file of that module.
-        settings: what it is made with, by name.
+        settings: the arguments of its class, by name.
     """
 
     code: Annotated[str, Meta(pattern=LAW_PATH_PATTERN, max_length=200)]
@@ -55,40 +57,34 @@ class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
     settings: dict[str, Any] = field(default_factory=dict)
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the numbers for the core: none but which law."""
+        """Returns the gains for the core: none."""
         return Gains(Law.OWN)
 
     def maker(self, sites: int) -> UserLawFactory:
-        """Returns what makes the law, in a site that is being built.
+        """Returns the factory of the law, for a site of an experiment of so many sites."""
 
-        Args:
-            sites: how many sites the experiment has.
-        """
-
-        def make(facts: LawContext) -> UserLaw:
-            kind = _found(self.code, f"sites.{facts.site}.control.law")
-            _check_kind(kind, self.code, facts, sites)  # before anything of it is called
+        def make(context: LawContext) -> UserLaw:
+            path = f"sites.{context.site}.control"
+            kind = _import_class(self.code, f"{path}.law")
+            _check_class(kind, self.code, context, sites)  # before anything of it is called
             try:
-                law: UserLaw = kind(facts, **self.settings)
-            except (Exception, SystemExit) as error:  # somebody's code
+                law: UserLaw = kind(context, **self.settings)
+            except (Exception, SystemExit) as error:  # the user's code
                 given = ", ".join(f"{key} = {value!r}" for key, value in self.settings.items())
-                raise ScenarioError(
-                    f"{self.code} cannot be made with {given or 'no settings'}: "
-                    f"{type(error).__name__}: {error}",
-                    path=f"sites.{facts.site}.control",
-                ) from None
+                problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
+                raise ScenarioError(f"{self.code} {problem}", path=path) from None
             return law
 
         return make
 
     def check_unchanged(self, site: str) -> None:
-        """Refuses to begin with another law than the scenario names.
+        """Refuses to start with another law than the scenario names.
 
         Raises:
-            ScenarioError: the law's file is not there, or is another one.
+            ScenarioError: the law's file is missing, or has another hash.
         """
         path = f"sites.{site}.control"
-        if source_sha256(self.code, f"{path}.law") != self.source_sha256:
+        if hash_law_source(self.code, f"{path}.law") != self.source_sha256:
             raise ScenarioError(
                 f"the file of {self.code} is not the one that the scenario names by this hash; put that one "
                 f"there, or write law = {self.code!r} to take the one that is",
@@ -96,49 +92,48 @@ class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
             )
 
     def changed(self) -> str | None:
-        """Says how the law's file differs from the one that the scenario names; None where it does not.
+        """Returns the difference of the law's file from the one that the scenario names, or None.
 
         Raises:
             ScenarioError: there is no such file.
         """
-        now = source_sha256(self.code, "control.law")
+        now = hash_law_source(self.code, "control.law")
         if now == self.source_sha256:
             return None
         return f"its sha256 is {now[:16]}, and was {self.source_sha256[:16]}"
 
 
-def source_sha256(code: str, path: str) -> str:
-    """Returns the hash of the file that a law is in.
-
-    Args:
-        code: where it is.
-        path: what errors call the key.
+def hash_law_source(code: str, path: str) -> str:
+    """Returns the SHA-256 of the file that defines a law; errors call the key `path`.
 
     Raises:
         ScenarioError: there is no such file.
     """
-    file = _file(code, path)
+    file = _find_file(code, path)
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
         raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
 
 
-def _check_kind(kind: Any, code: str, facts: LawContext, sites: int) -> None:
-    """Refuses what is no law; a log that names any other thing of a machine's modules runs nothing of it.
+def _check_class(kind: Any, code: str, context: LawContext, sites: int) -> None:
+    """Refuses a class that is no law, before anything of it runs; a log can name any class.
 
     A law may say what it is for: `sites = 2` or `sites = (2, 4)`, and `needs_theta = True`.
     """
-    path = f"sites.{facts.site}.control.law"
+    path = f"sites.{context.site}.control.law"
     missing = [name for name in _METHODS if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(f"{code} has no {', '.join(missing)}; see docs/own-controller.md", path=path)
     stated = getattr(kind, "sites", None)
-    least, most = (stated, stated) if isinstance(stated, int) else _range(stated, code, path)
+    ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
+    if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(n, int) for n in ends)):
+        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
+    least, most = ends
     if not least <= sites <= most:
-        asked = f"{least}" if least == most else f"{least} to {most}"
-        raise ScenarioError(f"{code} is for {asked} sites, and here are {sites}", path=path)
-    if getattr(kind, "needs_theta", False) and not facts.theta:
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
+    if getattr(kind, "needs_theta", False) and not context.theta:
         raise ScenarioError(
             f"{code} needs the arm's parameters, which nobody knows (arm.known = false): identify the arm "
             "and leave known out, or choose a law that learns them",
@@ -146,20 +141,10 @@ def _check_kind(kind: Any, code: str, facts: LawContext, sites: int) -> None:
         )
 
 
-def _range(stated: Any, code: str, path: str) -> tuple[int, int]:
-    """Returns the numbers of sites that a law says it is for."""
-    if stated is None:
-        return 2, sys.maxsize
-    ends = tuple(stated) if isinstance(stated, tuple | list) else ()
-    if len(ends) != 2 or not all(isinstance(end, int) for end in ends):
-        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
-    return ends[0], ends[1]
-
-
-def _file(code: str, path: str) -> Path:
+def _find_file(code: str, path: str) -> Path:
     module = code.partition(":")[0]
-    with _here():
-        spec = _spec(module)
+    with _searching_here():
+        spec = _find_spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
             f"there is no module {module}, where {code} is; install it, or be in the folder that it lies in "
@@ -169,77 +154,64 @@ def _file(code: str, path: str) -> Path:
     return Path(spec.origin)
 
 
-def _spec(module: str) -> ModuleSpec | None:
+def _find_spec(module: str) -> ModuleSpec | None:
     """Finds a module as an import would, without running the packages that it is in."""
     spec = None
     folders = None
-    *packages, last = module.split(".")
-    for depth, _ in enumerate([*packages, last], 1):
-        name = ".".join([*packages, last][:depth])
+    parts = module.split(".")
+    for depth in range(1, len(parts) + 1):
+        name = ".".join(parts[:depth])
         try:
             found = (finder.find_spec(name, folders) for finder in sys.meta_path)
             spec = next((one for one in found if one is not None), None)
         except (ImportError, ValueError, AttributeError):
             return None
-        if spec is None:
-            return None
-        folders = spec.submodule_search_locations
-        if folders is None and name != module:
+        folders = None if spec is None else spec.submodule_search_locations
+        if spec is None or (folders is None and name != module):
             return None
     return spec
 
 
-def _found(code: str, path: str) -> Any:
-    """Returns the class that a law's name stands for, of the file as it is now."""
+def _import_class(code: str, path: str) -> Any:
+    """Returns the class of a law from its file as it is now; refuses a file that does not define it."""
     module, _, name = code.partition(":")
-    _check_defined(name, _file(code, path), path)
-    now = source_sha256(code, path)
-    with _here():
-        try:
-            found = importlib.import_module(module)
-            if _imported.setdefault(module, now) != now:  # edited while this program runs
-                found = importlib.reload(found)
-                _imported[module] = now
-        except (Exception, SystemExit) as error:  # somebody's code
-            raise ScenarioError(
-                f"{module} cannot be imported: {type(error).__name__}: {error}", path=path
-            ) from None
-    return getattr(found, name)
-
-
-def _check_defined(name: str, file: Path, path: str) -> None:
-    """Refuses a file that defines no class of that name, before anything of it runs."""
+    file = _find_file(code, path)
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
     if not any(isinstance(node, ast.ClassDef) and node.name == name for node in tree.body):
         raise ScenarioError(f"{file} defines no class {name}; see docs/own-controller.md", path=path)
+    now = hash_law_source(code, path)
+    with _searching_here():
+        try:
+            found = importlib.import_module(module)
+            if _imported.setdefault(module, now) != now:  # edited while this program runs
+                found = importlib.reload(found)
+                _imported[module] = now
+        except (Exception, SystemExit) as error:  # the user's code
+            problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
+            raise ScenarioError(problem, path=path) from None
+    return getattr(found, name)
 
 
 @contextmanager
-def _here() -> Iterator[None]:
-    """Lets modules be found in the folder that the person is in."""
+def _searching_here() -> Iterator[None]:
+    """Lets modules be found in the working directory."""
     here = str(Path.cwd())
     if here in sys.path:
         yield
         return
     sys.path.insert(0, here)
-    importlib.invalidate_caches()  # a file that was written a moment ago
+    importlib.invalidate_caches()  # a file may be a moment old
     try:
         yield
     finally:
         sys.path.remove(here)
 
 
-class Adaptive(Frozen, frozen=True, tag_field="law", tag="adaptive"):
-    """The paper's adaptive law, Eq. (13) and (15).
-
-    Stable for any constant delays while nobody pushes, if the dominance matrix is irreducible and the Kd of
-    all sites are one matrix but for a scalar each (the paper's theorem with the weights of docs/errata.md).
-    That is sufficient; what delays that vary do is another question.
-
-    Gamma = 0 and theta_hat0 = theta make the law of known parameters; Kd = 0 takes the error's damping out.
+class AdaptiveGains(Frozen, frozen=True):
+    """The gains of the adaptive laws.
 
     Attributes:
         Lambda: per joint, 1/s.
@@ -252,53 +224,66 @@ class Adaptive(Frozen, frozen=True, tag_field="law", tag="adaptive"):
     Lambda: PositiveJoints = (1.0, 1.0)
     Kp: PositiveJoints = (1.0, 1.0)
     Kd: NotNegativeJoints = (3.0, 3.0)
-    Gamma: NotNegativeParameters = (1.0,) * 5
-    theta_hat0: Parameters = (0.0,) * 5
+    Gamma: NotNegativeParameters = (1.0,) * PARAMETERS
+    theta_hat0: Parameters = (0.0,) * PARAMETERS
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the numbers for the core, for an arm of parameters theta."""
+        """Returns the gains for the core, for an arm of parameters theta."""
         return Gains(Law.ADAPTIVE, self.Lambda, self.Kp, self.Kd, self.Gamma, self.theta_hat0)
 
 
-class AdaptiveBox(Frozen, frozen=True, tag_field="law", tag="adaptive_box"):
-    """The paper's law with every estimate held in a box.
+class Adaptive(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive"):
+    """The paper's adaptive law, Eq. (13) and (15).
 
-    A box that holds the truth strictly inside leaves V' <= 0 and takes away the spring by which learning
-    gravity ties the arms to a pose. Projection after Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4.
+    Stable for any constant delays without external torque, if the dominance matrix is irreducible and the Kd
+    of all sites are one matrix but for a scalar each (the paper's theorem, weights of docs/errata.md). This
+    is sufficient; it does not cover delays that vary.
 
-    Attributes:
-        Lambda: per joint, 1/s.
-        Kp: per joint, N m s/rad.
-        Kd: per joint, N m s/rad.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
-        theta_low: least that each estimate may be.
-        theta_high: most that it may be.
+    Gamma = 0 and theta_hat0 = theta make the law of known parameters; Kd = 0 removes the error's damping.
     """
 
-    Lambda: PositiveJoints = (1.0, 1.0)
-    Kp: PositiveJoints = (1.0, 1.0)
-    Kd: NotNegativeJoints = (3.0, 3.0)
-    Gamma: NotNegativeParameters = (1.0,) * 5
-    theta_hat0: Parameters = (0.0,) * 5
-    theta_low: Parameters = (-MAX_QUANTITY,) * 5
-    theta_high: Parameters = (MAX_QUANTITY,) * 5
 
-    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the numbers for the core, for an arm of parameters theta."""
-        return Gains(
-            Law.ADAPTIVE,
-            self.Lambda,
-            self.Kp,
-            self.Kd,
-            self.Gamma,
-            self.theta_hat0,
-            self.theta_low,
-            self.theta_high,
-        )
+class AdaptiveBox(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive_box"):
+    """The paper's law with every estimate held in a box.
+
+    A box that holds the truth strictly inside keeps V' <= 0 and removes the spring by which learning gravity
+    ties the arms to a pose. Projection after Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4.
+
+    Attributes:
+        theta_low: lower bound of each estimate.
+        theta_high: upper bound.
+    """
+
+    theta_low: Parameters = (-MAX_QUANTITY,) * PARAMETERS
+    theta_high: Parameters = (MAX_QUANTITY,) * PARAMETERS
+
+    def gains(self, theta: Array) -> Gains:
+        """Returns the gains for the core."""
+        return AdaptiveGains.gains(self, theta)._replace(low=self.theta_low, high=self.theta_high)
+
+    def check(self, path: str) -> None:
+        """Refuses a box without an inside, and a first estimate outside of it."""
+        bounds = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
+        for n, (low, first, high) in enumerate(bounds):
+            if low > high:
+                problem = f"must be at least theta_low = {low:g}, is {high:g}"
+                raise ScenarioError(problem, path=f"{path}.theta_high[{n}]")
+            if not low <= first <= high:
+                problem = f"must lie in its box from {low:g} to {high:g}, is {first:g}"
+                raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
 
 
-class ProportionalDamped(Frozen, frozen=True, tag_field="law", tag="p_d"):
+class KnownGravity(Frozen, frozen=True):
+    """A law of known gravity; a subclass has the key `gravity`, and some of K, Kd, d and k_f."""
+
+    def gains(self, theta: Array) -> Gains:
+        """Returns the gains for the core, for an arm of parameters theta."""
+        gains = asdict(self)
+        known = theta * gains.pop("gravity")
+        return Gains(Law.KNOWN, known=known.tolist(), **gains)
+
+
+class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
     """P+d with known gravity: tau = G(q) - K e - d qd.
 
     For equal gains and one constant delay T the linearised loop of N sites is stable if and only if
@@ -314,12 +299,8 @@ class ProportionalDamped(Frozen, frozen=True, tag_field="law", tag="p_d"):
     d: NotNegativeJoints = (3.0, 3.0)
     gravity: NotNegative = 1.0
 
-    def gains(self, theta: Array) -> Gains:
-        """Returns the numbers for the core, for an arm of parameters theta."""
-        return Gains(Law.KNOWN, known=(theta * self.gravity).tolist(), K=self.K, d=self.d)
 
-
-class ProportionalDerivativeDamped(Frozen, frozen=True, tag_field="law", tag="pd_d"):
+class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", tag="pd_d"):
     """PD+d with known gravity: tau = G(q) - K e - Kd ed - d qd.
 
     For constant delays the condition of P+d on K and d is sufficient (its source).
@@ -336,23 +317,18 @@ class ProportionalDerivativeDamped(Frozen, frozen=True, tag_field="law", tag="pd
     d: NotNegativeJoints = (5.0, 5.0)
     gravity: NotNegative = 1.0
 
-    def gains(self, theta: Array) -> Gains:
-        """Returns the numbers for the core, for an arm of parameters theta."""
-        return Gains(Law.KNOWN, Kd=self.Kd, known=(theta * self.gravity).tolist(), K=self.K, d=self.d)
 
-
-class ForceReflecting(Frozen, frozen=True, tag_field="law", tag="p_f"):
+class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
-    `felt` is the torque of hands and environments on the peers' arms as it came over the links, weighted by
-    dominance. A slave has K and k_f = 0, a master K = 0 and k_f. In free motion it is calm; in contact no
-    damping makes it stable for every stiffness and delay: the classic that contact separates. It is for one
-    master and one slave.
+    `felt` is the torque of operators and environments on the peers' arms as received, weighted by dominance.
+    A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free motion; in contact no damping
+    makes it so for every stiffness and delay. It is for one master and one slave.
 
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping per joint, N m s/rad.
-        k_f: share of what the peers feel, per joint.
+        k_f: gain of the reflected force, per joint, dimensionless.
         gravity: share of gravity that it knows, 1: exactly.
     """
 
@@ -361,20 +337,8 @@ class ForceReflecting(Frozen, frozen=True, tag_field="law", tag="p_f"):
     k_f: NotNegativeJoints = (0.0, 0.0)
     gravity: NotNegative = 1.0
 
-    def gains(self, theta: Array) -> Gains:
-        """Returns the numbers for the core, for an arm of parameters theta."""
-        return Gains(Law.KNOWN, known=(theta * self.gravity).tolist(), K=self.K, d=self.d, k_f=self.k_f)
 
-
-ControlLaw = (
-    Adaptive | AdaptiveBox | ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting | ImportedLaw
-)
-LAWS: dict[str, type[Frozen]] = {
-    "adaptive": Adaptive,
-    "adaptive_box": AdaptiveBox,
-    "p_d": ProportionalDamped,
-    "pd_d": ProportionalDerivativeDamped,
-    "p_f": ForceReflecting,
-    "own": ImportedLaw,
-}
-"""The laws by their names."""
+KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting
+ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | ImportedLaw
+LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
+"""The laws by name."""

@@ -9,20 +9,16 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import msgspec
-
 from ..errors import ScenarioError
 from .delay_models import DELAY_MODELS
 from .fields import TomlTable, check_keys, field_names, suggest_nearest
 from .laws import LAWS, ImportedLaw
-from .resolve_links import PRESETS
-from .scenario_types import Arm, Limits, OnStale, Scenario
+from .resolve_links import PRESETS, TRACE_KEYS
+from .scenario_types import SITE_GROUPS, Scenario
 
-_PLAIN: dict[str, type[msgspec.Struct]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
-_KIND = {"control": ("law",), "link": ("model", "preset")}
-"""Groups whose keys depend on a word, and the keys that say it."""
-_FILE = ("file", "of")
-_OWN = "own"
+_KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
+"""Groups whose keys depend on a kind, and the keys that name it."""
+_USER_LAW = "own"
 
 Override = tuple[str, Any]
 
@@ -30,14 +26,15 @@ Override = tuple[str, Any]
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
     """Returns overrides of a resolved scenario with every key of a group written out.
 
-    Args:
-        scenario: the experiment.
-        pairs: dotted keys and values, as a person gave them.
-
     Raises:
         ScenarioError: a group has no such key, or nothing in the scenario can have it.
     """
-    flat = [pair for key, value in pairs for pair in _flat(key, value)]
+    flat: list[Override] = []
+    for key, value in pairs:
+        if isinstance(value, Mapping) and (key in SITE_GROUPS or key in _KIND_KEYS):  # a whole group
+            flat += [(f"{key}.{name}", entry) for name, entry in value.items()]
+        else:
+            flat.append((key, value))
     given = dict(flat)
     every: dict[str, Any] = {}
     single: dict[str, Any] = {}
@@ -45,84 +42,74 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
         group, _, name = key.partition(".")
         if key == "rate_hz":
             every |= {f"sites.{site}.rate_hz": value for site in scenario.names}
-        elif group in _PLAIN and name:
-            check_keys({name: value}, field_names(_PLAIN[group]), group)
+        elif group in SITE_GROUPS and name:
+            check_keys({name: value}, field_names(SITE_GROUPS[group]), group)
             every |= {f"sites.{site}.{key}": value for site in scenario.names}
-        elif group in _KIND and name:
-            every |= dict.fromkeys(_places(scenario, group, name, given), value)
+        elif group in _KIND_KEYS and name:
+            every |= dict.fromkeys(_expand_group(scenario, group, name, given), value)
         else:
-            single[_single(scenario, key, given)] = value
+            single[_expand_single(scenario, key, given)] = value
     return every | single
 
 
-def _flat(key: str, value: Any) -> list[Override]:
-    """Returns a group that was given as a whole, key by key."""
-    if isinstance(value, Mapping) and (key in _PLAIN or key in _KIND):
-        return [(f"{key}.{name}", entry) for name, entry in value.items()]
-    return [(key, value)]
-
-
-def _single(scenario: Scenario, key: str, given: Mapping[str, Any]) -> str:
-    """Returns the key of a single one as the resolved scenario has it: settings of a law lie in a table."""
+def _expand_single(scenario: Scenario, key: str, given: Mapping[str, Any]) -> str:
+    """Returns the key of a single site or link in the resolved scenario."""
     group, _, rest = key.partition(".")
     site, _, name = rest.partition(".control.")
-    if group == "sites" and site in scenario.sites and name and _law(scenario, site, given) == _OWN:
-        return _own_place(f"sites.{site}.control", name)
+    if group == "sites" and site in scenario.sites and name and _law(scenario, site, given) == _USER_LAW:
+        return _user_law_key(f"sites.{site}.control", name)
     return key
 
 
-def _own_place(path: str, name: str) -> str:
-    """Returns where a law from outside, which stays, has a key."""
-    return (
-        f"{path}.{name}"
-        if name.split(".")[0] in ("law", *field_names(ImportedLaw))
-        else f"{path}.settings.{name}"
-    )
+def _user_law_key(path: str, name: str) -> str:
+    """Returns the path of a key of a user's law that stays."""
+    settings = "" if name.split(".")[0] in ("law", *field_names(ImportedLaw)) else "settings."
+    return f"{path}.{settings}{name}"
 
 
-def _places(scenario: Scenario, group: str, name: str, given: Mapping[str, Any]) -> list[str]:
-    """Returns the keys of the laws or links that can have a key of their group, as they will be."""
+def _expand_group(scenario: Scenario, group: str, name: str, given: Mapping[str, Any]) -> list[str]:
+    """Returns a key of a group for each law or link, of its future kind, that can have it."""
     if group == "control":
         kinds = {f"sites.{site}.control": str(_law(scenario, site, given)) for site in scenario.names}
         keys: dict[str, tuple[str, ...]] = {
-            law: field_names(kind) for law, kind in LAWS.items() if law != _OWN
+            law: field_names(kind) for law, kind in LAWS.items() if law != _USER_LAW
         }
     else:
         kinds = {f"links.{link}": str(_model(scenario, link, given)) for link in scenario.links}
         keys = {model: field_names(kind) for model, kind in DELAY_MODELS.items()}
-        keys["trace"] = (*keys["trace"], *_FILE)
-    if name in _KIND[group]:
+        keys["trace"] = (*keys["trace"], *TRACE_KEYS)
+    if name in _KIND_KEYS[group]:
         return [f"{path}.{name}" for path in kinds]
-    outside = {path: law for path, law in kinds.items() if group == "control" and _is_outside(law)}
-    ours = {path: kind for path, kind in kinds.items() if path not in outside}
+    user_laws = {
+        path: law for path, law in kinds.items() if group == "control" and (law == _USER_LAW or ":" in law)
+    }
+    built_in = {path: kind for path, kind in kinds.items() if path not in user_laws}
     valid = sorted({key for names in keys.values() for key in names})
-    members = [f"{path}.{name}" for path, kind in ours.items() if name in keys.get(kind, valid)]
-    if outside and not members:
-        return [_own_place(path, name) if law == _OWN else f"{path}.{name}" for path, law in outside.items()]
+    members = [f"{path}.{name}" for path, kind in built_in.items() if name in keys.get(kind, valid)]
+    if user_laws and not members:
+        return [
+            _user_law_key(path, name) if law == _USER_LAW else f"{path}.{name}"
+            for path, law in user_laws.items()
+        ]
     if name not in valid:
-        hint = suggest_nearest(name, [*_KIND[group], *valid]) or f"; valid are {', '.join(valid)}"
+        hint = suggest_nearest(name, [*_KIND_KEYS[group], *valid]) or f"; valid are {', '.join(valid)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     if not members:
-        word, owners = _KIND[group][0], [kind for kind, names in keys.items() if name in names]
+        word, owners = _KIND_KEYS[group][0], [kind for kind, names in keys.items() if name in names]
         is_now = ", ".join(dict.fromkeys(kinds.values()))
         problem = f"belongs to {word} {', '.join(owners)}, and here is only {is_now}: set {group}.{word} too"
         raise ScenarioError(problem, path=f"{group}.{name}")
     return members
 
 
-def _is_outside(law: str) -> bool:
-    """True for a law from outside: one that is named, or one that a log holds."""
-    return law == _OWN or ":" in law
-
-
 def _law(scenario: Scenario, site: str, given: Mapping[str, Any]) -> Any:
-    """Returns the law that a site will have."""
+    """Returns a site's law after the overrides."""
     now = scenario.sites[site].control.__struct_config__.tag
     return given.get(f"sites.{site}.control.law", given.get("control.law", now))
 
 
 def _model(scenario: Scenario, link: str, given: Mapping[str, Any]) -> Any:
-    """Returns the model that a link will have; a word that is none is refused where it is read."""
+    """Returns a link's model after the overrides; an unknown one is refused when the tables are resolved."""
     for path in (f"links.{link}", "link"):
         if f"{path}.model" in given:
             return given[f"{path}.model"]
@@ -131,18 +118,14 @@ def _model(scenario: Scenario, link: str, given: Mapping[str, Any]) -> Any:
     return scenario.links[link].__struct_config__.tag
 
 
-_KINDS = ("model", "preset", "law")
-"""Keys that say which other keys a table has."""
-
-
 def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
     """Writes overrides into the tables of a scenario, in place.
 
     Args:
         tables: as read from TOML.
         overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word. A number
-            means what stands there in a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. One
-            that names a kind (a link's model or preset, a law) replaces what the table said besides.
+            means the entry of a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. One that
+            names a kind (a link's model or preset, a law) replaces the table's other keys.
     """
     pairs = parse_overrides(overrides)
     overridden = {key for key, _ in pairs}
@@ -152,29 +135,23 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
         if len(folders) > 1 and folders[0] == "sites" and isinstance(sites, dict) and folders[1] not in sites:
             hint = suggest_nearest(folders[1], list(sites)) or f"; its sites are {', '.join(sites)}"
             raise ScenarioError(f"no such site{hint}", path=key)
-        table = _reached(tables, folders, last)
+        table = _reach_table(tables, folders, last)
         if isinstance(table, list):
-            table[_place(table, last, key)] = value
+            table[_list_index(table, last, key)] = value
             continue
-        if last in _KINDS:  # what the file says is of another kind
+        if any(last in keys for keys in _KIND_KEYS.values()):  # the file's other keys are of another kind
             for other in [k for k in table if ".".join([*folders, k]) not in overridden]:
                 del table[other]
         table[last] = value
 
 
-def _reached(tables: TomlTable, folders: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list that dotted keys lead to; tables that are not there are made.
-
-    Args:
-        tables: where to begin.
-        folders: keys of tables, and numbers of what stands in a list.
-        last: the key that will be sought in it.
-    """
+def _reach_table(tables: TomlTable, folders: Sequence[str], last: str) -> TomlTable | list[Any]:
+    """Returns the table or list at dotted keys, in which `last` is next; missing tables are added."""
     reached: Any = tables
     for depth, name in enumerate(folders):
         path = ".".join(folders[: depth + 1])
         if isinstance(reached, list):
-            entry = reached[_place(reached, name, path)]
+            entry = reached[_list_index(reached, name, path)]
         else:
             after = (*folders, last)[depth + 1]
             entry = reached.setdefault(name, [] if after.isdecimal() else {})
@@ -184,8 +161,8 @@ def _reached(tables: TomlTable, folders: Sequence[str], last: str) -> TomlTable 
     return reached  # type: ignore[no-any-return]
 
 
-def _place(entries: list[Any], name: str, path: str) -> int:
-    """Returns the place in a list that a part of a key means."""
+def _list_index(entries: list[Any], name: str, path: str) -> int:
+    """Returns the index in a list that a part of a key means."""
     if not name.isdecimal() or int(name) >= len(entries):
         counted = f"it has {len(entries)}, counted from 0" if entries else "it has none"
         raise ScenarioError(f"no such entry: {counted}", path=path)

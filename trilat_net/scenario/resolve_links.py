@@ -1,10 +1,7 @@
-"""Links and rows of the dominance matrix.
+"""Links and rows of the dominance matrix, from an author's tables to complete ones, with the link presets.
 
-From an author's tables to complete ones, with the named link presets.
-
-Invariant: what a person writes is checked in the shape in which it was written. A preset is what an
-author could have written (`scenarios/_presets.toml` has them, each with its source); a resolved scenario
-holds its keys, not its name.
+Invariant: tables are checked as the author wrote them. A preset is a table that an author could have written
+(`scenarios/_presets.toml` has them, each with its source); a resolved scenario holds its keys, not its name.
 """
 
 import tomllib
@@ -30,45 +27,34 @@ Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): roun
 and losses of 0 to 50 %. The points are ours; theirs are not known to us."""
 
 
-def _grid() -> dict[str, dict[str, Any]]:
-    """Returns the presets of the grid: half a round trip each way, every sample lost by itself."""
-    return {
-        f"rtt{round_trip_ms}-loss{percent}": {
-            "model": "constant",
-            "delay_ms": round_trip_ms / 2,
-            "loss": percent / 100,
-        }
-        for round_trip_ms in GRID_ROUND_TRIPS_MS
-        for percent in GRID_LOSSES_PERCENT
-    }
+_GRID: dict[str, dict[str, Any]] = {
+    f"rtt{rtt_ms}-loss{percent}": {"model": "constant", "delay_ms": rtt_ms / 2, "loss": percent / 100}
+    for rtt_ms in GRID_ROUND_TRIPS_MS
+    for percent in GRID_LOSSES_PERCENT
+}
+PRESETS: dict[str, dict[str, Any]] = {**tomllib.loads(_PRESETS_FILE.read_text(encoding="utf-8")), **_GRID}
+"""Keys of a link by the preset's name; those of the grid: half a round trip each way, single losses."""
+
+TRACE_KEYS = ("file", "of")
+"""Keys of an author that name the source of a trace; a resolved link has the trace instead."""
 
 
-PRESETS: dict[str, dict[str, Any]] = {**tomllib.loads(_PRESETS_FILE.read_text(encoding="utf-8")), **_grid()}
-"""Keys of a link by the preset's name."""
-
-_TRACE_KEYS = ("file", "of")
-"""Keys that say where a trace comes from; a resolved link has the trace in their place."""
-
-
-def resolve_dominance_row(row: TomlTable, names: list[str], own: int, path: str) -> TomlTable:
-    """Returns one row of the dominance matrix with every peer's share, checked."""
-    for peer, share in row.items():
-        if not is_number(share):
-            raise ScenarioError(f"must be a number, is {share!r}", path=f"{path}.{peer}")
-    fault = dominance.find_row_problem(np.array([float(row.get(peer, 0.0)) for peer in names]), own)
-    if fault:
-        raise ScenarioError(fault, path=path)
-    return {peer: float(row.get(peer, 0.0)) for peer in names if peer != names[own]}
+def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
+    """Returns a site's row of the dominance matrix, checked, with every peer's factor."""
+    row = check_keys(written, names, path)
+    for peer, factor in row.items():
+        if not is_number(factor):
+            raise ScenarioError(f"must be a number, is {factor!r}", path=f"{path}.{peer}")
+    factors = {name: float(row.get(name, 0.0)) for name in names}
+    problem = dominance.find_row_problem(np.array(list(factors.values())), names.index(site))
+    if problem:
+        raise ScenarioError(problem, path=path)
+    del factors[site]
+    return factors
 
 
 def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> TomlTable:
-    """Returns every link, complete, from [link] and [links].
-
-    Args:
-        tables: the scenario's.
-        names: the sites.
-        folder: where a trace's file lies; None where no file may be named.
-    """
+    """Returns every link, complete, from [link] and [links]; files of traces lie in `folder`, if any may."""
     every = [f"{j}->{i}" for i in names for j in names if i != j]
     written = check_keys(tables.get("links", {}), every, "links")
     default = resolve_link(tables.get("link", {}), {}, "link")
@@ -78,7 +64,7 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
         link = resolve_link(written.get(name, {}), default, path)
         if link["model"] == "trace":
             shared = "file" in default and "file" not in written.get(name, {})
-            link = _with_trace(link, name, "link" if shared else path, folder)
+            link = _read_trace_file(link, name, "link" if shared else path, folder)
         for field in msgspec.structs.fields(DELAY_MODELS[link["model"]]):
             if field.required and field.name not in link:
                 raise ScenarioError("is missing; give it here or in [link]", path=f"{path}.{field.name}")
@@ -87,14 +73,9 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
-    """Returns a link: what is written upon what it was, or anew where a model or a preset is named.
+    """Returns a link: what is written upon its base, or upon nothing if a model or a preset is named.
 
     The file of a trace is not read yet.
-
-    Args:
-        written: the author's table.
-        base: what the link is otherwise.
-        path: what errors call it.
     """
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
@@ -107,19 +88,19 @@ def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     if model != start.get("model", model):
         named = f"the preset {written['preset']!r} is {start['model']!r}: give one of the two"
         raise ScenarioError(f"is {model!r}, but {named}", path=f"{path}.model")
-    files = _TRACE_KEYS if model == "trace" else ()
+    files = TRACE_KEYS if model == "trace" else ()
     valid = ("model", "preset", *field_names(DELAY_MODELS[model]), *files)
     own = check_keys(written, valid, path)
-    replaced = _TRACE_KEYS if "trace" in own else ("trace",) if "file" in own else ()
+    replaced = TRACE_KEYS if "trace" in own else ("trace",) if "file" in own else ()
     link = {**{key: value for key, value in start.items() if key not in replaced}, **own, "model": model}
     link.pop("preset", None)
     return link
 
 
-def _with_trace(link: TomlTable, name: str, path: str, folder: Path | None) -> TomlTable:
-    """Returns a link that holds the trace of its file; of a log that of the link of its name, or of `of`."""
+def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None) -> TomlTable:
+    """Returns a link with the trace of its file; of a log that of the link of its name, or of `of`."""
     link = dict(link)
-    file, of = (link.pop(key, None) for key in _TRACE_KEYS)
+    file, of = (link.pop(key, None) for key in TRACE_KEYS)
     if ("trace" in link) == (file is not None):
         problem = "give either trace or file" if "trace" in link else "is missing: a table or a log of delays"
         raise ScenarioError(problem, path=f"{path}.file")

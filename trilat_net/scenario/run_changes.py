@@ -11,7 +11,7 @@ import msgspec
 from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import ScenarioError
 from .fields import TomlTable, check_keys, field_names, is_number, suggest_nearest
-from .resolve_links import resolve_dominance_row, resolve_link
+from .resolve_links import TRACE_KEYS, resolve_dominance_row, resolve_link
 from .scenario_types import Change, Scenario
 from .validate import check_change
 
@@ -19,33 +19,28 @@ LinkTables = dict[str, dict[str, Any]]
 
 
 def initial_link_tables(scenario: Scenario) -> LinkTables:
-    """Returns what every link is at the start, as tables."""
+    """Returns every link at the start, as tables."""
     return {name: msgspec.to_builtins(link) for name, link in scenario.links.items()}
 
 
 def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int) -> Change:
-    """Returns a change that somebody ordered, complete and checked.
+    """Returns a requested change, complete and checked.
 
     Args:
         scenario: the experiment.
-        present: what every link is now.
-        written: `link` or `dominance`, and what it is `to` be, as in a scenario's timeline.
-        from_ns: from when it holds, ns since the epoch.
+        present: every link as it is now.
+        written: `link` or `dominance`, and its new value `to`, as in a scenario's timeline.
+        from_ns: when it takes effect, ns since the epoch.
 
     Raises:
-        ScenarioError: there is no such link or site, or it cannot be that.
+        ScenarioError: there is no such link or site, or the value is not valid.
     """
-    change: dict[str, Any] = {**written, "at_s": from_ns / NS_PER_S}
+    change = {**written, "at_s": from_ns / NS_PER_S}
     if ("link" in change) == ("dominance" in change):
         raise ScenarioError("a change names either a link or, as dominance, a site")
-    if "link" in change:
-        change["to"] = change_link(change.get("to", {}), change["link"], present, "change")
-        if change["to"]["model"] == "trace":  # a record cannot hold it
-            raise ScenarioError("a link with a trace can only be given another model", path="change.to")
-    else:
-        change["to"] = change_dominance_row(
-            change.get("to", {}), change["dominance"], list(scenario.names), "change"
-        )
+    change["to"] = _resolve_target(change, present, list(scenario.names), "change")
+    if "link" in change and change["to"]["model"] == "trace":  # a record cannot hold it
+        raise ScenarioError("a link with a trace can only be given another model", path="change.to")
     try:
         complete = msgspec.convert(change, Change)
     except msgspec.ValidationError as error:
@@ -55,7 +50,7 @@ def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, A
 
 
 def find_owner(change: Change) -> str:
-    """Returns the site that carries a change out: a link belongs to its receiver."""
+    """Returns the site that carries a change out; a link belongs to its receiver."""
     return change.dominance or change.link.partition("->")[2]
 
 
@@ -70,10 +65,10 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Returns the command that a record of a site names.
+    """Returns the change that a text in a site's record names.
 
     Raises:
-        ScenarioError: it names none of that site's.
+        ScenarioError: it names no change of that site.
     """
     try:
         change = msgspec.json.decode(text, type=Change)
@@ -87,12 +82,12 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
     check_change(change, "cmd")
     if change.dominance:
-        change_dominance_row(change.to, change.dominance, list(scenario.names), "cmd")
+        resolve_dominance_row(change.to, list(scenario.names), change.dominance, "cmd.to")
     return to_core_change(scenario, change)
 
 
 def scheduled_link_tables(scenario: Scenario) -> list[tuple[int, str, dict[str, Any]]]:
-    """Returns what links become by the scenario's own timeline: (from when, ns, the link, its table)."""
+    """Returns the links of the scenario's own timeline: (first stamp, ns, the link, its table)."""
     return [(change.start_ns, change.link, change.to) for change in scenario.timeline if change.link]
 
 
@@ -119,51 +114,35 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
         for key in ("link", "dominance"):
             if not isinstance(change.get(key, ""), str):
                 raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
+        change["to"] = _resolve_target(change, present, names, path)
         if "link" in change:
-            change["to"] = present[change["link"]] = change_link(
-                change.get("to", {}), change["link"], present, path
-            )
-        else:
-            change["to"] = change_dominance_row(change.get("to", {}), change["dominance"], names, path)
+            present[change["link"]] = change["to"]
         changes.append(change)
     return changes
 
 
-def change_link(written: Any, link: str, present: TomlTable, path: str) -> TomlTable:
-    """Returns what a link becomes.
+def _resolve_target(change: TomlTable, present: TomlTable, names: list[str], path: str) -> TomlTable:
+    """Returns the complete link, or row of the dominance matrix, that a change leads to."""
+    written = change.get("to", {})
+    if "link" in change:
+        return _change_link(written, change["link"], present, path)
+    site = change["dominance"]
+    if site not in names:
+        hint = suggest_nearest(site, names) or f"; sites are {', '.join(names)}"
+        raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
+    return resolve_dominance_row(written, names, site, f"{path}.to")
 
-    Args:
-        written: what is to change of it.
-        link: its name.
-        present: what every link is now.
-        path: what errors call the change.
-    """
+
+def _change_link(written: Any, link: str, present: TomlTable, path: str) -> TomlTable:
     if link not in present:
         hint = suggest_nearest(link, list(present)) or f"; links are {', '.join(present)}"
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
-    after = resolve_link(written, present[link], f"{path}.to")
     before = present[link]
-    if "file" in after or "of" in after:
+    after = resolve_link(written, before, f"{path}.to")
+    if any(key in after for key in TRACE_KEYS):
         raise ScenarioError("no file can be named here", path=f"{path}.to.file")
     if after["model"] == "trace" and after.get("trace") != before.get("trace"):
         raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
     if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
         raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
     return {**after, "outages_s": before["outages_s"]} if "outages_s" in before else after
-
-
-def change_dominance_row(written: Any, site: str, names: list[str], path: str) -> TomlTable:
-    """Returns a row of the dominance matrix, complete and checked.
-
-    Args:
-        written: the shares; a peer that is not named has none.
-        site: whose row it is.
-        names: the sites.
-        path: what errors call the change.
-    """
-    if site not in names:
-        hint = suggest_nearest(site, names) or f"; sites are {', '.join(names)}"
-        raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
-    return resolve_dominance_row(
-        check_keys(written, names, f"{path}.to"), names, names.index(site), f"{path}.to"
-    )

@@ -13,14 +13,14 @@ from typing import Any
 from ..core.delay import MAX_DELAY_US
 from ..core.link import AHEAD_LIMIT_S, SAMPLE_DTYPE, calendar_pages
 from ..errors import ScenarioError
-from .fields import TomlTable, suggest_nearest
+from .fields import suggest_nearest
 from .override import apply_overrides, expand_overrides, parse_overrides
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
 
 MAX_LINKS_BYTES = 64 << 20
-"""Memory of a site's links, at most, in a scenario that somebody else wrote."""
+"""Most memory of a site's links in a scenario from a log or a peer."""
 
 _FOLDER = resources.files("trilat_net") / "scenarios"
 
@@ -32,7 +32,7 @@ def list_shipped() -> list[str]:
 
 
 def read_shipped(name: str) -> str:
-    """Returns the text of a shipped scenario as its author wrote it."""
+    """Returns the TOML text of a shipped scenario."""
     if name not in list_shipped():
         raise ScenarioError(
             f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
@@ -53,7 +53,7 @@ def load_scenario(
     """Returns a scenario by the name of a shipped one or by path, with overrides applied.
 
     Args:
-        source: a shipped name, a path, or a scenario, in which a key of a group counts for all (`spreading`).
+        source: a shipped name, a path, or a scenario, in which a key of a group applies to all (`override`).
         overrides: `{"control.Kd": 5}` or `["control.Kd=5"]`.
 
     Raises:
@@ -61,11 +61,8 @@ def load_scenario(
     """
     if isinstance(source, Scenario):
         try:
-            return (
-                parse_scenario(source.text, source.name, expand_overrides(source, parse_overrides(overrides)))
-                if overrides
-                else source
-            )
+            expanded = expand_overrides(source, parse_overrides(overrides))
+            return parse_scenario(source.text, source.name, expanded) if overrides else source
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     text, folder = read_source(source)
@@ -73,10 +70,7 @@ def load_scenario(
 
 
 def read_source(source: str | Path) -> tuple[str, Path]:
-    """Returns a scenario as its author wrote it, and the folder where files lie that it names.
-
-    Args:
-        source: a shipped name, or a path.
+    """Returns the TOML text of a shipped name or a path, and the folder of the files that it names.
 
     Raises:
         ScenarioError: it cannot be read.
@@ -95,7 +89,7 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     """Returns a site of a scenario.
 
     Raises:
-        ScenarioError: it has none of that name.
+        ScenarioError: it has no site of that name.
     """
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
@@ -115,15 +109,18 @@ def parse_scenario(
 
     Args:
         text: the TOML text.
-        source: what errors call it.
-        overrides: see `load`.
-        folder: where the files that it names lie; None where it may name none.
+        source: its name in errors.
+        overrides: see `load_scenario`.
+        folder: the folder of the files that it names; None: it may name none.
 
     Raises:
         ScenarioError: with the path of the offending key.
     """
     try:
-        tables = _tables(text)
+        try:
+            tables = tomllib.loads(text)
+        except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
+            raise ScenarioError(f"is not TOML: {error}") from None
         apply_overrides(tables, overrides)
         return build_scenario(resolve_scenario(tables, folder))
     except ScenarioError as error:
@@ -132,22 +129,11 @@ def parse_scenario(
         raise ScenarioError("is nested too deep", source=source) from None
 
 
-def _tables(text: str) -> TomlTable:
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
-        raise ScenarioError(f"is not TOML: {error}") from None
-
-
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Returns the scenario that a log or a peer holds: resolved, and written by who knows whom.
-
-    Args:
-        text: the TOML text.
-        source: what errors call it.
+    """Returns the resolved scenario of a log or a peer, which is not trusted.
 
     Raises:
-        ScenarioError: it is none, or names a file, or leaves to defaults what would fill the memory.
+        ScenarioError: it is not valid, or names a file, or would fill the memory by its defaults.
     """
     scenario = parse_scenario(text, source, folder=None)
     changed = (change.after for change in scenario.timeline if change.link)
@@ -156,8 +142,9 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
         raise ScenarioError("its traces are not written out, link by link", source=source)
     for name in scenario.names:
         rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(name)]
-        if sum(map(_pages_at_most, rates)) * SAMPLE_DTYPE.itemsize <= MAX_LINKS_BYTES:
-            continue  # plainly little: the compiled core takes half a second to load, and a log opens faster
+        bound = sum(2 * ((MAX_DELAY_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3) for rate_hz in rates)
+        if bound * SAMPLE_DTYPE.itemsize <= MAX_LINKS_BYTES:
+            continue  # `calendar_pages` is never more; calling it would load the compiled core, half a second
         pages = sum(map(calendar_pages, rates))
         if pages * SAMPLE_DTYPE.itemsize > MAX_LINKS_BYTES:
             wanted = pages * SAMPLE_DTYPE.itemsize >> 20
@@ -167,8 +154,3 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
                 source=source,
             )
     return scenario
-
-
-def _pages_at_most(rate_hz: int) -> int:
-    """Returns what `calendar_pages` does not exceed."""
-    return 2 * ((MAX_DELAY_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3)

@@ -1,6 +1,4 @@
-"""The types of a complete scenario.
-
-Sites, scripted changes, the scenario itself, and the core's setup of each site.
+"""The types of a complete scenario: sites, scripted changes, itself, and the core's setup of each site.
 
 Invariant: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it loads to the
 same scenario, and its SHA-256 names the experiment. A change names the time from which it holds and is
@@ -44,8 +42,8 @@ class Arm(Frozen, frozen=True):
         lc2_m: distance of its centre of mass from joint 2, m.
         I2_kg_m2: inertia about its centre of mass, kg m^2.
         g_m_s2: gravitational acceleration, m/s^2.
-        known: false where nobody knows masses and inertias, as of a real arm that was not identified: they
-            are then in no formula. Only for an arm outside of the program.
+        known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
+            formula. Only for an arm outside of the program.
     """
 
     l1_m: Positive = 1.0
@@ -66,12 +64,12 @@ class Arm(Frozen, frozen=True):
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """What a site does about a peer whose sample in use is too old.
+    """The rule for a peer whose sample in use is too old.
 
     Attributes:
         action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is.
-        age_ms: older than this is too old, ms.
-        return_s: how long the way back takes once a fresh sample is in use, s.
+        age_ms: the age beyond which it is too old, ms.
+        return_s: duration of the return once a fresh sample is in use, s.
     """
 
     action: Literal["use", "hold", "brake"] = "use"
@@ -80,14 +78,14 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> StaleRule:
-        """The same, as the core has it."""
+        """The rule as the core has it."""
         return StaleRule(
             StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
         )
 
 
 class Limits(Frozen, frozen=True):
-    """Where a run stops being physics.
+    """The limits of a site.
 
     Attributes:
         tau_limit_nm: largest control torque of a joint, N m; more is cut off.
@@ -102,17 +100,17 @@ class SiteSpec(Frozen, frozen=True):
     """One manipulator.
 
     Attributes:
-        role: what it is to a reader of figures; enters no formula.
+        role: its role for a reader of figures; enters no formula.
         rate_hz: tick rate of its loop, Hz.
         q0_rad: start pose, rad.
         qd0_rad_s: start velocity, rad/s.
         arm: its links.
         control: its law and gains.
-        limits: where it stops.
-        on_stale: what it does about a peer whose samples are too old.
-        hands: what its operator does.
-        environment: what it meets.
-        plant: "simulated"; or "external": an arm outside of the program, whose measured state comes in.
+        limits: its limits.
+        on_stale: its rule for a peer whose samples are too old.
+        hands: its operators.
+        environment: its environment.
+        plant: "simulated"; or "external": an arm outside of the program, whose state is measured.
     """
 
     role: Literal["master", "slave"]
@@ -128,15 +126,19 @@ class SiteSpec(Frozen, frozen=True):
     plant: Literal["simulated", "external"] = "simulated"
 
 
+SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
+"""Tables that a scenario may have for all sites, and each site for itself."""
+
+
 class Change(Frozen, frozen=True, omit_defaults=True):
     """One change. Exactly one of `link` and `dominance` is given.
 
     Attributes:
         at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then on.
         link: the link that it changes, as in "m1->s".
-        dominance: the site whose shares it changes.
-        to: all that the link is from then on, or all shares of the row.
-        ramp_s: how long shares take to change, linearly, s.
+        dominance: the site whose dominance factors it changes.
+        to: the whole link from then on, or all factors of the row.
+        ramp_s: duration of the linear change of the factors, s.
     """
 
     at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
@@ -157,30 +159,30 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shares(self) -> dict[str, float]:
-        """The shares at the end of the change."""
+        """The dominance factors at the end of the change."""
         return self.to
 
 
 def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
-    """Yields what a link becomes, with the first stamp for which it holds, ns, in order."""
+    """Yields the later states of a link, each with its first stamp, ns, in order."""
     for change in timeline:
         if change.link == name:
             yield change.start_ns, change.after
 
 
-_UNASKED: dict[str, tuple[Any, ...]] = {
+_ABSENT: dict[str, tuple[Any, ...]] = {
     "timeline": ((), []),
     "expect": ({},),
     "on_stale": ({},),
     "environment": ((), []),
     "plant": ("simulated",),
 }
-"""Keys that older scenarios do not have, and the values that say nothing."""
+"""Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 
 
-def _one_line(numbers: re.Match[str]) -> str:
-    """Puts a list of numbers on one line."""
+def _join_lines(numbers: re.Match[str]) -> str:
+    """Returns a list of numbers on one line."""
     return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
 
 
@@ -188,18 +190,18 @@ class Scenario(Frozen, frozen=True, dict=True):
     """An experiment, resolved: every value of every site and link is explicit.
 
     Attributes:
-        name: what the session and the log are called.
+        name: the name of the session and the log.
         title: one line for people.
         about: a paragraph for people.
-        assumed: what the source of the experiment does not say, and is assumed here.
-        duration_s: how long it runs, s.
-        seed: what every random draw is a function of.
-        scheme: "second_order" or "digital", see `core.site.Scheme`.
+        assumed: assumptions that the source of the experiment does not state.
+        duration_s: its duration, s.
+        seed: every random draw is a function of it.
+        scheme: "second_order" or "digital", see `Scheme`.
         sites: the manipulators, in order; the first leads a live session.
-        dominance: row i, column j: share of site j in the reference of site i, Eq. (6).
+        dominance: row i, column j: factor of site j in the reference of site i, Eq. (6).
         links: "j->i" for every pair of sites.
-        timeline: what changes during the run.
-        expect: what `trilat test` demands of it.
+        timeline: changes during the run.
+        expect: expectations, see `trilat test`.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
@@ -227,7 +229,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def beta(self) -> Array | None:
-        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None where alpha is reducible."""
+        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None if alpha is reducible."""
         return dominance.perron_vector(self.alpha) if dominance.is_irreducible(self.alpha) else None
 
     @cached_property
@@ -240,19 +242,19 @@ class Scenario(Frozen, frozen=True, dict=True):
             if site["arm"]["known"]:
                 del site["arm"]["known"]
         for table in (tables, *tables["sites"].values()):
-            for key, unasked in _UNASKED.items():  # what nobody asked for is not there
-                if table.get(key) in unasked:
+            for key, absent in _ABSENT.items():
+                if table.get(key) in absent:
                     del table[key]
-        numbers = _NUMBERS.sub(_one_line, tomli_w.dumps(tables))
+        numbers = _NUMBERS.sub(_join_lines, tomli_w.dumps(tables))
         return tomli_w.dumps(words, multiline_strings=True) + numbers
 
     @cached_property
     def sha256(self) -> str:
-        """Names the experiment: hash of the canonical text."""
+        """The hash of the canonical text, which names the experiment."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def ticks(self, site: str) -> int:
-        """Returns how many ticks a site makes."""
+        """Returns the number of ticks of a site."""
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
@@ -260,18 +262,18 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns what every link is at any time of the run."""
+        """Returns every state of every link in the run."""
         later = [link for name in self.links for _, link in scheduled_links(self.timeline, name)]
         return [*self.links.values(), *later]
 
     @property
     def random(self) -> bool:
-        """True where anything is drawn: then another seed is another run."""
+        """True if anything is drawn: then another seed is another run."""
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True where a sample of some link is in use as soon as it has come: then the network decides."""
+        """True if some link injects no delay: then the real network decides."""
         return any(link.measured for link in self._all_links())
 
     @property
@@ -323,11 +325,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> DominanceRamp:
-        """Returns a change of a site's shares, as the core has it."""
+        """Returns a change of a site's dominance factors, as the core has it."""
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def without_hands(self) -> "Scenario":
-        """Returns the same experiment with nobody at the arms: the twin that hands are measured against."""
+        """Returns the same experiment without operators."""
         sites = {name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()}
         return msgspec.structs.replace(self, sites=sites)

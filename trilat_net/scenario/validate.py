@@ -14,10 +14,10 @@ import msgspec
 
 from ..core.two_link_arm import is_positive_definite
 from ..errors import ScenarioError
-from . import expect
 from .delay_models import ConstantDelay, Link, LinkBase, TraceDelay
+from .expect import find_expect_problem
 from .fields import TomlTable
-from .laws import AdaptiveBox, ForceReflecting, ProportionalDamped, ProportionalDerivativeDamped
+from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
 from .operators import EndEffectorSpring, Environment, JointSpring, Operator, RecordedTorque, Wall
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
@@ -26,61 +26,39 @@ FORCE_REFLECTION_SITES = 2
 
 
 def check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a law that its site cannot carry out, and an arm that is not what its plant says.
-
-    Args:
-        name: the site's name.
-        site: the site.
-        sites: how many there are in the experiment.
+    """Refuses a law that a site, one of so many, cannot carry out, and an arm that contradicts its plant.
 
     Raises:
         ScenarioError: with the path of the key.
     """
     path, law = f"sites.{name}", site.control
-    outside = site.plant == "external"
-    if not site.arm.known and not outside:
+    external = site.plant == "external"
+    if not site.arm.known and not external:
         raise ScenarioError(
             "a simulated arm moves by its masses: leave it true, or set plant = 'external' for an arm "
             "outside of the program",
             path=f"{path}.arm.known",
         )
     if isinstance(law, AdaptiveBox):
-        _check_box(law, f"{path}.control")
+        law.check(f"{path}.control")
     if isinstance(law, ForceReflecting) and sites != FORCE_REFLECTION_SITES:
         raise ScenarioError(
             f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more of "
             "them it is not said whose contact a site feels; choose p_d, pd_d or adaptive, or two sites",
             path=f"{path}.control.law",
         )
-    if (
-        isinstance(law, ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting)
-        and not site.arm.known
-        and law.gravity * site.arm.g_m_s2 > 0.0
-    ):
+    if isinstance(law, KnownGravityLaw) and not site.arm.known and law.gravity * site.arm.g_m_s2 > 0.0:
         raise ScenarioError(
             f"{law.__struct_config__.tag} takes gravity from the arm's masses, which nobody knows "
             "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
             "horizontal plane, or choose adaptive, which learns it",
             path=f"{path}.control.gravity",
         )
-    for group in ("hands", "environment") if outside else ():
+    for group in ("hands", "environment") if external else ():
         if getattr(site, group):
             raise ScenarioError(
                 "an arm outside of the program is pushed outside of it: leave them out",
                 path=f"{path}.{group}",
-            )
-
-
-def _check_box(law: AdaptiveBox, path: str) -> None:
-    """Refuses a box without an inside, and a first estimate that is not in it."""
-    for n, (low, first, high) in enumerate(zip(law.theta_low, law.theta_hat0, law.theta_high, strict=True)):
-        if low > high:
-            raise ScenarioError(
-                f"must be at least theta_low = {low:g}, is {high:g}", path=f"{path}.theta_high[{n}]"
-            )
-        if not low <= first <= high:
-            raise ScenarioError(
-                f"must lie in its box from {low:g} to {high:g}, is {first:g}", path=f"{path}.theta_hat0[{n}]"
             )
 
 
@@ -103,8 +81,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at ")
-        dotted = _dotted(resolved, path.strip("`"))
-        raise ScenarioError(_plain(problem, dotted), path=dotted) from None
+        dotted = _dotted_path(resolved, path.strip("`"))
+        raise ScenarioError(_reword(problem, dotted), path=dotted) from None
     for name, site in scenario.sites.items():
         if not is_positive_definite(site.arm.theta):
             raise ScenarioError(
@@ -115,48 +93,43 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     for name, link in scenario.links.items():
-        if found := link.fault():
+        if found := link.find_problem():
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
-    scenario = msgspec.structs.replace(scenario, timeline=tuple(map(_spelt, scenario.timeline)))
-    if expected := expect.find_expect_problem(scenario.expect, scenario.names):
-        key, problem = expected
-        raise ScenarioError(problem, path=f"expect.{key}")
-    return scenario
+    if found := find_expect_problem(scenario.expect, scenario.names):
+        raise ScenarioError(found.problem, path=f"expect.{found.key}")
+    return msgspec.structs.replace(scenario, timeline=tuple(map(_normalise_change, scenario.timeline)))
 
 
 def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
-    """Refuses what ends before it begins, a wall without a side, and recorded torque out of order."""
+    """Refuses actors that end before they begin, walls without a side, and recorded torque out of order."""
     for n, actor in enumerate(actors):
+        key, problem = "", ""
         if isinstance(actor, RecordedTorque):
             if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
-                raise ScenarioError("must be in the order of their times", path=f"{path}[{n}].points")
-            continue
-        if actor.end_s <= actor.start_s:
-            raise ScenarioError(
-                f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}",
-                path=f"{path}[{n}].end_s",
-            )
-        if isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
-            raise ScenarioError("must point somewhere, is zero", path=f"{path}[{n}].normal")
-        if isinstance(actor, JointSpring | EndEffectorSpring) and actor.move_end_s < actor.move_start_s:
-            raise ScenarioError(
-                f"must not be before move_start_s = {actor.move_start_s:g}, is {actor.move_end_s:g}",
-                path=f"{path}[{n}].move_end_s",
-            )
+                key, problem = "points", "must be in the order of their times"
+        elif actor.end_s <= actor.start_s:
+            key, problem = "end_s", f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}"
+        elif isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
+            key, problem = "normal", "must point somewhere, is zero"
+        elif isinstance(actor, JointSpring | EndEffectorSpring) and actor.move_end_s < actor.move_start_s:
+            start_s, end_s = actor.move_start_s, actor.move_end_s
+            key, problem = "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
+        if problem:
+            raise ScenarioError(problem, path=f"{path}[{n}].{key}")
 
 
-def _spelt(change: Change) -> Change:
-    """Returns a change with its link spelt as in `links`, so that 350 and 350.0 are one experiment."""
+def _normalise_change(change: Change) -> Change:
+    """Returns a change with its link written as in `links`, so that 350 and 350.0 are one experiment."""
     if not change.link:
         return change
     return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses a rule by which a site would hold for ever: its links' delay alone is older than that."""
+    """Refuses a rule by which a site would always hold: the delay of its links alone exceeds its age."""
     for name, site in scenario.sites.items():
         for peer in scenario.peers(name):
             link = scenario.links[f"{peer}->{name}"]
@@ -171,22 +144,22 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 
 def check_change(change: Change, path: str) -> None:
-    """Refuses a change that makes no link of its link."""
+    """Refuses a change after which its link is not valid."""
     if not change.link:
         return
     if change.ramp_s:
         raise ScenarioError("a link changes at once; only shares have a ramp", path=f"{path}.ramp_s")
     try:
-        found = change.after.fault()
+        found = change.after.find_problem()
     except msgspec.ValidationError as error:
         problem, _, key = str(error).partition(" - at ")
-        raise ScenarioError(_plain(problem, key.strip("`$.")), path=f"{path}.to{key.strip('`$')}") from None
+        raise ScenarioError(_reword(problem, key.strip("`$.")), path=f"{path}.to{key.strip('`$')}") from None
     if found:
         raise ScenarioError(found.problem, path=f"{path}.to.{found.key}")
 
 
-def _plain(problem: str, path: str) -> str:
-    """Puts a validation message into the words of a scenario's author."""
+def _reword(problem: str, path: str) -> str:
+    """Returns a validation message in the words of a scenario's author."""
     if problem.startswith("Invalid enum value"):
         choices = _CHOICES[path.rpartition(".")[2]]
         return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"
@@ -198,32 +171,32 @@ def _plain(problem: str, path: str) -> str:
     return problem
 
 
-def _dotted(resolved: TomlTable, path: str) -> str:
-    """Turns `$.sites[...].control.Kp[0]` into the dotted path of the first value that it can mean."""
+def _dotted_path(resolved: TomlTable, path: str) -> str:
+    """Returns the dotted path of the first value that `$.sites[...].control.Kp[0]` can mean."""
     parts = re.findall(r"\.?([^.\[\]]+|\[[^\]]*\])", path.removeprefix("$"))
-    return _search(resolved, [p for p in parts if p], "") or path.removeprefix("$.")
+    return _follow_path(resolved, [p for p in parts if p], "") or path.removeprefix("$.")
 
 
-def _search(value: Any, parts: list[str], path: str) -> str:
-    """Follows the parts; where one is `[...]` (any key), takes the entry whose value breaks the rule."""
+def _follow_path(value: Any, parts: list[str], path: str) -> str:
+    """Follows the parts; for `[...]`, any key, takes the entry whose value is not valid."""
     if not parts:
         return path
     head, rest = parts[0], parts[1:]
     if head == "[...]":
         found = ""
         for key in value:
-            found = _search(value[key], rest, f"{path}.{key}")
-            if found and not _valid_entry(path, value[key]):
+            found = _follow_path(value[key], rest, f"{path}.{key}")
+            if found and not _is_valid_entry(path, value[key]):
                 return found
         return found
     if head.startswith("["):
-        return _search(value[int(head[1:-1])], rest, f"{path}{head}")
+        return _follow_path(value[int(head[1:-1])], rest, f"{path}{head}")
     if isinstance(value, dict) and head in value:
-        return _search(value[head], rest, f"{path}.{head}" if path else head)
+        return _follow_path(value[head], rest, f"{path}.{head}" if path else head)
     return f"{path}.{head}" if path else head
 
 
-def _valid_entry(folder: str, entry: Any) -> bool:
+def _is_valid_entry(folder: str, entry: Any) -> bool:
     kind: Any = {"sites": SiteSpec, "links": Link}.get(folder)
     try:
         msgspec.convert(entry, kind)
