@@ -20,7 +20,7 @@ from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
 from ..log.log_layout import collect_provenance
 from ..net.clock import SystemClock
-from ..scenario.laws import ImportedLaw, source_sha256
+from ..scenario.laws import ImportedLaw, hash_law_source
 
 CONNECT_S = 10.0
 """A scheduler that does not answer within this time, or has no worker by then, is given up."""
@@ -91,7 +91,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     missing = []
     for code, sha256 in laws:
         try:
-            found = source_sha256(code, "control.law")
+            found = hash_law_source(code, "control.law")
         except ScenarioError:
             found = ""
         if found != sha256:
