@@ -12,7 +12,7 @@ from tests.log.dealt import a_file, changed, messages
 from tests.log_editing import edited, opened, recorded
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError
-from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, add_unit_suffix, iterate_tables
+from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, add_unit_suffix
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats
 
@@ -28,7 +28,7 @@ LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.si
 @pytest.mark.parametrize("which", LOGS)
 def test_names_are_unique_end_in_their_unit_and_every_column_says_what_it_is(which: str) -> None:
     log = LOGS[which]()
-    for table in iterate_tables(log):
+    for table in log.tables():
         names = [column.name for column in table.columns]
         assert len(set(names)) == len(names)
         for column in table.columns:

@@ -6,7 +6,6 @@ from typing import Any
 
 from tests.analysis import logs
 from tests.log_editing import opened, recorded
-from trilat_net.log.data_tables import iterate_tables
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
 from trilat_net.reporting.export import Exporter, ExportFormat
@@ -41,7 +40,7 @@ def expected() -> dict[str, dict[str, list[Any]]]:
     """Per table the values of every column, as Python's own; None where there is none."""
     return {
         table.label: {column.name: column.rows(0, len(table)) for column in table.columns}
-        for table in iterate_tables(log())
+        for table in log().tables()
     }
 
 

@@ -18,7 +18,7 @@ from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -30,66 +30,62 @@ from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from .accounting import SessionAccounts
+from .data_tables import (
+    EVENTS_TABLE,
+    SITE_TABLE_KINDS,
+    Table,
+    build_arrivals_table,
+    build_events_table,
+    build_link_table,
+    build_state_table,
+    to_data_frame,
+)
 from .log_layout import ACCOUNTS, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
-from .record_columns import Ints
-from .site_log import MessageTimes, SiteLog
+from .site_log import MessageTimes, SiteLog, TimedMessages
 
 if TYPE_CHECKING:
     import polars
-
-    from .data_tables import Table
 
 
 M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
-class TimedMessages(NamedTuple, Generic[M]):
-    """Messages with the times at which they came and were sent, Unix ns, shape (K,) each."""
-
-    messages: list[M]
-    log_ns: Ints
-    publish_ns: Ints
-
-
 class Log:
-    """A session as it was recorded; `log["m1"]` is a site's part.
+    """A recorded session; `log["m1"]` is a site's part.
 
     Args:
-        whole: what its file holds, or its files together.
+        contents: the contents of its file, or of its files together.
 
     Attributes:
-        source: the file's name; those of several files, joined.
+        source: the file's name; of several files the first one's, and how many there are.
         sources: the names of its files, in order.
-        session: what the file says of the session: driver, seed, epoch, versions, commit, fingerprint.
+        session: metadata of the session: driver, seed, epoch, versions, commit, fingerprint.
         scenario: the scenario that ran.
-        scenario_text: its text, as it stands in the file.
+        scenario_text: its text, as it is in the file.
         scenario_sha256: the hash of that.
-        events: what happened, per member in order.
+        events: the events, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
 
     Raises:
         LogError: its scenario or an event cannot be read.
     """
 
-    def __init__(self, whole: LogContents) -> None:
-        self.sources = whole.sources
-        self.source = whole.source
-        self.session = whole.session
-        self.scenario_sha256 = hashlib.sha256(whole.scenario).hexdigest()
+    def __init__(self, contents: LogContents) -> None:
+        self.sources = contents.sources
+        self.source = contents.source
+        self.session = contents.session
+        self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
-            self.scenario_text = whole.scenario.decode()
+            self.scenario_text = contents.scenario.decode()
             self.scenario: Scenario = parse_embedded(self.scenario_text, f"{self.source}: scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
-        self.damaged = whole.damaged
-        self._whole = whole
+        self.damaged = contents.damaged
+        self._contents = contents
         self._sites: dict[str, SiteLog] = {}
-        ends = f"/{topics.EVENT}"
-        self.events = [
-            e for topic in sorted(whole.channels) if topic.endswith(ends) for e in self._events(topic)
-        ]
+        self.events = [event for topic in self._event_topics() for event in self._read_events(topic)]
 
     def __repr__(self) -> str:
         try:
@@ -105,19 +101,22 @@ class Log:
     def _topic(self, member: str, channel: str) -> str:
         return "/" + topics.key(self.session["session"], member, channel)
 
-    def _channel(self, topic: str) -> ChannelMessages:
-        return self._whole.channels.get(topic) or ChannelMessages()
+    def _event_topics(self) -> list[str]:
+        return [topic for topic in sorted(self._contents.channels) if topic.endswith(f"/{topics.EVENT}")]
 
-    def _decoded(self, topic: str, kind: type[M]) -> Iterator[M]:
+    def _channel(self, topic: str) -> ChannelMessages:
+        return self._contents.channels.get(topic) or ChannelMessages()
+
+    def _decode(self, topic: str, kind: type[M]) -> Iterator[M]:
         try:
             for payload in self._channel(topic).payloads:
                 yield decode(payload, kind, READABLE)
         except WireError as error:
             raise LogError(f"{self.source}: a message on {topic} cannot be read: {error}") from None
 
-    def _events(self, topic: str) -> list[Event]:
-        """Returns a member's events in order: one that came late stands where it belongs."""
-        events = list(self._decoded(topic, Event))
+    def _read_events(self, topic: str) -> list[Event]:
+        """Returns a member's events in order: one that came late belongs before those that it precedes."""
+        events = list(self._decode(topic, Event))
         boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
         return sorted(events, key=lambda event: (boots[event.boot], event.n))
 
@@ -128,20 +127,20 @@ class Log:
 
     @property
     def driver(self) -> str:
-        """What drove the session: "live" or "virtual"."""
+        """Driver of the session: "live" or "virtual"."""
         return self.session["driver"]
 
     @cached_property
     def complete(self) -> bool:
-        """False where the file was not finished.
+        """False if the file was not finished.
 
         Of several files all must be finished, or the last one, if no record is missing all the same.
         """
-        if self._whole.complete or len(self.sources) == 1:
-            return self._whole.complete
-        made = self._made()
-        lacks = any(name not in made or self.missing(name) for name in self.sites)
-        return self._whole.ended and not lacks
+        if self._contents.complete or len(self.sources) == 1:
+            return self._contents.complete
+        ticks = self._stated_ticks()
+        lacks = any(name not in ticks or self.missing(name) for name in self.sites)
+        return self._contents.ended and not lacks
 
     @cached_property
     def accounts(self) -> dict[str, str]:
@@ -149,34 +148,32 @@ class Log:
 
         Of several files, what is in all of them together.
         """
-        written = self._whole.metadata.get(ACCOUNTS, {})
-        return written if len(self.sources) == 1 else {**self._make_accounts(), **written}
-
-    def _make_accounts(self) -> dict[str, str]:
-        """Returns the accounts of the sites' channels, made from what is there."""
+        written = self._contents.metadata.get(ACCOUNTS, {})
+        if len(self.sources) == 1:
+            return written
         rates_hz = {name: self.scenario.sites[name].rate_hz for name in self.sites}
         accounts = SessionAccounts(self.session["session"], rates_hz)
         for name in self.sites:
-            numbers = {
+            sequences = {
                 topics.STATE: self[name].tick.tolist(),
                 topics.LINK: [stats.tick for stats in self.link_stats(name)],
                 topics.EVENT: [event.n for event in self.events if event.member == name and event.n >= 0],
             }
-            for channel in numbers:
+            for channel in sequences:
                 accounts.open(self._topic(name, channel))
-            for channel, sequences in numbers.items():
-                for sequence in sequences:
-                    accounts.take(self._topic(name, channel), sequence)
-        for name, ticks in self._made().items():
+            for channel, numbers in sequences.items():
+                for number in numbers:
+                    accounts.take(self._topic(name, channel), number)
+        for name, ticks in self._stated_ticks().items():
             accounts.expect(name, ticks)
-        return accounts.texts()
+        return {**accounts.texts(), **written}
 
     def account(self, site: str) -> str:
         """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
-    def _made(self) -> dict[str, int]:
-        """Returns how many ticks each site made, of those that said so."""
+    def _stated_ticks(self) -> dict[str, int]:
+        """Returns how many ticks each site made, of those that stated it."""
         most = {name: self.scenario.ticks(name) for name in self.sites}
         ends = [event for event in self.events if event.kind == "end" and event.member in most]
         return {event.member: min(max(event.ticks, 0), most[event.member]) for event in ends}
@@ -184,24 +181,18 @@ class Log:
     def missing(self, site: str) -> int:
         """Returns how many records of a site are missing: of those that it made, else up to its last one."""
         part = self[site]
-        behind = self._made().get(site, 0) - (int(part.tick[-1]) + 1 if len(part) else 0)
-        return part.missing + max(0, behind)
+        after_last = self._stated_ticks().get(site, 0) - (int(part.tick[-1]) + 1 if len(part) else 0)
+        return part.missing + max(0, after_last)
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
             raise KeyError(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
-            part = SiteLog(
-                site,
-                self.scenario.peers(site),
-                self.scenario.sites[site].rate_hz,
-                channel.payloads,
-                self.source,
-                MessageTimes(*channel.times()),
-            )
+            rate_hz, times = self.scenario.sites[site].rate_hz, MessageTimes(*channel.times())
+            part = SiteLog(site, self.scenario.peers(site), rate_hz, channel.payloads, self.source, times)
             most = self.scenario.ticks(site)
-            if len(part) and part.tick[-1] >= most:  # nobody counts up to what a stranger says
+            if len(part) and part.tick[-1] >= most:  # a tick of others is nothing to count up to
                 last = int(part.tick[-1])
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")
             self._sites[site] = part
@@ -210,13 +201,13 @@ class Log:
     def changes(self, site: str) -> dict[int, list[str]]:
         """Returns the texts of the changes that a site took in, by tick, in order.
 
-        They stand in its records, and in its events, which tell of those whose record is missing.
+        They are in its records, and in its events, which also have those whose record is missing.
         """
         named = self[site].changes()
-        told = [event for event in self.events if event.kind == "change" and event.member == site]
-        have = set(self[site].tick.tolist()) if told else set()
-        for event in told:
-            if event.ticks not in have:
+        events = [event for event in self.events if event.kind == "change" and event.member == site]
+        recorded = set(self[site].tick.tolist()) if events else set()
+        for event in events:
+            if event.ticks not in recorded:
                 named.setdefault(event.ticks, []).append(event.command)
         return dict(sorted(named.items()))
 
@@ -241,28 +232,27 @@ class Log:
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
         """Returns the same with the times at which they came and were sent."""
         topic = self._topic(site, topics.LINK)
-        stats = list(self._decoded(topic, LinkStats))
+        stats = list(self._decode(topic, LinkStats))
         order = sorted(range(len(stats)), key=lambda n: stats[n].tick)
-        return TimedMessages(
-            [stats[n] for n in order], *(times[order] for times in self._channel(topic).times())
-        )
+        times = (column[order] for column in self._channel(topic).times())
+        return TimedMessages([stats[n] for n in order], *times)
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns what happened, in the order in which the recorder learnt of it, with times as well."""
-        found = [topic for topic in sorted(self._whole.channels) if topic.endswith(f"/{topics.EVENT}")]
-        events = [event for topic in found for event in self._decoded(topic, Event)]
-        times = [self._channel(topic).times() for topic in found]
+        """Returns the events in the order in which they came to the recorder, with times as well."""
+        found = self._event_topics()
+        events = [event for topic in found for event in self._decode(topic, Event)]
         if not events:
             return TimedMessages([], *ChannelMessages().times())
+        times = [self._channel(topic).times() for topic in found]
         log_ns, publish_ns = (np.concatenate(column) for column in zip(*times, strict=True))
         order = np.argsort(log_ns, kind="stable")
         return TimedMessages([events[n] for n in order.tolist()], log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Returns what the recorder said of its own work, in order."""
-        return list(self._decoded(self._topic(topics.RECORDER, topics.STATS), RecorderStats))
+        """Returns the recorder's statistics of its own work, in order."""
+        return list(self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats))
 
-    def table(self, name: str, kind: str = "") -> "Table":
+    def table(self, name: str, kind: str = "") -> Table:
         """Returns a part of the log as a table: columns with names, units and meanings.
 
         Args:
@@ -272,11 +262,26 @@ class Log:
 
         Raises:
             KeyError: there is no such part.
-            LogError: what is in it cannot be read.
+            LogError: its messages cannot be read.
         """
-        from .data_tables import build_table
+        if name == EVENTS_TABLE and name not in self.sites:
+            return build_events_table(self.timed_events(), self.source)
+        site = self[name]
+        match kind:
+            case "" | "state":
+                return build_state_table(site, {p: self.scenario.sites[p].rate_hz for p in site.peers})
+            case "link":
+                return build_link_table(site, self.timed_link_stats(name), self.source)
+            case "arrivals":
+                return build_arrivals_table(site, self.source, live=self.driver == "live")
+        raise KeyError(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
 
-        return build_table(self, name, kind)
+    def tables(self) -> Iterator[Table]:
+        """Yields every table, one at a time: of each site, and the events."""
+        for site in self.sites:
+            for kind in SITE_TABLE_KINDS:
+                yield self.table(site, kind)
+        yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
         """Returns the same as a polars data frame; pandas has it by `log.frame("m1").to_pandas()`.
@@ -284,8 +289,6 @@ class Log:
         Raises:
             UsageError: polars is not installed.
         """
-        from .data_tables import to_data_frame
-
         return to_data_frame(self.table(name, kind))
 
 
@@ -297,41 +300,41 @@ def open_log(
     Args:
         source: a path, or a file opened for reading.
         more: further parts.
-        progress: told while they are read how many bytes are, and how many there are in all.
+        progress: called while they are read.
 
     Raises:
         LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of different
-            sessions, or tell the same differently.
+            sessions, or disagree on a message.
     """
     parts: list[LogContents] = []
     with ExitStack() as stack:
-        files = [_opened(one, stack) for one in (source, *more)]
-        sizes = [_size(stream) for stream, _ in files]
+        files = [_open(one, stack) for one in (source, *more)]
+        sizes = [_measure(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
-            told = shift_progress(progress, sum(sizes[:n]), sum(sizes))
-            with _readable(name):
-                parts.append(read_contents(stream, name, told))
+            with _reading(name):
+                shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
+                parts.append(read_contents(stream, name, shifted))
     return Log(merge_parts(parts))
 
 
-def _opened(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
+def _open(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
     """Returns a file and its name; one that is opened here is closed with the stack."""
     if not isinstance(source, str | Path):
         return source, "log"
-    with _readable(str(source)):
+    with _reading(str(source)):
         return stack.enter_context(Path(source).open("rb")), str(source)
 
 
 @contextmanager
-def _readable(name: str) -> Iterator[None]:
+def _reading(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         raise LogError(f"{name}: cannot be read: {error.strerror}{describe_unfinished(Path(name))}") from None
 
 
-def _size(stream: BinaryIO) -> int:
-    """Returns how many bytes a file has from where it stands."""
+def _measure(stream: BinaryIO) -> int:
+    """Returns how many bytes a file has from its current position on."""
     here = stream.tell()
     size = stream.seek(0, os.SEEK_END)
     stream.seek(here)
@@ -343,22 +346,18 @@ DelayRow = tuple[float, float]
 
 
 def read_link_delays(path: Path, link: str) -> list[DelayRow]:
-    """Returns how long the samples of a link were under way, by their own stamps.
+    """Returns the delays of the samples of a link such as "m1->s", by their own stamps.
 
-    These are the delays of the network that carried them, as the receiver's records have them in `rx`; what
-    the session's scenario injected besides is not in them. A negative one is a matter of clocks and counts
-    as none; of a sample that came twice the shorter one counts.
-
-    Args:
-        path: the log.
-        link: which link, as in "m1->s".
+    These are the delays of the network that carried them, as the receiver's records have them in `rx`,
+    without those that the session's scenario injected. A negative one comes of the clocks and counts as none;
+    of a sample that came twice the shorter one counts.
 
     Raises:
         OSError: the file cannot be opened.
-        ValueError: it is no log, or has no such link, or nothing came over it.
+        ValueError: it is no log, or has no such link, or no sample came over it.
     """
     status = path.stat()  # raises what open would, in the same words
-    links = _links(path, status.st_mtime_ns, status.st_size)
+    links = _read_links(path, status.st_mtime_ns, status.st_size)
     if link not in links:
         near = get_close_matches(link, list(links), n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else "."
@@ -369,12 +368,12 @@ def read_link_delays(path: Path, link: str) -> list[DelayRow]:
 
 
 @lru_cache(maxsize=1)
-def _links(path: Path, modified_ns: int, size: int) -> dict[str, list[DelayRow]]:  # noqa: ARG001 - of this very file
+def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[DelayRow]]:  # noqa: ARG001
     """Returns the rows of every link of a log; a scenario asks for one after the other."""
     try:
         log = open_log(path)
         return {
-            f"{peer}->{site}": list(_rows(log, site, index, peer))
+            f"{peer}->{site}": list(_iterate_delays(log, site, index, peer))
             for site in log.sites
             for index, peer in enumerate(log.scenario.peers(site))
         }
@@ -382,36 +381,27 @@ def _links(path: Path, modified_ns: int, size: int) -> dict[str, list[DelayRow]]
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
 
 
-def _rows(log: Log, site: str, index: int, peer: str) -> Iterator[DelayRow]:
+def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[DelayRow]:
     states = log[site].states
-    came = _delays_us(states, index)
-    longest_ns = 1000 * max(came.values(), default=0)
-    gaps = _gaps_ns(states)
-    rate_hz = log.scenario.sites[peer].rate_hz
-    for tick in range(max(came, default=-1) + 1):
-        stamp_ns = tick * NS_PER_S // rate_hz
-        if tick not in came and any(
-            stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps
-        ):
-            continue
-        # the microsecond in which the stamp lies, as the core counts it
-        yield stamp_ns // 1000 / 1e6, came[tick] / 1e3 if tick in came else math.inf
-
-
-def _delays_us(states: Sequence[State], index: int) -> dict[int, int]:
-    """Returns the delay of every sample that came from a peer, us, from 0 to `LIMIT_US`."""
-    came: dict[int, int] = {}
+    delays_us: dict[int, int] = {}
     for state in states:
-        for peer, tick, delay_us in state.rx:
-            if peer == index and tick >= 0:
-                came[tick] = min(came.get(tick, MAX_DELAY_US), max(delay_us, 0))
-    return came
+        for sender, tick, delay_us in state.rx:
+            if sender == index and tick >= 0:
+                delays_us[tick] = min(delays_us.get(tick, MAX_DELAY_US), max(delay_us, 0))
+    longest_ns = 1000 * max(delays_us.values(), default=0)
+    gaps = _find_gaps_ns(states)
+    rate_hz = log.scenario.sites[peer].rate_hz
+    for tick in range(max(delays_us, default=-1) + 1):
+        stamp_ns = tick * NS_PER_S // rate_hz
+        came = tick in delays_us
+        if came or not any(stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps):
+            # the microsecond in which the stamp lies, as the core counts it
+            yield stamp_ns // 1000 / 1e6, delays_us[tick] / 1e3 if came else math.inf
 
 
-def _gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns when samples may have come unseen, ns: where records are missing, and behind the last one."""
-    pairs = pairwise(states)
-    gaps: list[tuple[int, float]] = [(a.t_ns, b.t_ns) for a, b in pairs if b.tick != a.tick + 1]
+def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
+    """Returns when samples may have come unseen, ns: where records are missing, and after the last one."""
+    gaps: list[tuple[int, float]] = [(a.t_ns, b.t_ns) for a, b in pairwise(states) if b.tick != a.tick + 1]
     if states and states[0].tick > 0:
         gaps.append((0, states[0].t_ns))
     return [*gaps, (states[-1].t_ns if states else 0, math.inf)]

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import NamedTuple, overload
+from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from . import record_columns
 from .record_columns import Ints, Strings
+
+M = TypeVar("M")
 
 MAX_DECODED_RECORDS = 1 << 16
 """Records of a site that are held decoded, at most: a minute at 1 kHz, some 150 MB."""
@@ -146,8 +148,16 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class MessageTimes(NamedTuple):
-    """When messages came and when they were sent, Unix ns, shape (K,) each."""
+    """Times at which messages came and were sent, Unix ns, shape (K,) each."""
 
+    log_ns: Ints
+    publish_ns: Ints
+
+
+class TimedMessages(NamedTuple, Generic[M]):
+    """Messages with the times at which they came and were sent, Unix ns, shape (K,) each."""
+
+    messages: list[M]
     log_ns: Ints
     publish_ns: Ints
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..files import import_extra
-from ..log.data_tables import Column, Table, iterate_tables, to_data_frame
+from ..log.data_tables import Column, Table, to_data_frame
 from ..log.log_layout import SCENARIO, collect_provenance
 from ..log.log_reader import Log
 
@@ -87,7 +87,7 @@ def _write(
     written: Callable[[int], None],
 ) -> None:
     facts = []
-    for table in iterate_tables(log):
+    for table in log.tables():
         name = f"{table.label}{ending}"
         write(table, folder / name)
         facts.append((name, describe_table(table)))
@@ -138,7 +138,7 @@ def make_mat_writer() -> WriteExport:
 def _write_npz(log: Log, path: Path, written: Callable[[int], None]) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     facts = []
-    for table in iterate_tables(log):
+    for table in log.tables():
         place = table.name if table.kind in ("", "state") else f"{table.name}/{table.kind}"
         for column in table.columns:
             arrays[f"{place}/{column.name}"] = _texts(column) if column.is_text else column.numbers()
@@ -153,7 +153,7 @@ def _write_npz(log: Log, path: Path, written: Callable[[int], None]) -> None:
 def _write_mat(log: Log, path: Path, written: Callable[[int], None], savemat: Callable[..., None]) -> None:
     variables: dict[str, Any] = {}
     facts = []
-    for table in iterate_tables(log):
+    for table in log.tables():
         name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
         struct: dict[str, Any] = {column.name: _matlab(column, table) for column in table.columns}
         struct["units"] = {column.name: column.unit for column in table.columns}
