@@ -1,6 +1,7 @@
 """What the report, a terminal and a program are told of a certificate."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,7 +118,7 @@ def test_many_links_are_one_entry() -> None:
     found = certify(LOGS["four"]())
     assert found.balance is not None
     some = {f"a->{n}": np.ones_like(found.balance.V) for n in range(7)}
-    listed = list_energies(found.balance._replace(given={**found.balance.given, **some}))
+    listed = list_energies(replace(found.balance, work={**found.balance.work, **some}))
     assert [name for name, _ in listed if "->" in name] == []
     assert any("links" in name for name, _ in listed)
 

@@ -4,6 +4,7 @@ Invariant: alpha is a function of time and of the applied changes alone; a ramp 
 ramp before it has at that time.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +12,18 @@ import numpy as np
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
 from ..log.log_reader import Log
-from .aligned import AlignedRecords
 
 RAMP_TIME_TOLERANCE_S = 5e-10
-"""Times are whole nanoseconds where they are made."""
+"""Half of the nanosecond in which ramps begin and end."""
 
 
 class DominanceHistory(NamedTuple):
-    """Shares in the peers, in scenario order.
+    """Dominance factors of a site for its peers, in scenario order.
 
     Attributes:
         alpha: at every row, shape (K, P).
         rate: their derivative as the controller takes it into account, shape (K, P), 1/s.
-        before: what they are at the end of every period, before a sudden change there, shape (K - 1, P).
+        before: at the end of every period, before a step there, shape (K - 1, P).
     """
 
     alpha: Array
@@ -32,38 +32,33 @@ class DominanceHistory(NamedTuple):
 
     @property
     def constant(self) -> bool:
-        """True where nothing changes."""
+        """True if nothing changes."""
         return bool(np.all(self.alpha == self.alpha[0]) and not self.rate.any())
 
-
-def trace_dominance(log: Log, track: AlignedRecords) -> DominanceHistory:
-    """Returns the shares of a site.
-
-    Raises:
-        LogError: a record names a change that is none.
-    """
-    row = log.scenario.dominance[track.site]
-    start = np.array([row.get(peer, 0.0) for peer in track.used])
-    return evaluate_ramps(start, list_dominance_ramps(log, track.site), track.t_s, track.h_s)
+    def follows(self, peer: int) -> bool:
+        """True if a peer, by its index, ever has a share."""
+        return bool(self.alpha[:, peer].any())
 
 
-def list_dominance_ramps(log: Log, site: str) -> list[DominanceRamp]:
-    """Returns the changes of the shares of a site: those of the scenario, then those in its records.
+def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
+    """Returns the dominance factors of a site at ticks in a row, s.
 
     Raises:
         LogError: a record names a change that is none.
     """
+    scenario = log.scenario
+    start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
     scripted = [
-        log.scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
-        for change in log.scenario.timeline
+        scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
+        for change in scenario.timeline
         if change.dominance == site
     ]
     ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
-    return [*scripted, *ordered]
+    return evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / scenario.sites[site].rate_hz)
 
 
-def evaluate_ramps(start: Array, ramps: list[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:
-    """Returns shares at times.
+def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:
+    """Returns dominance factors at times.
 
     Args:
         start: at the epoch, shape (P,).
@@ -72,26 +67,17 @@ def evaluate_ramps(start: Array, ramps: list[DominanceRamp], t_s: Array, h_s: fl
         h_s: the period between them, s.
     """
     alpha, rate = np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), len(start)))
-    value, current = start, None
+    before, start_s, end_s, after = start, 0.0, 0.0, start
     for ramp in sorted(ramps, key=lambda ramp: ramp.start_ns):
-        if current is not None:
-            value = _value(value, current, ramp.start_ns * 1e-9)
-        current = ramp
-        later = t_s >= ramp.start_ns * 1e-9 - RAMP_TIME_TOLERANCE_S
-        climbs = later & (t_s < ramp.end_ns * 1e-9 - RAMP_TIME_TOLERANCE_S)
-        alpha[later], rate[later] = ramp.alpha, 0.0
+        at_s = ramp.start_ns * 1e-9
+        share = 1.0 if at_s >= end_s else (at_s - start_s) / (end_s - start_s)
+        before = after if share == 1.0 else before + (after - before) * share
+        start_s, end_s, after = at_s, ramp.end_ns * 1e-9, np.array(ramp.alpha)
+        later = t_s >= start_s - RAMP_TIME_TOLERANCE_S
+        climbs = later & (t_s < end_s - RAMP_TIME_TOLERANCE_S)
+        alpha[later], rate[later] = after, 0.0
         if climbs.any():
-            slope = (np.array(ramp.alpha) - value) / ((ramp.end_ns - ramp.start_ns) * 1e-9)
-            alpha[climbs] = value + slope * (t_s[climbs, np.newaxis] - ramp.start_ns * 1e-9)
+            slope = (after - before) / ((ramp.end_ns - ramp.start_ns) * 1e-9)
+            alpha[climbs] = before + slope * (t_s[climbs, np.newaxis] - start_s)
             rate[climbs] = slope
     return DominanceHistory(alpha, rate, alpha[:-1] + h_s * rate[:-1])
-
-
-def _value(before: Array, ramp: DominanceRamp, at_s: float) -> Array:
-    """Returns the shares at a time of one ramp."""
-    begin_s, end_s = ramp.start_ns * 1e-9, ramp.end_ns * 1e-9
-    after = np.array(ramp.alpha)
-    if at_s >= end_s:
-        return after
-    value: Array = before + (after - before) * ((at_s - begin_s) / (end_s - begin_s))
-    return value

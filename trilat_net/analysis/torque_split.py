@@ -4,6 +4,7 @@ Invariant: a torque that the scenario does not explain is the operator's: the re
 environment's. An operator has a script only if its torque matches the scenario.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,126 +17,115 @@ from .aligned import AlignedRecords
 from .arm_rows import EndEffectorRows, compute_end_effector
 from .torque_sources import compute_source_torque, compute_spring_effort
 
+SCRIPT_TORQUE_TOLERANCE = 1e-8
+"""Relative difference up to which a torque is the scenario's."""
+
 
 class TorqueSplit(NamedTuple):
     """The torque ON an arm over its rows, shape (K, 2) each, N m; `held` is computed once a tick and held.
 
     Attributes:
-        tip: where the arm's tip was.
-        hands: of the hands, a function of the present.
-        hands_held: of the hands, held.
-        walls: of the environment, a function of the present.
-        walls_held: of the environment, held.
+        end_effector: its position, speed and Jacobian.
+        operator_now: of the operator, a function of the present.
+        operator_held: of the operator, held.
+        environment_now: of the environment, a function of the present.
+        environment_held: of the environment, held.
+        script: the operator's intention, see `compute_operator_script`; None if not asked for, or if its
+            torque does not match the scenario.
     """
 
-    tip: EndEffectorRows
-    hands: Array
-    hands_held: Array
-    walls: Array
-    walls_held: Array
+    end_effector: EndEffectorRows
+    operator_now: Array
+    operator_held: Array
+    environment_now: Array
+    environment_held: Array
+    script: Array | None = None
+
+    @property
+    def operator(self) -> Array:
+        """Of the operator in all, shape (K, 2), N m."""
+        return self.operator_now + self.operator_held
+
+    @property
+    def environment(self) -> Array:
+        """Of the environment in all, shape (K, 2), N m."""
+        return self.environment_now + self.environment_held
 
 
-def split_torque(track: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
-    """Returns the torque on an arm, parted into hands and environment, held and not.
+def split_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
+    """Returns the torque on an arm by its sources, held and not; without the script.
 
     Args:
-        track: the site's records.
-        spec: the site: who pushes, and what it meets.
+        records: of the site.
+        spec: the site, with its operators and its environment.
     """
-    tip = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
-    t_s = track.nominal_s
+    end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), records.q, records.qd)
+    t_s = records.nominal_s
 
-    def together(actors: list[TorqueSource]) -> Array:
-        total = np.zeros_like(track.q)
-        for actor in actors:
-            total = total + compute_source_torque(actor, t_s, track.q, track.qd, tip)
+    def add(sources: Iterable[TorqueSource]) -> Array:
+        total = np.zeros_like(records.q)
+        for source in sources:
+            total = total + compute_source_torque(source, t_s, records.q, records.qd, end_effector)
         return total
 
     around = [one.actor for one in spec.environment]
-    walls = together([actor for actor in around if not actor.sampled])
-    walls_held = together([actor for actor in around if actor.sampled])
-    hands_held = together([one.actor for one in spec.hands if one.actor.sampled])
-    # what is left of the record is the hands', also where nobody has written down whose it was
-    hands = -track.tau_x - walls - walls_held - hands_held
-    return TorqueSplit(tip, hands, hands_held, walls, walls_held)
+    now, held = add(one for one in around if not one.sampled), add(one for one in around if one.sampled)
+    operator_held = add(one.actor for one in spec.hands if one.actor.sampled)
+    operator_now = -records.tau_x - now - held - operator_held
+    return TorqueSplit(end_effector, operator_now, operator_held, now, held)
 
 
-SCRIPT_TORQUE_TOLERANCE = 1e-8
-"""Relative difference up to which a torque is what the scenario says."""
+def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
+    """Returns the intention of an operator, which does not depend on the arm's motion, shape (K, 2), N m.
 
-
-def compute_operator_script(actor: TorqueSource, t_s: Array, J: Array) -> Array:
-    """Returns what a hand is to do, whatever the arm does, shape (K, 2), N m.
-
-    A pulse or a recorded torque itself; of a spring K times the way of its target and B times its speed, one
-    in the plane by the Jacobian of one pose. It moves where, and only where, the operator does.
+    A pulse or a recorded torque itself; of a spring K times the displacement of its target and B times its
+    speed, of one in the plane by the Jacobian of one pose. It moves if and only if the operator does.
 
     Args:
-        actor: the hand.
+        source: the operator.
         t_s: shape (K,), s.
-        J: Jacobian of the tip, shape (2, 2).
+        J: Jacobian of the end effector, shape (2, 2).
     """
-    nowhere = np.zeros((len(t_s), JOINTS))
-    if actor.acts is TorqueKind.PULSE:
-        x = np.clip((t_s - actor.start_s) / (actor.end_s - actor.start_s), 0.0, 1.0)
-        intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(actor.a)
-    elif actor.acts is TorqueKind.RECORDED and actor.table is not None:
-        at_s, rows = actor.table[:, 0], actor.table[:, 1:]
+    if source.acts is TorqueKind.PULSE:
+        x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
+        intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(source.a)
+    elif source.acts is TorqueKind.RECORDED and source.table is not None:
+        at_s, rows = source.table[:, 0], source.table[:, 1:]
         columns = [np.interp(t_s, at_s, column, left=0.0, right=0.0) for column in rows.T]
         intent = np.stack(columns, axis=1)
     else:
-        pull = compute_spring_effort(actor, t_s, nowhere, nowhere)
-        intent = pull @ J if actor.acts is TorqueKind.TASK_HAND else pull
-    there = (t_s >= actor.start_s) & (t_s < actor.end_s)
-    script: Array = np.where(there[:, None], intent, 0.0)
+        origin = np.zeros((len(t_s), JOINTS))
+        pull = compute_spring_effort(source, t_s, origin, origin)
+        intent = pull @ J if source.acts is TorqueKind.TASK_HAND else pull
+    acting = (t_s >= source.start_s) & (t_s < source.end_s)
+    script: Array = np.where(acting[:, None], intent, 0.0)
     return script
 
 
-class TorqueAttribution(NamedTuple):
-    """The torque ON an arm, and what was meant by it.
+def attribute_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
+    """Returns the torque on an arm by its sources, with the operator's script.
 
-    Attributes:
-        parts: the torque, parted; without hands there is none of them, not what rounding leaves.
-        script: what the hands were to do, whatever the arm does, see `script_of`; None where they did
-            something else than the scenario says.
-    """
-
-    parts: TorqueSplit
-    script: Array | None
-
-    @property
-    def by_hand(self) -> Array:
-        """What all hands do, shape (K, 2), N m."""
-        return self.parts.hands + self.parts.hands_held
-
-    @property
-    def by_wall(self) -> Array:
-        """What all of the environment does, shape (K, 2), N m."""
-        return self.parts.walls + self.parts.walls_held
-
-
-def attribute_torque(track: AlignedRecords, spec: SiteSpec) -> TorqueAttribution:
-    """Returns the torque on an arm, parted into hands and environment, with the script of the hands.
+    Without an operator in the scenario, the operator's torque is exactly zero where only rounding is left.
 
     Args:
-        track: the site's records.
-        spec: the site: who pushes, and what it meets.
+        records: of the site.
+        spec: the site, with its operators and its environment.
     """
-    who, t_s = split_torque(track, spec), track.nominal_s
-    hands, rest = [one.actor for one in spec.hands], who.hands.copy()
-    scripts = [compute_operator_script(actor, t_s, who.tip.J[0]) for actor in hands]
-    told = sum(
-        (
-            script
-            if actor.acts in (TorqueKind.PULSE, TorqueKind.RECORDED)
-            else compute_source_torque(actor, t_s, track.q, track.qd, who.tip)
-            for actor, script in zip(hands, scripts, strict=True)
-            if not actor.sampled
-        ),
-        np.zeros_like(track.q),
-    )
-    as_told = np.abs(rest - told) <= SCRIPT_TORQUE_TOLERANCE * (1.0 + np.abs(track.tau_x))
-    if not hands:  # what rounding leaves of nobody
-        rest[as_told] = 0.0
-    script = sum(scripts, np.zeros_like(track.q)) if as_told[track.known].all() else None
-    return TorqueAttribution(who._replace(hands=rest), script)
+    split, t_s = split_torque(records, spec), records.nominal_s
+    sources = [one.actor for one in spec.hands]
+    scripts = [compute_operator_script(source, t_s, split.end_effector.J[0]) for source in sources]
+    expected = np.zeros_like(records.q)
+    for source, script in zip(sources, scripts, strict=True):
+        if source.acts in (TorqueKind.PULSE, TorqueKind.RECORDED):
+            expected = expected + script
+        elif not source.sampled:
+            expected = expected + compute_source_torque(
+                source, t_s, records.q, records.qd, split.end_effector
+            )
+    tolerance = SCRIPT_TORQUE_TOLERANCE * (1.0 + np.abs(records.tau_x))
+    matches = np.abs(split.operator_now - expected) <= tolerance
+    if matches[records.known].all():
+        split = split._replace(script=sum(scripts, np.zeros_like(records.q)))
+    if not sources:
+        split = split._replace(operator_now=np.where(matches, 0.0, split.operator_now))
+    return split

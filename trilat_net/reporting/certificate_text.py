@@ -53,7 +53,7 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     )
     said = [
         CertificateLine(verdict, found.verdict.text),
-        CertificateLine(_GROWTH[found.growth.behaviour.grows], f"e and qd: {found.growth.text}"),
+        CertificateLine(_GROWTH[found.end.behaviour.grows], f"e and qd: {found.end.text}"),
     ]
     if found.balance is not None:
         said.append(
@@ -90,15 +90,15 @@ def describe_balance(balance: EnergyBalance) -> str:
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     """Returns V at the start and what made V at the end of it, in J; what is next to nothing is left out."""
-    links = {name: x for name, x in balance.given.items() if "->" in name}
-    given = {name: x for name, x in balance.given.items() if name not in links}
+    links = {name: x for name, x in balance.work.items() if "->" in name}
+    given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
         links = {f"{len(links)} links": np.sum(list(links.values()), axis=0)}
     entries = {
-        **{f"taken: {name}": -values for name, values in balance.taken.items()},
+        **{f"taken: {name}": -values for name, values in balance.dissipation.items()},
         **{f"given: {_SOURCE_NAMES.get(name, name)}": values for name, values in (given | links).items()},
         "given: sampling of the controller": balance.sampling,
-        "left by beta": -balance.passed,
+        "left by beta": -balance.transfer,
         "unexplained" if balance.judged.all() else "in gaps, or unexplained": _rest(balance),
     }
     least = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
@@ -112,6 +112,8 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 def _rest(balance: EnergyBalance) -> Array:
     """Returns what nobody gave or took, in the gaps too, shape (T,), J."""
-    known = sum(balance.given.values()) - sum(balance.taken.values()) + balance.sampling - balance.passed
+    known = (
+        sum(balance.work.values()) - sum(balance.dissipation.values()) + balance.sampling - balance.transfer
+    )
     rest: Array = balance.V - balance.V[0] - known
     return rest

@@ -1,5 +1,6 @@
 """The energy balance closes, to the order of what made the log, and only with every term as it is."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -48,7 +49,7 @@ def test_digital_closes_to_some_percent_with_order_one_and_sampling_is_what_is_l
 
 def test_jitter_closes_to_1e_4_where_the_jumps_are_booked_and_not_to_3e_3_where_they_are_not() -> None:
     b = runs.balanced("free", runs.JITTER)
-    links = np.sum([x for name, x in b.given.items() if "->" in name], axis=0)
+    links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
     assert np.abs(b.residual + links).max() / b.V.max() >= 3e-3
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
@@ -72,14 +73,14 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
 
 def test_a_wall_closes_to_1e_4_though_it_gives_energy_to_r() -> None:
     b = runs.balanced("wall")
-    assert b.given["walls"].max() > 1e-3
+    assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
 
 
 def test_everything_at_once_closes_to_1e_4_at_500_hz() -> None:
     b = runs.balanced("rich")
     assert of_largest_v(b) <= 1e-4
-    assert all(np.abs(x).max() > 1e-4 * b.scale for name, x in b.given.items() if name not in _SILENT)
+    assert all(np.abs(x).max() > 1e-4 * b.scale for name, x in b.work.items() if name not in _SILENT)
 
 
 _SILENT = ("m2->m1", "m1->m2", "m2->s")
@@ -87,10 +88,10 @@ _SILENT = ("m2->m1", "m1->m2", "m2->s")
 
 TERMS = [
     *[("rich", "parts", name) for name in ("kinetic", "parameter", "position", "delay")],
-    *[("rich", "taken", name) for name in ("damping", "disagreement")],
-    *[("rich", "given", name) for name in ("hands", "walls", "shares", "rule", "torque limit", "estimates")],
-    *[("rich", "given", name) for name in ("s->m1", "s->m2")],
-    ("free", "given", "m1->m2"),
+    *[("rich", "dissipation", name) for name in ("damping", "disagreement")],
+    *[("rich", "work", name) for name in ("hands", "walls", "shares", "rule", "torque limit", "estimates")],
+    *[("rich", "work", name) for name in ("s->m1", "s->m2")],
+    ("free", "work", "m1->m2"),
 ]
 
 
@@ -101,14 +102,14 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
 ) -> None:
     b = runs.balanced(name, runs.JITTER if name == "free" else None)
     terms = {**getattr(b, group), term: factor * getattr(b, group)[term]}
-    assert b._replace(**{group: terms}).relative > CAUGHT > 5 * b.relative
+    assert replace(b, **{group: terms}).relative > CAUGHT > 5 * b.relative
 
 
 def test_ones_for_beta_is_caught_and_named() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
     ones = compute_energy_balance(runs.booked("asymmetric", {"duration_s": 3.0, "rate_hz": 1000}), ones=True)
     assert ones.relative > 10 * CAUGHT
-    assert np.abs(ones.residual + ones.passed).max() <= 2e-5 * ones.V.max()
+    assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
 def test_the_papers_v_rises_by_12_3_of_32_8_and_the_corrected_one_never() -> None:
@@ -131,8 +132,8 @@ def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
     theirs, ours = balance_by_hand(made, left_null_vector(made.scenario) * 3), runs.balanced(name, overrides)
     close = {"abs": 1e-12 * float(theirs.V.max())}
     assert pytest.approx(theirs.V, **close) == ours.V
-    assert sum(ours.taken.values()) == pytest.approx(theirs.taken, **close)
-    assert sum(ours.given.values()) == pytest.approx(theirs.given, **close)
+    assert sum(ours.dissipation.values()) == pytest.approx(theirs.taken, **close)
+    assert sum(ours.work.values()) == pytest.approx(theirs.given, **close)
 
 
 def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
@@ -144,8 +145,8 @@ def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
         taken, given = _exact_integrals(exact, t)
-        assert sum(float(x[k]) for x in ours.taken.values()) == pytest.approx(taken, abs=3e-4)
-        assert float(ours.given["hands"][k]) == pytest.approx(given, abs=3e-4)
+        assert sum(float(x[k]) for x in ours.dissipation.values()) == pytest.approx(taken, abs=3e-4)
+        assert float(ours.work["hands"][k]) == pytest.approx(given, abs=3e-4)
         assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - given == pytest.approx(0.0, abs=1e-7)
 
 

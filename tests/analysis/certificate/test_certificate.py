@@ -43,7 +43,7 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
     found = certify(trilat_net.simulate(load_scenario("free", law)))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
-    assert found.growth.behaviour is motion
+    assert found.end.behaviour is motion
     assert found.passed is passed
 
 
@@ -105,7 +105,7 @@ def test_gaps_are_left_out_and_told_of() -> None:
     assert found.verdict.finding is StabilityFinding.COVERED
     assert found.verdict.text.startswith("covered by the theorem, as far as the log tells: V did not rise: ")
     assert "not judged: 0.995 to 1.35 s" in found.verdict.text
-    given = sum(np.abs(x).max() for x in found.balance.given.values())
+    given = sum(np.abs(x).max() for x in found.balance.work.values())
     assert given <= 1e-6  # nobody is said to have given what changed in the gap
     assert found.balance.relative <= 1e-3
     assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]  # s looks back by 150 ms
@@ -136,7 +136,7 @@ def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes
 def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
     found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
     assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
-    assert found.growth.behaviour is EndBehaviour.UNDECIDED
+    assert found.end.behaviour is EndBehaviour.UNDECIDED
     assert not found.passed
 
 

@@ -5,12 +5,12 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from tests.analysis import logs
-from trilat_net.analysis.aligned import RECORD_COLUMNS, PeerTrajectory, align_common_records
+from trilat_net.analysis.aligned import RECORD_COLUMNS, PeerTrajectory, align_records
 
 
 def test_a_whole_log_is_as_it_was_recorded() -> None:
     log = logs.simulated("paper")
-    for site, track in align_common_records(log).items():
+    for site, track in align_records(log, common=True).items():
         assert track.known.all()
         assert track.follows.all()
         assert np.array_equal(track.t_s, log[site].t_s)
@@ -21,7 +21,7 @@ def test_a_whole_log_is_as_it_was_recorded() -> None:
 def test_a_gap_is_filled_straight_and_marked() -> None:
     whole = logs.simulated("paper")
     log = logs.rewritten(whole, lambda state: not (state.site == "s" and 100 <= state.tick < 120))
-    track = align_common_records(log)["s"]
+    track = align_records(log, common=True)["s"]
     assert np.flatnonzero(~track.known).tolist() == list(range(100, 120))
     assert track.q[110] == pytest.approx(track.q[99] + 11 / 21 * (track.q[120] - track.q[99]))
     assert np.array_equal(track.q[track.known], log["s"].q)
@@ -32,25 +32,26 @@ def test_the_end_is_that_of_the_time_that_all_sites_have() -> None:
         logs.simulated("four"),
         lambda state: (state.site != "a" or state.t_ns >= 5e8) and (state.site != "d" or state.t_ns < 12e8),
     )
-    found = align_common_records(log)
+    found = align_records(log, common=True)
     assert {site: track.t_s[0] for site, track in found.items()} == {"a": 0.5, "b": 0.0, "c": 0.0, "d": 0.0}
     assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in found.values())
     assert (
-        align_common_records(logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8)) == {}
+        align_records(logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8), common=True)
+        == {}
     )
 
 
 def test_a_record_that_diverged_is_left_out_and_none_is_no_track() -> None:
     log = logs.diverged()
-    last = {site: track.t_s[-1] for site, track in align_common_records(log).items()}
+    last = {site: track.t_s[-1] for site, track in align_records(log, common=True).items()}
     gone = [site for site in log.sites if log[site].states[-1].mode == "diverged"]
     assert gone
     assert all(last[site] < log[site].t_s[-1] for site in gone)
-    assert align_common_records(logs.rewritten(log, lambda state: state.site != "s")) == {}
+    assert align_records(logs.rewritten(log, lambda state: state.site != "s"), common=True) == {}
 
 
 def test_the_past_is_the_records_at_ticks_and_rest_before_them() -> None:
-    track = align_common_records(logs.simulated("four"))["b"]
+    track = align_records(logs.simulated("four"), common=True)["b"]
     now, before = PeerTrajectory(track).at(track.t_s), PeerTrajectory(track).at(np.array([-0.5, -1e-3]))
     assert np.array_equal(now.q, track.q)
     assert np.array_equal(now.qd, track.qd)
@@ -64,7 +65,7 @@ def test_the_past_is_the_records_at_ticks_and_rest_before_them() -> None:
 
 
 def test_between_ticks_it_is_the_cubic_through_angles_and_velocities() -> None:
-    track = align_common_records(logs.simulated("two_sites"))["m"]
+    track = align_records(logs.simulated("two_sites"), common=True)["m"]
     t_s = track.t_s
     track.q[:] = np.stack([t_s**3 - t_s, 2.0 - t_s**2], axis=1)
     track.qd[:] = np.stack([3 * t_s**2 - 1.0, -2.0 * t_s], axis=1)
@@ -78,5 +79,5 @@ def test_what_lies_in_a_gap_rests_on_no_record() -> None:
     whole = logs.simulated("paper")
     log = logs.rewritten(whole, lambda state: not (state.site == "m1" and state.tick == 100))
     at_s = np.array([98.0, 99.0, 99.5, 100.0, 100.5, 101.0, 102.0]) / 200
-    known = PeerTrajectory(align_common_records(log)["m1"]).at(at_s).known
+    known = PeerTrajectory(align_records(log, common=True)["m1"]).at(at_s).known
     assert known.tolist() == [True, True, False, False, False, True, True]

@@ -72,7 +72,7 @@ def test_a_slow_digital_loop_is_fed_by_sampling() -> None:
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
     assert next(iter(found.verdict.rise.causes)) == "sampling"
-    assert found.growth.behaviour is not EndBehaviour.CONVERGED
+    assert found.end.behaviour is not EndBehaviour.CONVERGED
 
 
 def tampered(change: Callable[[State], State]) -> Certificate:
@@ -156,7 +156,7 @@ def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
     """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
     found = certify(trilat_net.simulate(load_scenario("free", {**SHORT, **EXPERT, "duration_s": 1.0})))
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.growth.behaviour.grows is None
+    assert found.end.behaviour.grows is None
     assert found.passed
 
 
@@ -172,6 +172,6 @@ def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
 
 def test_growth_fails_a_run_whatever_v_did() -> None:
     found = runs.certified("wall")
-    grown = found.growth._replace(behaviour=EndBehaviour.GROWS)
+    grown = found.end._replace(behaviour=EndBehaviour.GROWS)
     assert found.passed
-    assert not found._replace(growth=grown).passed
+    assert not found._replace(end=grown).passed

@@ -49,9 +49,9 @@ def test_hands_and_environment_are_told_apart_and_make_up_the_record() -> None:
     for site, track in align_records(log).items():
         spec = log.scenario.sites[site]
         by = attribute_torque(track, spec)
-        np.testing.assert_allclose(by.by_hand + by.by_wall, -track.tau_x, atol=1e-9)
-        assert by.by_hand.any() == bool(spec.hands)
-        assert by.by_wall.any() == bool(spec.environment)
+        np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
+        assert by.operator.any() == bool(spec.hands)
+        assert by.environment.any() == bool(spec.environment)
         assert by.script is not None  # every hand did what the scenario says
 
 

@@ -1,126 +1,119 @@
-"""Energy balance of each site, and of all sites together under the weights beta.
+"""Energy balance of each site, and of a group of sites together under the weights beta.
 
 Invariant: V_i - V_i(0) + dissipation + transfer - work vanishes for every site, without any weights; V -
 V(0) + dissipation - work vanishes for the weighted sum, whatever the operators do. A log that violates it
 was not produced by the equations that it claims.
 """
 
-from collections.abc import Callable, Mapping
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
-from ..aligned import (
-    AlignedRecords,
-    Bools,
-    DelayedPeer,
-    PeerTrajectory,
-    align_common_records,
-    view_delayed_peer,
-)
-from ..dominance_history import DominanceHistory, trace_dominance
+from ..aligned import AlignedRecords, Bools, PeerTrajectory, align_records, view_delayed_peer
+from ..dominance_history import trace_dominance
 from ..lyapunov_weights import compute_lyapunov_weights
 from ..torque_split import split_torque
-from . import energy_terms
 from .energy_terms import (
     FunctionalParts,
     Increment,
-    PeriodEnds,
-    SiteConstants,
+    SiteMotion,
+    compute_dissipation,
+    compute_sampling_work,
+    compute_transfer,
+    compute_work,
     derive_site_constants,
     evaluate_functional,
-    split_periods,
 )
 
 MIN_PERIODS = 10
 """Fewer show nothing of what happens within them."""
+ZERO_ENERGY_J = 1e-12
+"""What rounding may leave of no energy at all."""
+EXTERNAL_SOURCES = ("hands", "walls")
+"""The sources of work that are outside of the loop: operator and environment."""
 
 
-class SiteEnergy(NamedTuple):
-    """A site's book over its K rows and K - 1 periods.
+@dataclass(frozen=True)
+class SiteEnergy:
+    """Energies of a site over its K rows and K - 1 periods.
 
     Attributes:
-        track: its records.
-        eq: its constants.
-        shares: its shares in its peers.
-        views: what it sees of them, by name.
+        motion: what they are computed from.
         parts: its functional.
-        taken: dissipation: `damping` and `disagreement`.
-        passed: what it passes on to the sites that follow it.
-        given: work: `hands`, `walls`, per link "j->i", `shares`, `rule`, `torque limit`, `estimates`.
-        sampling: the work of the scheme by which the continuous law was sampled.
-        judged: whether a period rests on records alone, shape (K - 1,).
-        coupling: the part of `doubt` by changes of r and a torque together, J.
+        dissipation: `damping` and `disagreement`.
+        transfer: to the sites that follow it, less what it gets from those that it follows.
+        work: of `hands`, `walls`, per link "j->i", `shares`, `rule`, `torque limit`, `estimates`.
+        sampling: the work of the scheme that samples the continuous law.
+        judged: True if a period follows from records alone, shape (K - 1,).
     """
 
-    track: AlignedRecords
-    eq: SiteConstants
-    shares: DominanceHistory
-    views: dict[str, DelayedPeer]
+    motion: SiteMotion
     parts: FunctionalParts
-    taken: dict[str, Increment]
-    passed: Increment
-    given: dict[str, Increment]
+    dissipation: dict[str, Increment]
+    transfer: Increment
+    work: dict[str, Increment]
     sampling: Increment
     judged: Bools
-    coupling: float
 
-    @property
+    @cached_property
     def residual(self) -> Array:
-        """V_i - V_i(0) + dissipation + passed on - work, over the judged periods, shape (K,), J."""
-        change = np.diff(self.parts.total) + self.passed.total
-        change += np.sum([one.total for one in self.taken.values()], axis=0)
-        change -= np.sum([one.total for one in self.given.values()], axis=0)
+        """V_i - V_i(0) + dissipation + transfer - work, over the judged periods, shape (K,), J."""
+        change = np.diff(self.parts.total) + self.transfer.total
+        change += np.sum([one.total for one in self.dissipation.values()], axis=0)
+        change -= np.sum([one.total for one in self.work.values()], axis=0)
         return accumulate(np.where(self.judged, change, 0.0))
 
-    @property
+    @cached_property
     def unexplained(self) -> Array:
-        """The residual without what the scheme does, shape (K,), J."""
+        """The residual without the work of the scheme, shape (K,), J."""
         return self.residual - accumulate(np.where(self.judged, self.sampling.total, 0.0))
 
     @property
-    def begin_s(self) -> float:
-        """The first tick at which all that is under way rests on records, s; infinite where there is none."""
-        seen = [v.seen.known & v.now.known for j, v in enumerate(self.views.values()) if self.follows(j)]
-        rows = np.flatnonzero(np.logical_and.reduce(seen))
-        return float(self.track.t_s[rows[0]]) if len(rows) else np.inf
-
-    @property
     def followed(self) -> set[str]:
-        """The peers that have a share at any time."""
-        return {peer for j, peer in enumerate(self.views) if self.follows(j)}
-
-    def follows(self, j: int) -> bool:
-        """True where a peer, by its index, has a share at any time."""
-        return bool(self.shares.alpha[:, j].any())
+        """The peers that ever have a share."""
+        return {peer for j, peer in enumerate(self.motion.peers) if self.motion.dominance.follows(j)}
 
     @property
-    def doubt(self) -> float:
-        """How far off the books may be here by what happens within a period, J.
+    def begin_s(self) -> float:
+        """The first tick at which everything in transit follows from records, s; infinite without one."""
+        views = self.motion.peers
+        seen = [views[peer].seen.known & views[peer].now.known for peer in views if peer in self.followed]
+        rows = np.flatnonzero(np.logical_and.reduce(seen))
+        return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
 
-        The trapezoid rule by the second differences of all powers, summed; sampling and hands by what r and a
-        torque change by together: where that adds up, the period is long for these gains. Where there are too
-        few periods for second differences, all is in doubt.
+    @cached_property
+    def uncertainty(self) -> float:
+        """How far the energies may be off by what happens within a period, J.
+
+        The trapezoid rule by the second differences of all powers, summed; sampling and operators by the
+        products of the changes of r and of a torque: if these add up, the period is long for these gains.
+        With too few periods for second differences all is uncertain.
         """
+        signed = [(1.0, self.transfer), *((1.0, one) for one in self.dissipation.values())]
+        signed += [(-1.0, one) for one in self.work.values()]
         if self.judged.sum() < MIN_PERIODS:
-            every = (self.passed, *self.taken.values(), *self.given.values())
-            return float(sum(np.abs(one.left).sum() + np.abs(one.right).sum() for one in every))
-        power = self.passed.left + np.sum([one.left for one in self.taken.values()], axis=0)
-        power -= np.sum([one.left for one in self.given.values()], axis=0)
-        return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + self.coupling
+            return float(sum(np.abs(one.left).sum() + np.abs(one.right).sum() for _, one in signed))
+        power = np.sum([sign * one.left for sign, one in signed], axis=0)
+        records, ends = self.motion.records, self.motion.ends
+        coupled = 0.0
+        for torque in (records.tau, records.tau_x):
+            together = records.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
+            coupled += 2.0 * float(np.abs(accumulate(np.where(self.judged, together, 0.0))).max())
+        return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + coupled
 
 
 def accumulate(amounts: Array) -> Array:
-    """Returns what has come together at every row, from 0 on."""
+    """Returns the sum of all amounts before each row, from 0 on."""
     return np.concatenate([[0.0], np.cumsum(amounts)])
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Returns the books of all sites, in scenario order; {} where there is no time in which all are known.
+    """Returns the energies of all sites, in scenario order; {} if at no time all are known.
 
     Args:
         log: a log all of whose sites have a functional.
@@ -128,266 +121,264 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     Raises:
         LogError: a record names a change that is none.
     """
-    found = align_common_records(log)
-    pasts = {site: PeerTrajectory(track) for site, track in found.items()}
-    made = {site: _site_energy(log, found, pasts, site) for site in found}
-    begin_s = max((book.begin_s for book in made.values()), default=np.inf)
-    fastest = max((track.rate_hz for track in found.values()), default=1)
-    end_s = min((track.t_s[-1] for track in found.values()), default=0.0)
-    return made if end_s - begin_s > 0.5 / fastest else {}
+    records = align_records(log, common=True)
+    pasts = {site: PeerTrajectory(own) for site, own in records.items()}
+    energies = {}
+    for site, own in records.items():
+        spec = log.scenario.sites[site]
+        motion = SiteMotion(
+            own,
+            derive_site_constants(spec),
+            trace_dominance(log, site, own.t_s),
+            {peer: view_delayed_peer(own, records[peer], pasts[peer]) for peer in own.used},
+            split_torque(own, spec),
+            Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL,
+        )
+        energies[site] = compute_site_energy(motion)
+    times = find_common_times(energies.values()) if energies else np.zeros(0)
+    return energies if len(times) > 1 else {}
 
 
-def _site_energy(
-    log: Log, found: dict[str, AlignedRecords], pasts: dict[str, PeerTrajectory], site: str
-) -> SiteEnergy:
-    track, spec = found[site], log.scenario.sites[site]
-    eq, share = derive_site_constants(spec), trace_dominance(log, track)
-    views = {peer: view_delayed_peer(track, found[peer], pasts[peer]) for peer in track.used}
-    seen = list(views.values())
-    ends = split_periods(track, eq, share, seen)
-    pushed = split_torque(track, spec)
-    digital = Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL
-    given = {
-        "hands": energy_terms.torque_work(track, ends, pushed.hands, pushed.hands_held),
-        "walls": energy_terms.torque_work(track, ends, pushed.walls, pushed.walls_held),
-        **{
-            f"{peer}->{site}": energy_terms.link_work(track, eq, share, ends, j, one)
-            for j, (peer, one) in enumerate(views.items())
-        },
-        "shares": energy_terms.dominance_change_work(track, eq, share, ends, seen),
-        "rule": energy_terms.stale_rule_work(track, eq, share, ends, seen),
-        "torque limit": energy_terms.torque_limit_work(track, eq),
-        "estimates": energy_terms.estimate_work(track, eq, digital=digital),
-    }
-    taken = {
-        "damping": energy_terms.damping_dissipation(track, eq, ends),
-        "disagreement": energy_terms.disagreement_dissipation(track, eq, share, seen),
-    }
-    known = [track.known[:-1], track.known[1:]]
-    known += [v.known for j, v in enumerate(seen) if share.alpha[:, j].any()]
-    judged: Bools = np.logical_and.reduce(known)
+def compute_site_energy(motion: SiteMotion) -> SiteEnergy:
+    """Returns the energies of one site."""
+    views = enumerate(motion.peers.values())
+    known = [motion.records.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
     return SiteEnergy(
-        track,
-        eq,
-        share,
-        views,
-        evaluate_functional(track, eq, share, seen),
-        taken,
-        energy_terms.transferred_energy(track, eq, share, seen),
-        given,
-        energy_terms.sampling_work(track, eq, ends, digital=digital),
-        judged,
-        sum(_coupling(track, ends, torque, judged) for torque in (track.tau, track.tau_x)),
+        motion,
+        evaluate_functional(motion),
+        compute_dissipation(motion),
+        compute_transfer(motion),
+        compute_work(motion),
+        compute_sampling_work(motion),
+        np.logical_and.reduce(known),
     )
 
 
-def _coupling(track: AlignedRecords, ends: PeriodEnds, torque: Array, judged: Bools) -> float:
-    """Returns twice the largest sum of h dr' dtau over the judged periods, J."""
-    together = track.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
-    return 2.0 * float(np.abs(accumulate(np.where(judged, together, 0.0))).max())
+def find_common_times(energies: Iterable[SiteEnergy]) -> Array:
+    """Returns the ticks of the fastest site from when every V_i is known to the end of the records, s."""
+    energies = list(energies)
+    records = [energy.motion.records for energy in energies]
+    times = max(records, key=lambda own: own.rate_hz).t_s
+    begin_s = max(energy.begin_s for energy in energies)
+    end_s = min(own.t_s[-1] for own in records)
+    common: Array = times[(times >= begin_s - 1e-9) & (times <= end_s + 1e-9)]
+    return common
 
 
-WeightFunction = Callable[[Array], Array]
-ZERO_ENERGY_J = 1e-12
-"""What rounding may leave of no energy at all."""
+@dataclass(frozen=True)
+class EnergyBalance:
+    """The functional of a group of sites over time, at the ticks of its fastest; energies in J.
 
-
-class EnergyBalance(NamedTuple):
-    """The functional over time, at the ticks of the fastest site; energies in J.
-
-    What is taken, given and passed counts in judged periods alone.
+    Dissipation, work and transfer count in judged periods alone.
 
     Attributes:
         t_s: shape (T,), s.
         beta: the weights over time, shape (T, N).
         sites: per site beta_i V_i, each shape (T,).
         parts: of all sites: kinetic, parameter, position, delay, each shape (T,).
-        taken: what was dissipated until then, by kind, each shape (T,).
-        given: the work until then, by who did it, each shape (T,).
+        dissipation: until then, by kind, each shape (T,).
+        work: until then, by source, each shape (T,).
         sampling: the work of the scheme until then; no part of the balance, see `unexplained`, shape (T,).
-        passed: what the weights failed to cancel until then, 0 where they are right, shape (T,).
-        judged: whether the period before a tick rests on records alone, shape (T - 1,).
+        transfer: what the weights did not cancel until then, 0 if they are right, shape (T,).
+        judged: True if the period before a tick follows from records alone, shape (T - 1,).
     """
 
     t_s: Array
     beta: Array
     sites: dict[str, Array]
     parts: dict[str, Array]
-    taken: dict[str, Array]
-    given: dict[str, Array]
+    dissipation: dict[str, Array]
+    work: dict[str, Array]
     sampling: Array
-    passed: Array
+    transfer: Array
     judged: Bools
 
-    @property
+    @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
         """The functional, shape (T,), J."""
         return _sum(self.parts)
 
-    @property
+    @cached_property
     def residual(self) -> Array:
         """V - V(0) + dissipation - work, over the judged periods, shape (T,), J."""
-        change = np.diff(self.V + _sum(self.taken) - _sum(self.given))
-        return accumulate(np.where(self.judged, change, 0.0))
+        return self._over_judged(self.V + _sum(self.dissipation) - _sum(self.work))
 
-    @property
+    @cached_property
     def unexplained(self) -> Array:
-        """What nobody accounts for: the residual less the scheme's work and what beta left, shape (T,), J."""
-        known = np.diff(self.sampling - self.passed)
-        return self.residual - accumulate(np.where(self.judged, known, 0.0))
+        """The residual less the scheme's work and what beta did not cancel, shape (T,), J."""
+        return self.residual - self._over_judged(self.sampling - self.transfer)
+
+    @cached_property
+    def unsupplied(self) -> Array:
+        """V less the work of operator and environment, over the judged periods, shape (T,), J.
+
+        By the theorem it does not rise.
+        """
+        unsupplied: Array = self.V[0] + self._over_judged(self.V - self.external_work)
+        return unsupplied
 
     @property
-    def own(self) -> Array:
-        """V less what hands and walls gave, over the judged periods, shape (T,), J: what must not rise."""
-        change = np.where(self.judged, np.diff(self.V - self.pushed), 0.0)
-        own: Array = self.V[0] + accumulate(change)
-        return own
+    def external_work(self) -> Array:
+        """The work of operator and environment until then, shape (T,), J."""
+        work: Array = self.work["hands"] + self.work["walls"]
+        return work
 
     @property
-    def pushed(self) -> Array:
-        """The work of hands and walls until then, shape (T,), J."""
-        return self.given["hands"] + self.given["walls"]
+    def external_sources(self) -> list[str]:
+        """The sources of external work: hands, walls, both or none."""
+        return [name for name in EXTERNAL_SOURCES if self.work[name].any()]
 
-    @property
-    def pushers(self) -> list[str]:
-        """Who pushed: hands, walls, both or nobody."""
-        return [name for name in ("hands", "walls") if self.given[name].any()]
-
-    @property
+    @cached_property
     def scale(self) -> float:
-        """What residuals are held against: the largest V, or the largest work where that is more, J."""
-        return max(float(np.abs(x).max()) for x in (self.V, *self.given.values()))
+        """The energy that residuals are compared with: the largest V, or the largest work if more, J."""
+        return max(float(np.abs(x).max()) for x in (self.V, *self.work.values()))
 
     @property
     def relative(self) -> float:
-        """Largest residual as a share of the scale; 0 where there is no energy but of rounding."""
+        """Largest residual as a share of the scale; 0 if there is no energy but of rounding."""
         return float(np.abs(self.residual).max()) / self.scale if self.scale > ZERO_ENERGY_J else 0.0
 
+    def _over_judged(self, values: Array) -> Array:
+        return accumulate(np.where(self.judged, np.diff(values), 0.0))
 
-def compute_energy_balance(books: Mapping[str, SiteEnergy], *, ones: bool = False) -> EnergyBalance:
-    """Returns the balance of all sites.
+
+def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = False) -> EnergyBalance:
+    """Returns the balance of a group of sites of which none follows a site outside.
 
     Args:
-        books: of every site, in scenario order.
-        ones: whether to weigh every site alike, as the paper does; then it need not close.
+        energies: of every site of the group, in scenario order.
+        ones: True to weigh every site alike, as the paper does; then it need not close.
     """
-    times = _times(books)
-    weigh = _weigher(books, ones=ones)
-    columns = {site: _column(books, site, times, weigh) for site in books}
-    every = list(columns.values())
-    judged: Bools = np.logical_and.reduce([np.diff(column.unjudged) == 0.0 for column in every])
+    times, weights = find_common_times(energies.values()), _Weights(energies, ones=ones)
+    columns, sites, unjudged = [], {}, np.zeros(len(times))
+    sums: dict[tuple[str, str], Array] = {}
+    for n, (site, energy) in enumerate(energies.items()):
+        records = energy.motion.records
+        left, right = (beta[:, n] for beta in weights.along(records))
+        weighted = _weigh_site(energy, left, right)
+        for key, values in weighted.items():
+            values = _resample(times, records.t_s, values)
+            sums[key] = sums[key] + values if key in sums else values
+        columns.append(_resample(times, records.t_s, left))
+        sites[site] = _resample(times, records.t_s, left * energy.parts.total)
+        unjudged += np.abs(_resample(times, records.t_s, accumulate((~energy.judged).astype(np.float64))))
+    judged: Bools = np.diff(unjudged) == 0.0
 
-    def booked(amounts: list[Array]) -> Array:
-        """Adds up what came together, without what came while records are missing."""
-        return accumulate(np.where(judged, np.diff(np.sum(amounts, axis=0)), 0.0))
+    def of_kind(kind: str) -> dict[str, Array]:
+        return {name: _cut(values, judged) for (group, name), values in sums.items() if group == kind}
 
-    names = dict.fromkeys(name for column in every for name in column.given)
     return EnergyBalance(
         times,
-        np.stack([column.beta for column in every], axis=1),
-        {site: _sum(column.parts) for site, column in columns.items()},
-        {name: _sum({n: c.parts[name] for n, c in columns.items()}) for name in FunctionalParts._fields},
-        {name: booked([column.taken[name] for column in every]) for name in every[0].taken},
-        {name: booked([column.given[name] for column in every if name in column.given]) for name in names},
-        booked([column.sampling for column in every]),
-        booked([column.passed for column in every]),
+        np.stack(columns, axis=1),
+        sites,
+        {name: sums["parts", name] for name in FunctionalParts._fields},
+        of_kind("dissipation"),
+        of_kind("work"),
+        of_kind("sampling")[""],
+        of_kind("transfer")[""],
         judged,
     )
 
 
-class _Column(NamedTuple):
-    """What one site adds to the balance, at the common times."""
+def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str, str], Array]:
+    """Returns what a site adds to the balance at its own ticks, by kind and name.
 
-    beta: Array
-    parts: dict[str, Array]
-    taken: dict[str, Array]
-    given: dict[str, Array]
-    sampling: Array
-    passed: Array
-    unjudged: Array
+    A change of the weight itself does work on V_i, booked as `shares`: along a ramp, and at a step.
 
+    Args:
+        energy: of the site.
+        left: its weight at every tick, shape (K,).
+        right: its weight at the end of every period, before a step, shape (K - 1,).
+    """
 
-def _column(books: Mapping[str, SiteEnergy], site: str, times: Array, weigh: WeightFunction) -> _Column:
-    book, n = books[site], list(books).index(site)
-    t_s = book.track.t_s
-    beta = weigh(interpolate_dominance(books, t_s))[:, n]
-    before = weigh(interpolate_dominance(books, t_s[:-1], book.track.h_s))[:, n]  # before a sudden change
+    def weigh(one: Increment) -> Array:
+        return accumulate(left[:-1] * one.left + right * (one.right + one.jump))
 
-    def at(values: Array) -> Array:
-        same = len(t_s) == len(times) and t_s[0] == times[0]
-        return values if same else np.interp(times, t_s, values)
-
-    def together(amounts: Array) -> Array:
-        values = at(accumulate(amounts))
-        shifted: Array = values - values[0]
-        return shifted
-
-    def summed(one: Increment) -> Array:
-        return together(beta[:-1] * one.left + before * (one.right + one.jump))
-
-    given = {name: summed(one) for name, one in book.given.items()}
-    V = book.parts.total
-    smooth = (before - beta[:-1]) * 0.5 * (V[:-1] + V[1:])
-    given["shares"] = given["shares"] + together(smooth + (beta[1:] - before) * V[1:])
-    return _Column(
-        at(beta),
-        {name: at(beta * part) for name, part in book.parts._asdict().items()},
-        {name: summed(one) for name, one in book.taken.items()},
-        given,
-        summed(book.sampling),
-        summed(book.passed),
-        together((~book.judged).astype(np.float64)),
-    )
+    V = energy.parts.total
+    reweighted = (right - left[:-1]) * 0.5 * (V[:-1] + V[1:]) + (left[1:] - right) * V[1:]
+    weighted = {("parts", name): left * part for name, part in energy.parts._asdict().items()}
+    weighted |= {("dissipation", name): weigh(one) for name, one in energy.dissipation.items()}
+    weighted |= {("work", name): weigh(one) for name, one in energy.work.items()}
+    weighted["work", "shares"] = weighted["work", "shares"] + accumulate(reweighted)
+    return weighted | {("sampling", ""): weigh(energy.sampling), ("transfer", ""): weigh(energy.transfer)}
 
 
-def _weigher(books: Mapping[str, SiteEnergy], *, ones: bool) -> WeightFunction:
-    """Returns what gives beta, shape (T, N), for dominance matrices, shape (T, N, N)."""
-    Kd = np.array([book.eq.Kd for book in books.values()])
-    if ones:
-        return lambda alpha: np.ones(alpha.shape[:2])
-
-    @cache
-    def beta(alpha: bytes) -> Array:
-        return compute_lyapunov_weights(np.frombuffer(alpha).reshape(len(Kd), -1), Kd).beta
-
-    def over_time(alpha: Array) -> Array:
-        flat = np.round(alpha.reshape(len(alpha), -1), 12) + 0.0
-        if np.all(flat == flat[0]):
-            return np.tile(beta(flat[0].tobytes()), (len(flat), 1))
-        rows, place = np.unique(flat, axis=0, return_inverse=True)
-        return np.array([beta(row.tobytes()) for row in rows])[place.ravel()]
-
-    return over_time
+def _resample(times: Array, t_s: Array, values: Array) -> Array:
+    same = len(t_s) == len(times) and t_s[0] == times[0]
+    return values if same else np.interp(times, t_s, values)
 
 
-def interpolate_dominance(books: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:
+def _cut(values: Array, judged: Bools) -> Array:
+    """Returns the growth of a running sum, without its growth while records are missing."""
+    return values - values[0] if judged.all() else accumulate(np.where(judged, np.diff(values), 0.0))
+
+
+class _Weights:
+    """beta over time; each dominance matrix is solved once."""
+
+    def __init__(self, energies: Mapping[str, SiteEnergy], *, ones: bool) -> None:
+        self._energies, self._ones = energies, ones
+        self._Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
+        self._constant = all(energy.motion.dominance.constant for energy in energies.values())
+        self._solved: dict[bytes, Array] = {}
+        self._along: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+
+    def along(self, records: AlignedRecords) -> tuple[Array, Array]:
+        """Returns beta at every tick, shape (K, N), and at the end of every period, before a step there."""
+        key = records.first, len(records.known), records.rate_hz
+        if key not in self._along:
+            t_s = records.t_s
+            self._along[key] = self._at(t_s), self._at(t_s[:-1], records.h_s)
+        return self._along[key]
+
+    def _at(self, t_s: Array, ahead_s: float = 0.0) -> Array:
+        if self._ones:
+            return np.ones((len(t_s), len(self._Kd)))
+        times = t_s[:1] if self._constant else t_s
+        alpha = np.round(interpolate_dominance(self._energies, times, ahead_s), 12) + 0.0
+        matrices, place = np.unique(alpha.reshape(len(alpha), -1), axis=0, return_inverse=True)
+        beta: Array = np.array([self._solve(matrix) for matrix in matrices])[place.ravel()]
+        return np.tile(beta, (len(t_s), 1)) if self._constant else beta
+
+    def _solve(self, matrix: Array) -> Array:
+        key = matrix.tobytes()
+        if key not in self._solved:
+            alpha = matrix.reshape(len(self._Kd), -1)
+            self._solved[key] = compute_lyapunov_weights(alpha, self._Kd).beta
+        return self._solved[key]
+
+
+def interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:
     """Returns the dominance matrix at times, shape (T, N, N).
 
     Args:
-        books: of every site, in scenario order.
+        energies: of every site of a group, in scenario order; factors for sites outside are left out.
         t_s: the times, shape (T,), s.
-        ahead_s: how much further a ramp that is under way is followed, s.
+        ahead_s: how much further a ramp in progress is followed, s.
     """
-    names = list(books)
+    names = list(energies)
     alpha = np.zeros((len(t_s), len(names), len(names)))
-    for i, book in enumerate(books.values()):
-        place = (t_s - book.track.t_s[0]) * book.track.rate_hz
-        row = np.clip(np.floor(place + 1e-5), 0, len(book.track.known) - 1).astype(np.int64)
-        later_s = np.maximum(place - row, 0.0) / book.track.rate_hz + ahead_s
-        for j, peer in enumerate(book.views):
-            alpha[:, i, names.index(peer)] = book.shares.alpha[row, j] + later_s * book.shares.rate[row, j]
-    # between its last tick and its end a ramp has been followed too far
-    return np.clip(alpha, 0.0, 1.0)
+    for i, energy in enumerate(energies.values()):
+        records, dominance = energy.motion.records, energy.motion.dominance
+        place = (t_s - records.t_s[0]) * records.rate_hz
+        row = np.clip(np.floor(place + 1e-5), 0, len(records.known) - 1).astype(np.int64)
+        later_s = np.maximum(place - row, 0.0) / records.rate_hz + ahead_s
+        for j, peer in enumerate(energy.motion.peers):
+            if peer in energies:
+                factor = dominance.alpha[row, j] + later_s * dominance.rate[row, j]
+                alpha[:, i, names.index(peer)] = factor
+    return np.clip(alpha, 0.0, 1.0)  # between its last tick and its end a ramp is followed too far
 
 
-def _times(books: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the ticks of the fastest site within the time in which every V_i is known from its start on."""
-    tracks = [book.track for book in books.values()]
-    times = max(tracks, key=lambda track: track.rate_hz).t_s
-    begin_s = max(book.begin_s for book in books.values())
-    end_s = min(track.t_s[-1] for track in tracks)
-    kept: Array = times[(times >= begin_s - 1e-9) & (times <= end_s + 1e-9)]
-    return kept
+def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
+    """Returns every dominance matrix that was in force, of a ramp its ends, shape (M, N, N)."""
+    times = [next(iter(energies.values())).motion.records.t_s[:1]]
+    for energy in energies.values():
+        t_s, dominance = energy.motion.records.t_s, energy.motion.dominance
+        turns = np.flatnonzero(np.diff(dominance.rate, axis=0, prepend=0.0).any(axis=1))
+        steps = np.flatnonzero((dominance.alpha[1:] != dominance.before).any(axis=1)) + 1
+        times += [t_s[turns], t_s[steps]]
+    return interpolate_dominance(energies, np.concatenate(times))
 
 
 def _sum(columns: Mapping[str, Array]) -> Array:

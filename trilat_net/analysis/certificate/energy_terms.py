@@ -1,6 +1,4 @@
-"""The corrected functional V_i of a site, and every term that changes it.
-
-Dissipation, transfer and work, in J.
+"""The corrected functional V_i of a site, and every term that changes it, in J.
 
 Invariant: V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e + sum_j
 alpha_ij int qd_j' Kd qd_j ds ), the integral from the stamp of the sample in use to now: the paper's Eq.
@@ -15,20 +13,25 @@ with respect to r. A site has a functional if its control law is the paper's and
 known.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ...core.vectors import Array
+from ...log.record_columns import Ints
 from ...scenario import SiteSpec
 from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
 from ..arm_rows import inertia_product_rows, regressor_rows
 from ..dominance_history import DominanceHistory
+from ..torque_split import TorqueSplit
 
 
 class SiteConstants(NamedTuple):
-    """A site's constants; vectors per joint have shape (2,), per parameter (5,).
+    """Constants of a site; vectors per joint have shape (2,), per parameter (5,).
 
     Attributes:
         theta: the arm's true parameters.
@@ -37,10 +40,10 @@ class SiteConstants(NamedTuple):
         Kp: N m s/rad.
         Kd: N m s/rad.
         Gamma: adaptation gain.
-        low: least that each estimate may be.
-        high: most.
+        low: lower limits of the estimates.
+        high: upper limits.
         tau_limit: largest torque of a joint, N m.
-        outside: whether the arm is outside of the program: theta is then what its author says of it.
+        outside: True if the arm is outside of the program: theta is then what its author states.
     """
 
     theta: Array
@@ -53,6 +56,12 @@ class SiteConstants(NamedTuple):
     high: Array
     tau_limit: float
     outside: bool = False
+
+    @property
+    def adapts(self) -> Bools:
+        """True for each parameter that the law adapts, shape (5,)."""
+        adapts: Bools = self.Gamma > 0.0
+        return adapts
 
 
 def derive_site_constants(spec: SiteSpec) -> SiteConstants:
@@ -73,7 +82,7 @@ def derive_site_constants(spec: SiteSpec) -> SiteConstants:
 
 
 def explain_missing_functional(spec: SiteSpec) -> str:
-    """Says why a site has no functional; "" where it has one."""
+    """Returns the reason why a site has no functional; "" if it has one."""
     if not spec.arm.known:
         return "nobody knows the arm's theta, and V is made of it"
     if not isinstance(spec.control, Adaptive | AdaptiveBox):
@@ -82,12 +91,121 @@ def explain_missing_functional(spec: SiteSpec) -> str:
     return ""
 
 
+class PeriodEnds(NamedTuple):
+    """The ends of every period, K - 1 rows; `right` is before the jump, `middle` half-way through it.
+
+    Attributes:
+        following: True if the site followed its peers at both ends.
+        link: per peer the jump of e by the age of its sample, shape (P, K - 1, 2), rad.
+        dominance: the jump of e by a step of dominance factors, shape (K - 1, 2), rad.
+        rule: the jump of e by the rule for stale peers, shape (K - 1, 2), rad.
+        r_left: r = qd + Lambda e, shape (K - 1, 2), rad/s.
+        r_right: shape (K - 1, 2), rad/s.
+        r_middle: shape (K - 1, 2), rad/s.
+        e_middle: shape (K - 1, 2), rad.
+        qd_des_left: shape (K - 1, 2), rad/s.
+        qd_des_right: shape (K - 1, 2), rad/s.
+    """
+
+    following: Bools
+    link: Array
+    dominance: Array
+    rule: Array
+    r_left: Array
+    r_right: Array
+    r_middle: Array
+    e_middle: Array
+    qd_des_left: Array
+    qd_des_right: Array
+
+
+@dataclass(frozen=True)
+class SiteMotion:
+    """Motion of a site and all that acts on it, over K rows: what its energies are computed from.
+
+    Attributes:
+        records: of the site.
+        constants: of the site.
+        dominance: its factors for its peers.
+        peers: these as the site sees them, in the same order.
+        torque: ON its arm.
+        digital: True if the scheme holds tau_k, False if it extrapolates the torque.
+    """
+
+    records: AlignedRecords
+    constants: SiteConstants
+    dominance: DominanceHistory
+    peers: Mapping[str, DelayedPeer]
+    torque: TorqueSplit
+    digital: bool = False
+
+    @cached_property
+    def r(self) -> Array:
+        """The sliding variable qd + Lambda e, Eq. (10), shape (K, 2), rad/s."""
+        r: Array = self.records.qd + self.constants.Lambda * self.records.e
+        return r
+
+    @cached_property
+    def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
+        """Y'r of Eq. (15), shape (K, 5)."""
+        Yr: Array = np.einsum("kij,ki->kj", self.regressor(), self.r)
+        return Yr
+
+    @cached_property
+    def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
+        """Y'r with which the scheme advances the estimate over a period, shape (K - 1, 5)."""
+        return self.Yr[:-1] if self.digital else 0.5 * (self.Yr[:-1] + self.Yr[1:])
+
+    def regressor(self, rows: slice | Ints = slice(None)) -> Array:
+        """Returns Y of Eq. (13) in some rows, shape (K, 2, 5)."""
+        at, c = self.records, self.constants
+        ed = (at.qd - at.qd_des)[rows]
+        return regressor_rows(c.g, at.q[rows], at.qd[rows], -c.Lambda * at.e[rows], -c.Lambda * ed)
+
+    @cached_property
+    def ends(self) -> PeriodEnds:
+        """The ends of its periods.
+
+        While the site follows its peers, the smooth course of its reference is Eq. (6) with every stamp
+        moving at rate one. Otherwise the rule decides: the trapezoid rule on the recorded derivative.
+        """
+        at, c, views, alpha = self.records, self.constants, list(self.peers.values()), self.dominance
+        following = at.follows[:-1] & at.follows[1:]
+        here, left = following[:, np.newaxis], at.follows[:-1, np.newaxis]
+        before, after, rate = (x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1]))
+        kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
+        kept_qd = np.sum(
+            [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)], axis=0
+        )
+        qd_des_left, qd_des_right = at.qd_des[:-1], np.where(left, kept_qd, at.qd_des[1:])
+        ruled_q = at.q_des[:-1] + 0.5 * at.h_s * (qd_des_left + qd_des_right)
+        link = np.array(
+            [np.where(here, before[:, j] * (v.kept.q - v.seen.q[1:]), 0.0) for j, v in enumerate(views)]
+        )
+        steps = [(before[:, j] - after[:, j]) * v.seen.q[1:] for j, v in enumerate(views)]
+        dominance = np.where(here, np.sum(steps, axis=0), 0.0)
+        rule = np.where(here, 0.0, np.where(left, kept_q, ruled_q) - at.q_des[1:])
+        jump = link.sum(axis=0) + dominance + rule
+        return PeriodEnds(
+            following,
+            link,
+            dominance,
+            rule,
+            r_left=self.r[:-1],
+            r_right=self.r[1:] - c.Lambda * jump,
+            r_middle=self.r[1:] - 0.5 * c.Lambda * jump,
+            e_middle=at.e[1:] - 0.5 * jump,
+            qd_des_left=qd_des_left,
+            qd_des_right=qd_des_right,
+        )
+
+
 class FunctionalParts(NamedTuple):
-    """V_i of a site, part by part, each of shape (K,), J.
+    """V_i of a site by its parts, each of shape (K,), J.
 
     Attributes:
         kinetic: 1/2 r' M r.
-        parameter: 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), of the parameters that are learnt.
+        parameter: 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), of the adapted parameters.
         position: 1/2 e' Lambda Kd e.
         delay: 1/2 sum_j alpha_ij int qd_j' Kd qd_j ds over the age of the sample in use.
     """
@@ -104,43 +222,27 @@ class FunctionalParts(NamedTuple):
         return total
 
 
-def sliding_variable(track: AlignedRecords, eq: SiteConstants) -> Array:
-    """Returns r = qd + Lambda e, Eq. (10), shape (K, 2), rad/s."""
-    r: Array = track.qd + eq.Lambda * track.e
-    return r
-
-
-def evaluate_functional(
-    track: AlignedRecords, eq: SiteConstants, shares: DominanceHistory, views: list[DelayedPeer]
-) -> FunctionalParts:
-    """Returns the functional of a site along its records.
-
-    Args:
-        track: the records.
-        eq: the site's constants.
-        shares: its shares in its peers.
-        views: what it sees of them, in the same order.
-    """
-    r, e = sliding_variable(track, eq), track.e
-    learnt = eq.Gamma > 0.0
-    off = (track.theta_hat - eq.theta)[:, learnt]
-    stored = [energy_in_transit(eq, v) for v in views]
+def evaluate_functional(site: SiteMotion) -> FunctionalParts:
+    """Returns the functional of a site along its records."""
+    at, c, r = site.records, site.constants, site.r
+    off = (at.theta_hat - c.theta)[:, c.adapts]
+    in_transit = [_energy_in_transit(c, view) for view in site.peers.values()]
     return FunctionalParts(
-        kinetic=0.5 * (r * inertia_product_rows(eq.theta, track.q, r)).sum(axis=1),
-        parameter=0.5 * (off**2 / eq.Gamma[learnt]).sum(axis=1),
-        position=0.5 * (eq.Lambda * eq.Kd * e**2).sum(axis=1),
-        delay=np.sum([shares.alpha[:, j] * energy for j, energy in enumerate(stored)], axis=0),
+        kinetic=0.5 * (r * inertia_product_rows(c.theta, at.q, r)).sum(axis=1),
+        parameter=0.5 * (off**2 / c.Gamma[c.adapts]).sum(axis=1),
+        position=0.5 * (c.Lambda * c.Kd * at.e**2).sum(axis=1),
+        delay=np.sum([site.dominance.alpha[:, j] * energy for j, energy in enumerate(in_transit)], axis=0),
     )
 
 
-def energy_in_transit(eq: SiteConstants, view: DelayedPeer) -> Array:
+def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
     """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,), J."""
-    stored: Array = 0.5 * ((view.now.squares - view.seen.squares) @ eq.Kd)
+    stored: Array = 0.5 * ((view.now.squares - view.seen.squares) @ c.Kd)
     return stored
 
 
 class Increment(NamedTuple):
-    """An amount of energy per period, J: what its two ends give to an integral, and a jump at its end.
+    """An amount of energy per period, J: the two ends of a trapezoid, and a jump after it.
 
     Attributes:
         left: of the trapezoid rule, at the beginning, shape (K - 1,).
@@ -159,284 +261,199 @@ class Increment(NamedTuple):
         return total
 
 
-def integrate_trapezoid(h_s: float, left: Array, right: Array) -> Increment:
+def _trapezoid(site: SiteMotion, left: Array, right: Array, jump: Array | None = None) -> Increment:
     """Returns the integral of a power, W, over every period by the trapezoid rule."""
-    return Increment(0.5 * h_s * left, 0.5 * h_s * right, np.zeros(len(left)))
+    half_s = 0.5 * site.records.h_s
+    return Increment(half_s * left, half_s * right, np.zeros(len(left)) if jump is None else jump)
 
 
-def integrate_jump(amount: Array) -> Increment:
-    """Returns amounts that come at once."""
-    nothing = np.zeros(len(amount))
-    return Increment(nothing, nothing, amount)
+def _jump(amount: Array) -> Increment:
+    return Increment(np.zeros(len(amount)), np.zeros(len(amount)), amount)
 
 
-class PeriodEnds(NamedTuple):
-    """The ends of every period, K - 1 rows; `right` is before the jump.
-
-    Attributes:
-        following: whether the site followed its peers at both ends.
-        link: per peer the jump of e by the age of its sample, shape (P, K - 1, 2), rad.
-        shares: the jump of e by a sudden change of shares, shape (K - 1, 2), rad.
-        rule: the jump of e by the rule for stale peers, shape (K - 1, 2), rad.
-        r_left: r = qd + Lambda e, shape (K - 1, 2), rad/s.
-        r_right: shape (K - 1, 2), rad/s.
-        r_middle: half-way through the jump, shape (K - 1, 2), rad/s.
-        e_middle: half-way through the jump, shape (K - 1, 2), rad.
-        qd_des_left: shape (K - 1, 2), rad/s.
-        qd_des_right: shape (K - 1, 2), rad/s.
-    """
-
-    following: Bools
-    link: Array
-    shares: Array
-    rule: Array
-    r_left: Array
-    r_right: Array
-    r_middle: Array
-    e_middle: Array
-    qd_des_left: Array
-    qd_des_right: Array
+def _nothing(site: SiteMotion) -> Increment:
+    return _jump(np.zeros(len(site.records.known) - 1))
 
 
-def split_periods(
-    track: AlignedRecords, eq: SiteConstants, shares: DominanceHistory, views: list[DelayedPeer]
-) -> PeriodEnds:
-    """Returns the periods of a site.
-
-    While it follows its peers, the smooth way of its reference is Eq. (6) with every stamp moving at rate
-    one. Otherwise that is a matter of the rule: the trapezoid rule on the recorded derivative.
-
-    Args:
-        track: the site's records.
-        eq: its constants.
-        shares: its shares in its peers.
-        views: what it sees of them, in the same order.
-    """
-    following = track.follows[:-1] & track.follows[1:]
-    here = following[:, np.newaxis]
-    before, after, rate = (x[:, :, np.newaxis] for x in (shares.before, shares.alpha[1:], shares.rate[:-1]))
-    link = np.array(
-        [np.where(here, before[:, j] * (v.kept.q - v.seen.q[1:]), 0.0) for j, v in enumerate(views)]
-    )
-    sudden = np.sum([(before[:, j] - after[:, j]) * v.seen.q[1:] for j, v in enumerate(views)], axis=0)
-    follow = track.follows[:-1, np.newaxis]
-    kept_qd = np.sum([before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
-    kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
-    qd_des_left, qd_des_right = track.qd_des[:-1], np.where(follow, kept_qd, track.qd_des[1:])
-    way = track.q_des[:-1] + 0.5 * track.h_s * (qd_des_left + qd_des_right)
-    rule = np.where(here, 0.0, np.where(follow, kept_q, way) - track.q_des[1:])
-    sudden = np.where(here, sudden, 0.0)
-    jump = link.sum(axis=0) + sudden + rule
-    r, e_middle = track.qd + eq.Lambda * track.e, track.e[1:] - 0.5 * jump
-    r_right, r_middle = r[1:] - eq.Lambda * jump, r[1:] - 0.5 * eq.Lambda * jump
-    moved = (link, sudden, rule)
-    return PeriodEnds(following, *moved, r[:-1], r_right, r_middle, e_middle, qd_des_left, qd_des_right)
+def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
+    """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2."""
+    at, c, ends, alpha = site.records, site.constants, site.ends, site.dominance
+    left = right = np.zeros(len(at.known) - 1)
+    for j, view in enumerate(site.peers.values()):
+        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, at.qd[:-1] - view.seen.qd[:-1])
+        right = right + 0.5 * alpha.before[:, j] * _norm(c, at.qd[1:] - view.kept.qd)
+    damping = ((c.Kp * r**2).sum(axis=1) for r in (ends.r_left, ends.r_right))
+    return {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
 
 
-def damping_dissipation(track: AlignedRecords, eq: SiteConstants, ends: PeriodEnds) -> Increment:
-    """Returns int r' Kp r."""
-    left, right = (eq.Kp * ends.r_left**2).sum(axis=1), (eq.Kp * ends.r_right**2).sum(axis=1)
-    return integrate_trapezoid(track.h_s, left, right)
-
-
-def disagreement_dissipation(
-    track: AlignedRecords, eq: SiteConstants, shares: DominanceHistory, views: list[DelayedPeer]
-) -> Increment:
-    """Returns 1/2 int sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2."""
-    left = right = np.zeros(len(track.known) - 1)
-    for j, view in enumerate(views):
-        left = left + 0.5 * shares.alpha[:-1, j] * _norm(eq, track.qd[:-1] - view.seen.qd[:-1])
-        right = right + 0.5 * shares.before[:, j] * _norm(eq, track.qd[1:] - view.kept.qd)
-    return integrate_trapezoid(track.h_s, left, right)
-
-
-def transferred_energy(
-    track: AlignedRecords, eq: SiteConstants, shares: DominanceHistory, views: list[DelayedPeer]
-) -> Increment:
+def compute_transfer(site: SiteMotion) -> Increment:
     """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that follow it."""
-    own = 0.5 * _norm(eq, track.qd)
+    own = 0.5 * _norm(site.constants, site.records.qd)
     left, right = own[:-1], own[1:]
-    for j, view in enumerate(views):
-        peer = 0.5 * _norm(eq, view.now.qd)
-        left = left - shares.alpha[:-1, j] * peer[:-1]
-        right = right - shares.before[:, j] * peer[1:]
-    return integrate_trapezoid(track.h_s, left, right)
+    for j, view in enumerate(site.peers.values()):
+        peer = 0.5 * _norm(site.constants, view.now.qd)
+        left = left - site.dominance.alpha[:-1, j] * peer[:-1]
+        right = right - site.dominance.before[:, j] * peer[1:]
+    return _trapezoid(site, left, right)
 
 
-def _norm(eq: SiteConstants, x: Array) -> Array:
-    norm: Array = (eq.Kd * x**2).sum(axis=1)
+def _norm(c: SiteConstants, x: Array) -> Array:
+    norm: Array = (c.Kd * x**2).sum(axis=1)
     return norm
 
 
-JUMP_TOLERANCE = 1e-12
-"""rad, and rad/s: a jump that is none."""
+def compute_work(site: SiteMotion) -> dict[str, Increment]:
+    """Returns the work done on a site, by its source: all that may raise V_i besides transfer."""
+    torque = site.torque
+    return {
+        "hands": torque_work(site, torque.operator_now, torque.operator_held),
+        "walls": torque_work(site, torque.environment_now, torque.environment_held),
+        **{f"{peer}->{site.records.site}": link_work(site, j) for j, peer in enumerate(site.peers)},
+        "shares": dominance_change_work(site),
+        "rule": stale_rule_work(site),
+        "torque limit": torque_limit_work(site),
+        "estimates": estimate_work(site),
+    }
 
 
-def torque_work(track: AlignedRecords, ends: PeriodEnds, now: Array, held: Array) -> Increment:
+def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
     """Returns the work int r' tau_h of a torque ON the arm.
 
     Args:
-        track: the site's records.
-        ends: its periods.
+        site: the site.
         now: torque that follows the present, shape (K, 2), N m.
         held: torque that is held over the period, shape (K, 2), N m.
     """
-    left = (ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
-    return integrate_trapezoid(track.h_s, left, (ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
+    left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
+    return _trapezoid(site, left, (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
 
 
-def link_work(
-    track: AlignedRecords,
-    eq: SiteConstants,
-    shares: DominanceHistory,
-    ends: PeriodEnds,
-    j: int,
-    view: DelayedPeer,
-) -> Increment:
-    """Returns the work of a link: the exact change of V where the age of its sample in use changes.
+def link_work(site: SiteMotion, j: int) -> Increment:
+    """Returns the work of the link from peer j: the exact change of V where the age of its sample changes.
 
     With s' in place of s + h at the end of a period: (Lambda M r + Lambda Kd e)' de, with r and e half-way
     through the jump and de what this link adds to it, less 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to
     s'. For an age that varies smoothly this is the integral of the theorem's missing term with dT/dt.
     """
-    stored = 0.5 * (view.kept.squares - view.seen.squares[1:]) @ eq.Kd
-    return integrate_jump(_of_jump(track, eq, ends, ends.link[j]) + shares.before[:, j] * stored)
+    view = list(site.peers.values())[j]
+    stored = 0.5 * (view.kept.squares - view.seen.squares[1:]) @ site.constants.Kd
+    return _jump(_energy_of_jump(site, site.ends.link[j]) + site.dominance.before[:, j] * stored)
 
 
-def dominance_change_work(
-    track: AlignedRecords,
-    eq: SiteConstants,
-    shares: DominanceHistory,
-    ends: PeriodEnds,
-    views: list[DelayedPeer],
-) -> Increment:
-    """Returns the work of a change of shares, without that of beta: what a ramp adds to V_i', a step to V_i.
+def dominance_change_work(site: SiteMotion) -> Increment:
+    """Returns the work of a change of dominance, without that of beta: what a ramp or a step adds to V_i.
 
     1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij): the second because ed,
-    and with it the damping, knows of the ramp.
+    and with it the damping, contains the ramp.
     """
-    if shares.constant:
-        return integrate_jump(np.zeros(len(ends.shares)))
-    left = right = np.zeros(len(ends.shares))
-    jump = _of_jump(track, eq, ends, ends.shares)
-    for j, view in enumerate(views):
-        stored, rate = energy_in_transit(eq, view), shares.rate[:-1, j]
-        kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ eq.Kd
+    at, c, alpha, ends = site.records, site.constants, site.dominance, site.ends
+    if alpha.constant:
+        return _nothing(site)
+    left = right = np.zeros(len(at.known) - 1)
+    jump = _energy_of_jump(site, ends.dominance)
+    for j, view in enumerate(site.peers.values()):
+        stored, rate = _energy_in_transit(c, view), alpha.rate[:-1, j]
+        kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ c.Kd
+        followed_rate = np.where(ends.following, rate, 0.0)
         left = left + rate * stored[:-1]
+        left = left + followed_rate * (at.qd[:-1] * c.Kd * view.seen.q[:-1]).sum(axis=1)
         right = right + rate * kept
-        known = np.where(ends.following, rate, 0.0)
-        left = left + known * (track.qd[:-1] * eq.Kd * view.seen.q[:-1]).sum(axis=1)
-        right = right + known * (track.qd[1:] * eq.Kd * view.kept.q).sum(axis=1)
-        jump = jump + (shares.alpha[1:, j] - shares.before[:, j]) * stored[1:]
-    return Increment(0.5 * track.h_s * left, 0.5 * track.h_s * right, jump)
+        right = right + followed_rate * (at.qd[1:] * c.Kd * view.kept.q).sum(axis=1)
+        jump = jump + (alpha.alpha[1:, j] - alpha.before[:, j]) * stored[1:]
+    return _trapezoid(site, left, right, jump)
 
 
-def stale_rule_work(
-    track: AlignedRecords,
-    eq: SiteConstants,
-    shares: DominanceHistory,
-    ends: PeriodEnds,
-    views: list[DelayedPeer],
-) -> Increment:
+def stale_rule_work(site: SiteMotion) -> Increment:
     """Returns the work of the rule for stale peers: all that moves the reference while it is not Eq. (6)."""
-    alone = ~ends.following
-    if not alone.any():
-        return integrate_jump(np.zeros(len(alone)))
-    seen = np.sum([shares.alpha[:-1, j, None] * v.seen.qd[:-1] for j, v in enumerate(views)], axis=0)
-    kept = np.sum([shares.before[:, j, None] * v.kept.qd for j, v in enumerate(views)], axis=0)
-    left = (track.qd[:-1] * eq.Kd * (ends.qd_des_left - seen)).sum(axis=1)
-    right = (track.qd[1:] * eq.Kd * (ends.qd_des_right - kept)).sum(axis=1)
-    jump = _of_jump(track, eq, ends, ends.rule)
-    booked = integrate_trapezoid(track.h_s, np.where(alone, left, 0.0), np.where(alone, right, 0.0))
-    return booked._replace(jump=np.where(alone, jump, 0.0))
+    at, alpha, ends = site.records, site.dominance, site.ends
+    ruled = ~ends.following
+    if not ruled.any():
+        return _nothing(site)
+    views = list(enumerate(site.peers.values()))
+    seen = np.sum([alpha.alpha[:-1, j, None] * view.seen.qd[:-1] for j, view in views], axis=0)
+    kept = np.sum([alpha.before[:, j, None] * view.kept.qd for j, view in views], axis=0)
+    left = (at.qd[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
+    right = (at.qd[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
+    return _trapezoid(
+        site, *(np.where(ruled, x, 0.0) for x in (left, right, _energy_of_jump(site, ends.rule)))
+    )
 
 
-def torque_limit_work(track: AlignedRecords, eq: SiteConstants) -> Increment:
+def torque_limit_work(site: SiteMotion) -> Increment:
     """Returns the work of what the limit cut off: int r' (tau - tau of Eq. (13))."""
-    cut = np.flatnonzero((np.abs(track.tau) >= eq.tau_limit).any(axis=1))
-    power = np.zeros(len(track.known))
+    at, c = site.records, site.constants
+    cut = np.flatnonzero((np.abs(at.tau) >= c.tau_limit).any(axis=1))
+    power = np.zeros(len(at.known))
     if len(cut):
-        r, ed = sliding_variable(track, eq)[cut], (track.qd - track.qd_des)[cut]
-        law = np.einsum("kij,kj->ki", _regressor(track, eq)[cut], track.theta_hat[cut])
-        law -= eq.Kp * r + eq.Kd * ed
-        power[cut] = (r * (track.tau[cut] - law)).sum(axis=1)
-    return integrate_trapezoid(track.h_s, power[:-1], power[1:])
+        r, ed = site.r[cut], (at.qd - at.qd_des)[cut]
+        law = np.einsum("kij,kj->ki", site.regressor(cut), at.theta_hat[cut]) - c.Kp * r - c.Kd * ed
+        power[cut] = (r * (at.tau[cut] - law)).sum(axis=1)
+    return _trapezoid(site, power[:-1], power[1:])
 
 
-def estimate_work(track: AlignedRecords, eq: SiteConstants, *, digital: bool) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, or not learnt and wrong.
+def estimate_work(site: SiteMotion) -> Increment:
+    """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed and wrong.
 
     The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the truth; a
-    parameter that is not learnt leaves r' Y (theta_hat - theta) without its counterpart.
+    parameter that is not adapted leaves r' Y (theta_hat - theta) without its counterpart.
     """
-    off = track.theta_hat - eq.theta
-    learnt = eq.Gamma > 0.0
-    at_edge = ((track.theta_hat <= eq.low) | (track.theta_hat >= eq.high))[1:] & learnt
-    wrong = (off != 0.0) & ~learnt
+    at, c = site.records, site.constants
+    off = at.theta_hat - c.theta
+    at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts
+    wrong = (off != 0.0) & ~c.adapts
     if not (at_edge.any() or wrong.any()):
-        return integrate_jump(np.zeros(len(off) - 1))
-    Yr = _regressor_transpose_r(track, eq)
-    mean = Yr[:-1] if digital else 0.5 * (Yr[:-1] + Yr[1:])
-    held = np.diff(off, axis=0) + track.h_s * eq.Gamma * mean  # what the box kept the estimate from
+        return _nothing(site)
+    held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr  # what the box kept the estimate from
     with np.errstate(divide="ignore", invalid="ignore"):
-        amount = np.where(at_edge, 0.5 * (off[:-1] + off[1:]) * held / eq.Gamma, 0.0).sum(axis=1)
-    power = np.where(wrong, Yr * off, 0.0).sum(axis=1)
-    return integrate_trapezoid(track.h_s, power[:-1], power[1:])._replace(jump=amount)
+        amount = np.where(at_edge, 0.5 * (off[:-1] + off[1:]) * held / c.Gamma, 0.0).sum(axis=1)
+    power = np.where(wrong, site.Yr * off, 0.0).sum(axis=1)
+    return _trapezoid(site, power[:-1], power[1:], amount)
 
 
-def sampling_work(track: AlignedRecords, eq: SiteConstants, ends: PeriodEnds, *, digital: bool) -> Increment:
+JUMP_TOLERANCE = 1e-12
+"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
+
+
+def compute_sampling_work(site: SiteMotion) -> Increment:
     """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its step of (15).
 
     int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, and tau straight
-    to where it is before the jump; and what the scheme makes of the estimate in place of the trapezoid rule
-    up to there. No part of the balance: what that leaves without this, nobody accounts for.
+    to its value before the jump; and the scheme's step of the estimate in place of the trapezoid rule up to
+    there. It is no part of the balance: what that leaves without this is unexplained.
     """
-    tau = track.tau
-    u = tau[:-1].copy()
-    if not digital:
-        u[1:] = np.clip(1.5 * tau[1:-1] - 0.5 * tau[:-2], -eq.tau_limit, eq.tau_limit)
-    Yr = _regressor_transpose_r(track, eq)
-    tau_right, Yr_right = _before_jump(track, eq, ends, Yr)
-    off_law = u - 0.5 * (tau[:-1] + tau_right)
-    amount = track.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)
-    off = (track.theta_hat - eq.theta) * (eq.Gamma > 0.0)
-    step = Yr[:-1] if digital else 0.5 * (Yr[:-1] + Yr[1:])
-    missed = 0.5 * (Yr[:-1] + Yr_right) - step
-    return integrate_jump(amount + 0.5 * track.h_s * ((off[1:] + off[:-1]) * missed).sum(axis=1))
+    at, c, ends = site.records, site.constants, site.ends
+    u = at.held_torque(c.tau_limit, digital=site.digital)
+    tau_right, Yr_right = _before_jump(site)
+    off_law = u - 0.5 * (at.tau[:-1] + tau_right)
+    amount = at.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)
+    off = (at.theta_hat - c.theta) * c.adapts
+    missed = 0.5 * (site.Yr[:-1] + Yr_right) - site.mean_Yr
+    return _jump(amount + 0.5 * at.h_s * ((off[1:] + off[:-1]) * missed).sum(axis=1))
 
 
-def _before_jump(
-    track: AlignedRecords, eq: SiteConstants, ends: PeriodEnds, Yr: Array
-) -> tuple[Array, Array]:
+def _before_jump(site: SiteMotion) -> tuple[Array, Array]:
     """Returns tau of Eq. (13) and Y'r at the end of every period, before its jump, K - 1 rows each."""
-    tau, Yr = track.tau[1:].copy(), Yr[1:].copy()
-    q, qd, e = track.q[1:], track.qd[1:], 2.0 * ends.e_middle - track.e[1:]
-    moved = np.abs(e - track.e[1:]) + np.abs(ends.qd_des_right - track.qd_des[1:]) > JUMP_TOLERANCE
+    at, c, ends = site.records, site.constants, site.ends
+    tau, Yr = at.tau[1:].copy(), site.Yr[1:].copy()
+    q, qd, e = at.q[1:], at.qd[1:], 2.0 * ends.e_middle - at.e[1:]
+    moved = np.abs(e - at.e[1:]) + np.abs(ends.qd_des_right - at.qd_des[1:]) > JUMP_TOLERANCE
     rows = np.flatnonzero(moved.any(axis=1))
     e, ed, r = e[rows], (qd - ends.qd_des_right)[rows], ends.r_right[rows]
-    Y = regressor_rows(eq.g, q[rows], qd[rows], -eq.Lambda * e, -eq.Lambda * ed)
+    Y = regressor_rows(c.g, q[rows], qd[rows], -c.Lambda * e, -c.Lambda * ed)
     Yr[rows] = np.einsum("kij,ki->kj", Y, r)
-    law = np.einsum("kij,kj->ki", Y, track.theta_hat[1:][rows]) - eq.Kp * r - eq.Kd * ed
-    tau[rows] = np.clip(law, -eq.tau_limit, eq.tau_limit)
+    law = np.einsum("kij,kj->ki", Y, at.theta_hat[1:][rows]) - c.Kp * r - c.Kd * ed
+    tau[rows] = np.clip(law, -c.tau_limit, c.tau_limit)
     return tau, Yr
 
 
-def _regressor_transpose_r(track: AlignedRecords, eq: SiteConstants) -> Array:
-    """Returns Y'r, shape (K, 5)."""
-    Yr: Array = np.einsum("kij,ki->kj", _regressor(track, eq), sliding_variable(track, eq))
-    return Yr
-
-
-def _regressor(track: AlignedRecords, eq: SiteConstants) -> Array:
-    ed = track.qd - track.qd_des
-    return regressor_rows(eq.g, track.q, track.qd, -eq.Lambda * track.e, -eq.Lambda * ed)
-
-
-def _of_jump(track: AlignedRecords, eq: SiteConstants, ends: PeriodEnds, de: Array) -> Array:
+def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
     """Returns the exact part that `de` has in the change of 1/2 (r'M r + e' Lambda Kd e), shape (K - 1,), J.
 
     Both are quadratic in e, so that the gradient half-way through the whole jump gives it, linear in `de`.
     """
-    gradient = inertia_product_rows(eq.theta, track.q[1:], ends.r_middle) + eq.Kd * ends.e_middle
-    change: Array = (gradient * eq.Lambda * de).sum(axis=1)
+    c, ends = site.constants, site.ends
+    if not de.any():
+        return np.zeros(len(de))
+    gradient = inertia_product_rows(c.theta, site.records.q[1:], ends.r_middle) + c.Kd * ends.e_middle
+    change: Array = (gradient * c.Lambda * de).sum(axis=1)
     return change

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ..aligned import AlignedRecords, Bools, find_latest_rows
-from ..torque_split import TorqueAttribution
+from ..torque_split import TorqueSplit
 
 Complex = NDArray[np.complex128]
 
@@ -183,7 +183,7 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueAttribution]
+    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit]
 ) -> list[ImpedanceEstimate]:
     """Returns what every hand feels over frequency of its site, and of every wall elsewhere.
 
@@ -191,8 +191,8 @@ def estimate_impedances(
         found: the sites' records.
         by: who pushed them.
     """
-    hands = [site for site in found if by[site].by_hand.any()]
-    walls = [site for site in found if by[site].by_wall.any()]
+    hands = [site for site in found if by[site].operator.any()]
+    walls = [site for site in found if by[site].environment.any()]
     return [
         *(one for site in hands for one in _impedance(found, by, site)),
         *(
@@ -206,21 +206,21 @@ def estimate_impedances(
 
 
 def _impedance(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueAttribution], site: str
+    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit], site: str
 ) -> Iterator[ImpedanceEstimate]:
     track, script = found[site], by[site].script
     others = _still(found, by, track, [name for name in found if name != site])
     for joint in range(JOINTS):
         told = FrequencyResponse(why=NO_SCRIPT_TEXT)
         if script is not None and others is not None:
-            torque = by[site].by_hand[:, joint]
+            torque = by[site].operator[:, joint]
             signals = ResponseSignals(script[:, joint], track.qd[:, joint], torque, track.known & others)
             told = estimate_response(signals, track.rate_hz, MIN_DRIVE_TORQUE_NM)
         yield ImpedanceEstimate("impedance", site, "", joint + 1, told)
 
 
 def _reflection(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueAttribution], wall: str, hand: str
+    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit], wall: str, hand: str
 ) -> Iterator[ImpedanceEstimate]:
     track = found[hand]
     row, there = find_latest_rows(found[wall], track.t_s)
@@ -228,9 +228,9 @@ def _reflection(
     for joint in range(JOINTS):
         told = FrequencyResponse(why=NO_SCRIPT_TEXT)
         if nobody is not None:
-            torque = by[wall].by_wall[row, joint]
+            torque = by[wall].environment[row, joint]
             signals = ResponseSignals(
-                torque, torque, -by[hand].by_hand[:, joint], track.known & there & nobody
+                torque, torque, -by[hand].operator[:, joint], track.known & there & nobody
             )
             told = estimate_response(signals, track.rate_hz, MIN_DRIVE_TORQUE_NM)
         yield ImpedanceEstimate("reflection", hand, wall, joint + 1, told)
@@ -238,7 +238,7 @@ def _reflection(
 
 def _still(
     found: Mapping[str, AlignedRecords],
-    by: Mapping[str, TorqueAttribution],
+    by: Mapping[str, TorqueSplit],
     at: AlignedRecords,
     sites: list[str],
 ) -> Bools | None:

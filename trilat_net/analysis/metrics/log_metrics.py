@@ -18,7 +18,7 @@ from ..aligned import AlignedRecords, align_records
 from ..dominance_history import DominanceHistory, trace_dominance
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
-from ..torque_split import TorqueAttribution, attribute_torque
+from ..torque_split import TorqueSplit, attribute_torque
 from . import force_sharing, parameter_error, port_energy, tracking_metrics, wall_contact
 from .force_sharing import JointLoad, SharingRatio
 from .impedance import ImpedanceEstimate, estimate_impedances
@@ -131,7 +131,7 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 def _measure_aligned(log: Log, found: dict[str, AlignedRecords]) -> LogMetrics:
     specs = log.scenario.sites
     by = {site: attribute_torque(track, specs[site]) for site, track in found.items()}
-    owned = {site: trace_dominance(log, track) for site, track in found.items()}
+    owned = {site: trace_dominance(log, site, track.t_s) for site, track in found.items()}
     absent = [site for site in log.sites if site not in found]
     windows: list[StaticWindow] = [] if absent else find_static_windows(found, by, owned)
     levers = force_sharing.find_joint_loads(log.scenario, windows)
@@ -153,9 +153,7 @@ def _measure_aligned(log: Log, found: dict[str, AlignedRecords]) -> LogMetrics:
     )
 
 
-def _measure_site(
-    log: Log, site: str, track: AlignedRecords | None, by: TorqueAttribution | None
-) -> MetricValues:
+def _measure_site(log: Log, site: str, track: AlignedRecords | None, by: TorqueSplit | None) -> MetricValues:
     ports = unavailable(port_energy.PORT_ENERGY_KEYS, f"no records of {site}")
     if track is not None and by is not None:
         ports = port_energy.measure_port_energy(log.scenario, track, by)
@@ -182,12 +180,12 @@ def _measure_links(
 
 
 def _measure_walls(
-    log: Log, found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueAttribution]
+    log: Log, found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit]
 ) -> dict[str, MetricValues]:
     facts = {}
     for site in log.sites:
         for n, wall in enumerate(wall_contact.list_walls(log.scenario.sites[site]), 1):
-            tip = by[site].parts.tip if site in by else None
+            tip = by[site].end_effector if site in by else None
             facts[f"{site}/{n}"] = wall_contact.measure_wall_contact(wall, found.get(site), tip)
     return facts
 

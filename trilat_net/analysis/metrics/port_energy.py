@@ -27,10 +27,10 @@ from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario, SiteSpec
-from ..aligned import AlignedRecords, PeerMotion, PeerTrajectory, mask_recorded_periods
+from ..aligned import AlignedRecords, PeerMotion, PeerTrajectory
 from ..arm_rows import inertia_product_rows, regressor_rows
 from ..dominance_history import DominanceHistory
-from ..torque_split import TorqueAttribution
+from ..torque_split import TorqueSplit
 from .metric_catalogue import Metric, MetricValues, metric, unavailable
 from .parameter_error import has_known_theta
 
@@ -96,7 +96,7 @@ def mechanical_energy(spec: SiteSpec, track: AlignedRecords) -> Array:
     return energy
 
 
-def measure_port_energy(scenario: Scenario, track: AlignedRecords, by: TorqueAttribution) -> MetricValues:
+def measure_port_energy(scenario: Scenario, track: AlignedRecords, by: TorqueSplit) -> MetricValues:
     """Returns the energies of a site's ports, over the periods whose both ends are recorded.
 
     Args:
@@ -104,7 +104,7 @@ def measure_port_energy(scenario: Scenario, track: AlignedRecords, by: TorqueAtt
         track: the site's records.
         by: who pushed it.
     """
-    spec, there = scenario.sites[track.site], mask_recorded_periods(track)
+    spec, there = scenario.sites[track.site], track.known_periods
     if not there.any():
         return unavailable(PORT_ENERGY_KEYS, "no two records in a row")
 
@@ -112,8 +112,8 @@ def measure_port_energy(scenario: Scenario, track: AlignedRecords, by: TorqueAtt
         return np.cumsum(np.where(there, amounts, 0.0))
 
     controller = summed(held_work(held_control_torque(track, scenario), track.q))
-    hands = summed(trapezoid_work(by.parts.hands, track.q) + held_work(by.parts.hands_held, track.q))
-    walls = summed(trapezoid_work(by.parts.walls, track.q) + held_work(by.parts.walls_held, track.q))
+    hands = summed(trapezoid_work(by.operator_now, track.q) + held_work(by.operator_held, track.q))
+    walls = summed(trapezoid_work(by.environment_now, track.q) + held_work(by.environment_held, track.q))
     found = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(hands[-1]),
@@ -171,7 +171,7 @@ def measure_delay_energy(
     seen = past.at(np.where(used >= 0, used / other.rate_hz, -1.0))
     now = past.at(track.t_s)
     known = seen.known & now.known & track.follows
-    there = mask_recorded_periods(track) & known[:-1] & known[1:]
+    there = track.known_periods & known[:-1] & known[1:]
     if not there.any():
         return unavailable(DELAY_ENERGY_KEYS, "no period rests on records of both sites")
     share, j = shares[site], list(track.used).index(peer)

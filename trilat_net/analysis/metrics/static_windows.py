@@ -25,7 +25,7 @@ from ...log.record_columns import Ints
 from ..aligned import AlignedRecords, Bools, find_latest_rows
 from ..dominance_history import DominanceHistory
 from ..run_end import STATIC_SPEED_RAD_S
-from ..torque_split import TorqueAttribution
+from ..torque_split import TorqueSplit
 
 WINDOW_S = 1.0
 """Length of a window, s; a stretch must be as long."""
@@ -64,7 +64,7 @@ class StaticWindow(NamedTuple):
 
 def find_static_windows(
     found: Mapping[str, AlignedRecords],
-    by: Mapping[str, TorqueAttribution],
+    by: Mapping[str, TorqueSplit],
     owned: Mapping[str, DominanceHistory],
 ) -> list[StaticWindow]:
     """Returns the windows at rest, in order.
@@ -95,10 +95,10 @@ def find_static_windows(
     return [window for window in windows if window is not None]
 
 
-def _moving(by: TorqueAttribution) -> Bools:
+def _moving(by: TorqueSplit) -> Bools:
     """Returns where a hand moves by its script, shape (K,); of one without a script the torque decides."""
     if by.script is None:
-        return np.zeros(len(by.by_hand), dtype=np.bool_)
+        return np.zeros(len(by.operator), dtype=np.bool_)
     change = np.abs(np.diff(by.script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
     moving: Bools = np.append(change, False) | np.append(False, change)
     return moving
@@ -114,7 +114,7 @@ def _static_window(
     from_s: float,
     to_s: float,
     found: Mapping[str, AlignedRecords],
-    by: Mapping[str, TorqueAttribution],
+    by: Mapping[str, TorqueSplit],
     owned: Mapping[str, DominanceHistory],
     rows: Mapping[str, Ints],
 ) -> StaticWindow | None:
@@ -133,7 +133,7 @@ def _static_window(
         from_s,
         to_s,
         {site: values.mean(axis=0) for site, values in torque.items()},
-        {site: by[site].by_wall[row].mean(axis=0) for site, row in rows.items()},
+        {site: by[site].environment[row].mean(axis=0) for site, row in rows.items()},
         {site: _mean(by[site].script, row) for site, row in rows.items()},
         {site: found[site].q[row].mean(axis=0) for site, row in rows.items()},
         alpha,

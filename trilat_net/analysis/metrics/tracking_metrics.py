@@ -12,8 +12,9 @@ import numpy as np
 
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
-from ..aligned import METRIC_END_S, AlignedRecords, find_latest_rows, mask_end_window
+from ..aligned import AlignedRecords, find_latest_rows
 from .metric_catalogue import Metric, MetricValues, metric, peak, rms, unavailable
 
 TRACKING_KEYS = ("settle_s", "rms_error_rad", "max_error_rad", "max_error_end_rad")
@@ -32,7 +33,7 @@ def measure_tracking(log: Log, site: str) -> MetricValues:
         "settle_s": Metric(None, still) if settle_s is None else metric(settle_s),
         "rms_error_rad": metric(rms(errors)),
         "max_error_rad": metric(peak(errors)),
-        "max_error_end_rad": metric(peak(errors[part.t_s > part.t_s[-1] - METRIC_END_S])),
+        "max_error_end_rad": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
     }
 
 
@@ -55,7 +56,7 @@ def measure_spread(log: Log, found: Mapping[str, AlignedRecords]) -> MetricValue
     q: Array = np.stack(poses)[:, known]
     spread = q.max(axis=0) - q.min(axis=0)
     end_s = min(float(track.t_s[-1]) for track in found.values())
-    last = spread[first.t_s[known] > end_s - METRIC_END_S]
+    last = spread[first.t_s[known] > end_s - END_WINDOW_S]
     return {
         "spread_rms_rad": metric(rms(spread)),
         "spread_max_rad": metric(peak(spread)),
@@ -86,7 +87,7 @@ def measure_following(log: Log, found: Mapping[str, AlignedRecords], peer: str, 
     if not known.any():
         return unavailable(FOLLOWING_KEYS, f"no record of {site} uses a recorded sample of {peer}")
     off = master.q[row] - slave.q
-    last = mask_end_window(slave, float(slave.t_s[-1]))[known]
+    last = slave.known_at_end(END_WINDOW_S)[known]
     off = off[known]
     end = peak(off[last]) if last.any() else math.nan
     return {

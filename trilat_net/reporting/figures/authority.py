@@ -3,10 +3,9 @@
 Invariant: dominance factors follow from the scenario and the changes in the records, Eq. (6) and (7).
 """
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from ...analysis.dominance_history import evaluate_ramps, list_dominance_ramps
+from ...analysis.dominance_history import trace_dominance
 from ...analysis.site_signals import joint_angles
 from ...analysis.timeline import list_changes
 from ...core.two_link_arm import JOINTS
@@ -30,9 +29,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         column = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
         for site, axes in zip(owners, column, strict=False):
             part, peers = log[site], log.scenario.peers(site)
-            start = np.array([log.scenario.dominance[site].get(peer, 0.0) for peer in peers])
-            ramps = list_dominance_ramps(log, site)
-            alpha = evaluate_ramps(start, ramps, part.t_s, 1.0 / part.rate_hz).alpha
+            alpha = trace_dominance(log, site, part.t_s).alpha
             for peer, share in zip(peers, alpha.T, strict=True):
                 plot.trace(axes, site, share, **style.site_line(log, peer))
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.analysis.dominance_history import evaluate_ramps
+import trilat_net
+from trilat_net.analysis.dominance_history import evaluate_ramps, trace_dominance
 from trilat_net.core.dominance import apply_ramps
 from trilat_net.core.link import LINK_DTYPE
 from trilat_net.core.ticks import DominanceRamp
@@ -34,3 +35,42 @@ def test_before_a_sudden_change_they_are_as_they_were() -> None:
     assert found.alpha[50].tolist() == [1.0, 0.0]
     assert not found.constant
     assert evaluate_ramps(np.array([0.5, 0.5]), [], np.arange(9.0), 1.0).constant
+
+
+RAMPS = {
+    "duration_s": 6.0,
+    "rate_hz": 100,
+    "timeline": [
+        {"at_s": 1.0, "dominance": "s", "to": {"m1": 1.0, "m2": 0.0}, "ramp_s": 2.0},
+        {"at_s": 2.0, "dominance": "s", "to": {"m1": 0.0, "m2": 1.0}, "ramp_s": 1.5},
+        {"at_s": 5.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}},
+    ],
+}
+"""The second ramp begins half-way through the first one, at 0.75."""
+
+
+@pytest.fixture(scope="module")
+def ramped():
+    return trilat_net.simulate("paper", RAMPS)
+
+
+def test_a_ramp_begins_where_the_one_before_it_is(ramped):
+    part = ramped["s"]
+    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    at = [0.5, 1.0, 1.5, 2.0, 2.75, 3.5, 4.9, 5.1]
+    assert np.interp(at, part.t_s, alpha[:, 0]) == pytest.approx(
+        [0.5, 0.5, 0.625, 0.75, 0.375, 0.0, 0.0, 0.5]
+    )
+    assert alpha.sum(axis=1) == pytest.approx(np.ones(len(part)))
+
+
+def test_they_are_the_factors_of_the_recorded_references(ramped):
+    """Eq. (6) with them and the samples in use gives the recorded reference."""
+    part = ramped["s"]
+    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    reference = np.zeros_like(part.q)
+    for peer, factor in zip(part.peers, alpha.T, strict=True):
+        used, q = part.used[peer], ramped[peer].q
+        seen = np.where(used[:, None] >= 0, q[np.maximum(used, 0)], ramped.scenario.sites[peer].q0_rad)
+        reference += factor[:, None] * seen
+    assert reference == pytest.approx(part.q_des, abs=1e-9)

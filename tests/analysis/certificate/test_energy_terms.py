@@ -6,10 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
-from trilat_net.analysis.certificate import energy_terms
-from trilat_net.analysis.certificate.energy_terms import SiteConstants, evaluate_functional, split_periods
+from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.certificate.energy_terms import (
+    SiteConstants,
+    SiteMotion,
+    dominance_change_work,
+    evaluate_functional,
+    link_work,
+    torque_work,
+)
 from trilat_net.analysis.dominance_history import DominanceHistory
-from trilat_net.analysis.torque_split import split_torque
+from trilat_net.analysis.torque_split import TorqueSplit, split_torque
 
 from . import runs
 
@@ -54,16 +61,18 @@ class Situation:
         alpha = np.tile(self.alpha, (2, 1))
         self.shares = DominanceHistory(alpha, np.zeros((2, 2)), alpha[:1])
 
+    @property
+    def motion(self) -> SiteMotion:
+        peers = dict(zip(("a", "b"), self.views, strict=True))
+        none = np.zeros_like(self.track.q)
+        tip = compute_end_effector((1.0, 1.0), self.track.q, self.track.qd)
+        return SiteMotion(self.track, EQ, self.shares, peers, TorqueSplit(tip, none, none, none, none))
+
     def v(self, row: int) -> float:
-        return float(evaluate_functional(self.track, EQ, self.shares, self.views).total[row])
+        return float(evaluate_functional(self.motion).total[row])
 
     def booked(self) -> list[float]:
-        ends = split_periods(self.track, EQ, self.shares, self.views)
-        links = enumerate(self.views)
-        return [
-            float(energy_terms.link_work(self.track, EQ, self.shares, ends, j, one).total[0])
-            for j, one in links
-        ]
+        return [float(link_work(self.motion, j).total[0]) for j in range(2)]
 
 
 ticks = st.integers(1, NOW - 2)
@@ -87,7 +96,7 @@ def test_the_right_end_of_a_period_is_where_the_ages_stayed_as_they_were(
     seed: int, before: tuple[int, int], after: tuple[int, int]
 ) -> None:
     site = Situation(seed, before, after)
-    ends = split_periods(site.track, EQ, site.shares, site.views)
+    ends = site.motion.ends
     kept = sum(a * p.q[m + 1] for a, p, m in zip(site.alpha, site.peers, before, strict=True))
     q, qd = site.track.q[1], site.track.qd[1]
     right, jumped = qd + EQ.Lambda * (q - kept), qd + EQ.Lambda * (q - site.track.q_des[1])
@@ -101,9 +110,9 @@ def test_the_right_end_of_a_period_is_where_the_ages_stayed_as_they_were(
 @given(st.integers(0, 2**32 - 1))
 def test_a_held_torque_works_with_its_value_at_the_beginning(seed: int) -> None:
     site = Situation(seed, (5, 9), (6, 10))
-    ends = split_periods(site.track, EQ, site.shares, site.views)
+    ends = site.motion.ends
     now, held = np.random.default_rng(seed).normal(size=(2, 2, 2))
-    booked = energy_terms.torque_work(site.track, ends, now, held)
+    booked = torque_work(site.motion, now, held)
     left, right = ends.r_left[0] @ (now[0] + held[0]), ends.r_right[0] @ (now[1] + held[0])
     assert float(booked.total[0]) == pytest.approx(0.5 / RATE_HZ * (left + right))
 
@@ -114,10 +123,7 @@ def test_the_work_of_a_step_of_shares_is_what_it_changes_in_v(seed: int, share: 
     after = np.array([share, 1.0 - share])
     stepped.shares.alpha[1] = after
     stepped.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(after, stepped.views, strict=True))
-    ends = split_periods(stepped.track, EQ, stepped.shares, stepped.views)
-    amount = energy_terms.dominance_change_work(stepped.track, EQ, stepped.shares, ends, stepped.views).total[
-        0
-    ]
+    amount = dominance_change_work(stepped.motion).total[0]
     assert float(amount) == pytest.approx(stepped.v(1) - kept.v(1), rel=1e-9, abs=1e-9)
 
 
@@ -132,10 +138,9 @@ def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: 
     grown_s = 1e-6
     one = view_delayed_peer(site.track, peer, PeerTrajectory(peer))
     later = PeerTrajectory(peer).at(one.stamp_s - np.array([0.0, grown_s]))
-    views = [one._replace(seen=later), site.views[1]]
-    site.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(site.alpha, views, strict=True))
-    ends = split_periods(site.track, EQ, site.shares, views)
-    booked = float(energy_terms.link_work(site.track, EQ, site.shares, ends, 0, views[0]).total[0])
+    site.views[0] = one._replace(seen=later)
+    site.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(site.alpha, site.views, strict=True))
+    booked = float(link_work(site.motion, 0).total[0])
     e, qd, q = site.track.e[1], site.track.qd[1], site.track.q[1]
     r = qd + EQ.Lambda * e
     c2 = np.cos(q[1])
@@ -147,24 +152,24 @@ def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: 
 def test_hands_and_walls_are_told_apart_and_are_all_that_pushes() -> None:
     log = runs.log("rich")
     for name, book in runs.booked("rich").items():
-        torque = split_torque(book.track, log.scenario.sites[name])
-        total = torque.hands + torque.hands_held + torque.walls + torque.walls_held
-        assert total == pytest.approx(-book.track.tau_x, abs=1e-12)
-        assert (name == "s") == bool(torque.walls.any())
-        assert (name == "m1") == bool(np.abs(torque.hands_held).max() > 1e-9)
-        assert (name == "m2") == bool(np.abs(torque.hands).max() > 1e-9)
+        records = book.motion.records
+        torque = split_torque(records, log.scenario.sites[name])
+        assert torque.operator + torque.environment == pytest.approx(-records.tau_x, abs=1e-12)
+        assert (name == "s") == bool(torque.environment_now.any())
+        assert (name == "m1") == bool(np.abs(torque.operator_held).max() > 1e-9)
+        assert (name == "m2") == bool(np.abs(torque.operator_now).max() > 1e-9)
 
 
 def test_a_box_that_holds_the_truth_only_takes() -> None:
-    given_by_box = runs.balanced("rich").given["estimates"]
+    given_by_box = runs.balanced("rich").work["estimates"]
     assert given_by_box[-1] < -0.1
     assert np.diff(given_by_box).max() <= 1e-12
 
 
 def test_the_torque_limit_counts_where_it_cuts() -> None:
     book = runs.booked("rich")["s"]
-    cut = (np.abs(book.track.tau) >= book.eq.tau_limit).any(axis=1)
-    booked = book.given["torque limit"]
+    cut = (np.abs(book.motion.records.tau) >= book.motion.constants.tau_limit).any(axis=1)
+    booked = book.work["torque limit"]
     assert cut.any()
     assert np.array_equal(booked.left != 0.0, cut[:-1])
     assert np.array_equal(booked.right != 0.0, cut[1:])
