@@ -10,9 +10,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from trilat_net.core.jit import is_core_cached
+from trilat_net.core.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import choose_session_endpoints
@@ -24,8 +26,8 @@ from .monitor import SessionDisplay, SessionMonitor
 from .warmup import warm_up
 
 POLL_NS = 100_000_000
-END_S = 15
-"""How long a child may take to end once it was asked to; then it is killed."""
+END_TIMEOUT_NS = 15 * NS_PER_S
+"""Time for a child to end after its signal; then it is killed."""
 
 
 @dataclass(slots=True)
@@ -34,7 +36,7 @@ class SessionResult:
 
     Attributes:
         log: its log.
-        problems: what went wrong, in order; empty where nothing did.
+        problems: what failed, in order.
         interrupted: number of the signal that ended it, or 0.
     """
 
@@ -44,13 +46,13 @@ class SessionResult:
 
 
 class _Child:
-    """One process of the session, with what it prints in a file."""
+    """One process of the session; its output goes into a file."""
 
     def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         self.name = name
-        self._asked = False
-        self.printed = folder / f"{name}.txt"
-        with self.printed.open("wb") as sink:
+        self._signalled = False
+        self._output = folder / f"{name}.txt"
+        with self._output.open("wb") as sink:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "trilat_net", *arguments],
                 stdin=subprocess.DEVNULL,
@@ -64,132 +66,104 @@ class _Child:
         return self._process.poll()
 
     def end(self, number: int) -> None:
-        """Asks the process to end, or kills it."""
+        """Sends a signal that ends the process."""
         if self.code() is None:
-            self._asked = True
+            self._signalled = True
             self._process.send_signal(number)
 
     def problem(self) -> str | None:
-        """Says how the process failed, or None where it did not."""
+        """Describes how the process failed; None if it did not."""
         code = self.code()
-        if code in (0, None) or (self._asked and code == 128 + signal.SIGINT):
+        if code in (0, None) or (self._signalled and code == 128 + signal.SIGINT):
             return None
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
-        lines = self.printed.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        last = lines[-1].removeprefix("error: ") if lines else "it said nothing"
+        lines = self._output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        last = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
         return f"{self.name} ended with code {code}: {last}"
 
 
 def demo_session_name(scenario: Scenario) -> str:
-    """Returns what the session of a demo is called, for `trilat set` and `trilat ping`."""
+    """Returns the name of a demo's session, for `trilat set` and `trilat ping`."""
     return f"{scenario.name}-demo"
 
 
 def run_demo(scenario: Scenario, folder: Path, display: SessionDisplay) -> SessionResult:
-    """Runs a session of all sites and a recorder, from start to end.
+    """Runs a session of all sites and a recorder; its log is valid whenever the session began.
 
     Args:
         scenario: the experiment.
-        folder: where the log and what the processes print go; exists.
-        display: where progress is shown.
-
-    Returns:
-        How it ended. The log is valid in every case in which a session began.
+        folder: an existing folder for the log and the output of the processes.
+        display: shows progress.
     """
-    outcome = SessionResult(folder / "run.mcap")
+    result = SessionResult(folder / "run.mcap")
+    session, clock = demo_session_name(scenario), SystemClock()
     with Interrupt() as interrupt:
         if not is_core_cached():
             display.say("compiling, once for this machine ...")
             with interrupt.raising():
                 warm_up(scenario, scenario.names[0])  # once for all children
-        session = demo_session_name(scenario)
         endpoints = choose_session_endpoints(session, scenario.names)
-        children, recorder = _start(scenario, folder, session, endpoints)
+        sites, recorder = _start(scenario, folder, session, endpoints)
         for name in scenario.external:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
             display.say(f"{name} waits for its arm on {place}; see docs/external-arm.md")
-        clock = SystemClock()
         try:
             with closing(ZenohBus([], endpoints)) as bus:
-                watch = SessionMonitor(bus, session, scenario.names)
-                _supervise(watch, display, children, recorder, interrupt, outcome, clock)
+                monitor = SessionMonitor(bus, session, scenario.names)
+                while not (interrupt.requested() or _is_over([*sites, recorder], result)):
+                    monitor.poll()
+                    display.update(monitor.latest)
+                    for text in monitor.take_news():
+                        display.say(text)
+                    clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         finally:
-            _end_all(children, recorder, clock)
-        outcome.interrupted = interrupt.number
-    for child in [*children, recorder]:
+            _end_all(sites, recorder, clock)
+        result.interrupted = interrupt.number
+    for child in [*sites, recorder]:
         problem = child.problem()
-        if problem and not outcome.interrupted and problem not in outcome.problems:
-            outcome.problems.append(problem)
-    return outcome
+        if problem and not result.interrupted and problem not in result.problems:
+            result.problems.append(problem)
+    return result
 
 
 def _start(
     scenario: Scenario, folder: Path, session: str, endpoints: list[str]
 ) -> tuple[list[_Child], _Child]:
-    """Starts every site and the recorder; what they print goes into `processes/`."""
-    text = folder / "scenario.toml"
-    text.write_text(scenario.text, encoding="utf-8")
-    printed = folder / "processes"
-    printed.mkdir(exist_ok=True)
-    children = [
-        _Child(name, _site_arguments(name, text, session, endpoints, n), printed)
+    """Starts every site and the recorder; their output goes into `processes/`."""
+    file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
+    file.write_text(scenario.text, encoding="utf-8")
+    output.mkdir(exist_ok=True)
+    log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
+    connect = [["--connect", endpoint] for endpoint in endpoints]
+    sites = [
+        _Child(
+            name,
+            [
+                *("site", name, "--scenario", str(file), "--session", session, "--listen", endpoints[n]),
+                *chain(*connect[:n]),
+                "--needs-recorder",
+            ],
+            output,
+        )
         for n, name in enumerate(scenario.names)
     ]
-    connect = [word for endpoint in endpoints for word in ("--connect", endpoint)]
-    log = str(folder / "run.mcap")
-    Path(log).unlink(missing_ok=True)  # an earlier run's, in a folder that may be replaced
-    arguments = ["record", "--session", session, *connect, "-o", log, "--join-timeout", "60", "--force"]
-    return children, _Child(topics.RECORDER, arguments, printed)
+    arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
+    return sites, _Child(topics.RECORDER, [*arguments, "--join-timeout", "60", "--force"], output)
 
 
-def _site_arguments(name: str, scenario: Path, session: str, endpoints: list[str], n: int) -> list[str]:
-    connect = [word for endpoint in endpoints[:n] for word in ("--connect", endpoint)]
-    return [
-        "site",
-        name,
-        "--scenario",
-        str(scenario),
-        "--session",
-        session,
-        "--listen",
-        endpoints[n],
-        *connect,
-        "--needs-recorder",
-    ]
+def _is_over(children: list[_Child], result: SessionResult) -> bool:
+    """True once a child has failed, or all have ended; notes the failures."""
+    result.problems += [problem for child in children if (problem := child.problem())]
+    return bool(result.problems) or all(child.code() == 0 for child in children)
 
 
-def _supervise(
-    watch: SessionMonitor,
-    display: SessionDisplay,
-    children: list[_Child],
-    recorder: _Child,
-    interrupt: Interrupt,
-    outcome: SessionResult,
-    clock: Clock,
-) -> None:
-    """Shows progress until every process has ended, one has failed, or a signal has come."""
-    while not interrupt.requested():
-        watch.poll()
-        display.update(watch.latest)
-        for sentence in watch.take_news():
-            display.say(sentence)
-        everyone = [*children, recorder]
-        failed = [problem for child in everyone if (problem := child.problem())]
-        if failed:
-            outcome.problems += failed
-            return
-        if all(child.code() == 0 for child in everyone):
-            return
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-
-
-def _end_all(children: list[_Child], recorder: _Child, clock: Clock) -> None:
-    """Ends the sites, then the recorder, which by then has what they had to say."""
-    for group in (children, [recorder]):
+def _end_all(sites: list[_Child], recorder: _Child, clock: Clock) -> None:
+    """Ends the sites, then the recorder, which by then has all their messages."""
+    for group in (sites, [recorder]):
         for child in group:
             child.end(signal.SIGINT)
-        give_up_ns = clock.monotonic_ns() + END_S * 1_000_000_000
+        give_up_ns = clock.monotonic_ns() + END_TIMEOUT_NS
         while any(child.code() is None for child in group):
             if clock.monotonic_ns() > give_up_ns:
                 for child in group:

@@ -14,7 +14,8 @@ from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.messages import Event, LinkStats
+from trilat_net.net.membership import read_events
+from trilat_net.net.messages import LinkStats
 from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 
@@ -22,14 +23,9 @@ from trilat_net.scenario import Scenario
 class SessionMonitor:
     """The latest statistics and the events of a session.
 
-    Args:
-        bus: a connection to every site.
-        session: the session's name.
-        sites: its sites; what others say is nobody's.
-
     Attributes:
-        latest: per site its latest statistics.
-        news: sentences that a person should read, not yet taken.
+        latest: latest statistics of every site.
+        news: event texts for the user, not yet taken.
     """
 
     def __init__(self, bus: Bus, session: str, sites: Sequence[str]) -> None:
@@ -40,7 +36,7 @@ class SessionMonitor:
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
 
     def poll(self) -> None:
-        """Takes what has come."""
+        """Takes the messages that have arrived."""
         while (message := self._links.poll()) is not None:
             try:
                 stats = decode(message[1], LinkStats)
@@ -48,31 +44,22 @@ class SessionMonitor:
                 continue  # the sites and the recorder count strangers
             if stats.site in self._sites:
                 self.latest[stats.site] = stats
-        while (message := self._events.poll()) is not None:
-            try:
-                event = decode(message[1], Event)
-            except WireError:
-                continue
+        for event in read_events(self._events):
             if event.kind in ("lost", "diverged", "failed", "refused", "clock fault"):
                 self.news.append(event.text)
 
     def take_news(self) -> Sequence[str]:
-        """Returns the sentences that came since the last call."""
+        """Returns the event texts since the last call."""
         news, self.news = self.news, []
         return news
 
 
 LINE_EVERY = 20
-"""Without a terminal, every so many updates a line is printed."""
+"""Without a terminal, one update in so many prints a line."""
 
 
 class SessionDisplay:
-    """Shows progress; a context, so that the terminal is left as it was.
-
-    Args:
-        scenario: the experiment.
-        console: where to show it.
-    """
+    """Shows the progress of a session; a context, which restores the terminal."""
 
     def __init__(self, scenario: Scenario, console: Console) -> None:
         self._scenario, self._console = scenario, console
@@ -99,7 +86,7 @@ class SessionDisplay:
             self._console.print(self._line(latest), highlight=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
-        """Prints a sentence above the table."""
+        """Prints a line above the table."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def _table(self, latest: dict[str, LinkStats]) -> Table:

@@ -22,20 +22,20 @@ from trilat_net.scenario import parse_embedded
 
 POLL_NS = 1_000_000
 GATHER_NS = 600_000_000
-"""How long to look for members after the first one."""
+"""Time to find members after the first one."""
 PATIENCE_NS = 3_000_000_000
-"""How much longer than they should take to wait for the last answers."""
+"""Time to wait for the last answers beyond their due time."""
 
 
 @dataclass(frozen=True, slots=True)
 class PingResult:
-    """One member, as far as it could be reached.
+    """Round trips to one member.
 
     Attributes:
-        info: what it says of itself.
+        info: its identity.
         rtts_ns: round trips, without the time that it held them.
-        shared: whether its clock is the visitor's own.
-        estimate: where its clock stands against the visitor's; None where too few round trips agree.
+        shared: whether its clock is the client's own.
+        estimate: offset of its clock from the client's; None if too few round trips agree.
     """
 
     info: Info
@@ -45,17 +45,17 @@ class PingResult:
 
 
 class SessionPing:
-    """One look at a session; call `poll` until `over`.
+    """One measurement of a session; call `poll` until `over`.
 
     Args:
         bus: a connection to its members.
-        clock: the visitor's time.
+        clock: the time.
         session: the session's name.
-        count: how many round trips to make to each member.
+        count: number of round trips to each member.
 
     Attributes:
-        infos: who answered, by name.
-        links: of every site that runs, its latest statistics.
+        infos: identities of the members that answered, by name.
+        links: latest statistics of every running site.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
@@ -68,7 +68,7 @@ class SessionPing:
         self._first_ns: int | None = None
 
     def poll(self) -> None:
-        """Takes what has come, and asks on."""
+        """Takes the answers that have arrived, and asks again."""
         for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
@@ -84,7 +84,7 @@ class SessionPing:
         return {info.boot for info in self.infos.values()}
 
     def over(self, timeout_ns: int, begun_ns: int) -> bool:
-        """True once everybody has answered, or had the time to."""
+        """True once every member has answered, or has had the time to."""
         now_ns = self._clock.monotonic_ns()
         if self._first_ns is None:
             return now_ns - begun_ns > timeout_ns
@@ -93,7 +93,7 @@ class SessionPing:
         return passed_ns > GATHER_NS and (self.pinger.know(self._boots()) or passed_ns > enough_ns)
 
     def reached(self) -> list[PingResult]:
-        """Returns what was measured, by name of the member."""
+        """Returns the measurements in the order of the members' names."""
         own = self._clock.identity()
         reached = []
         for _, info in sorted(self.infos.items()):
@@ -113,18 +113,18 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> SessionPing | None:
-    """Looks at a session once; None where a signal came first.
+    """Measures a session once; None if `stopped`.
 
     Args:
-        connection: how to reach it; without endpoints to connect to, on this machine.
-        clock: the visitor's time.
+        connection: how to reach it, see `connect_to_session`.
+        clock: the time.
         session: its name.
-        count: how many round trips to make to each member.
+        count: number of round trips to each member.
         timeout_s: how long to wait for the first answer, s.
-        stopped: True once it was asked to end.
+        stopped: True once the client should end.
 
     Raises:
-        RunFailed: nobody answered.
+        RunFailed: no member answered.
     """
 
     def site_names(text: str) -> tuple[str, ...]:

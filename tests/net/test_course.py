@@ -26,7 +26,7 @@ def test_it_is_continuous_whatever_estimates_come_and_when(bends: list[tuple[Off
     for estimate, passed_ns in bends:
         now_ns += passed_ns
         before = course.at(now_ns)
-        course.bend(now_ns, estimate._replace(at_ns=now_ns))
+        course.slew_to(now_ns, estimate._replace(at_ns=now_ns))
         assert abs(course.at(now_ns) - before) <= 1 + abs(estimate.offset_ns - before) * 1e-12
         for at_ns in (now_ns, now_ns + SLEW_NS // 3, now_ns + SLEW_NS, now_ns + 2 * SLEW_NS):
             steps = [course.at(at_ns + n) for n in range(3)]
@@ -36,7 +36,7 @@ def test_it_is_continuous_whatever_estimates_come_and_when(bends: list[tuple[Off
 @given(estimates)
 def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstimate) -> None:
     course = SlewedOffset(exact_offset(0))
-    course.bend(0, estimate)
+    course.slew_to(0, estimate)
     for at_ns in (SLEW_NS, 2 * SLEW_NS, 10 * SLEW_NS):
         assert abs(course.at(at_ns) - estimate.offset_at(at_ns)) <= 2
 
@@ -59,7 +59,7 @@ def test_the_truth_is_inside_its_bound_at_every_instant(seed: int, offset_ns: in
         estimate = estimator.estimate(now_ns)
         assert estimate is not None
         bent_ns = now_ns + rnd.randrange(1_000_000)
-        course.bend(bent_ns, estimate)
+        course.slew_to(bent_ns, estimate)
         assert course.bound_at(bent_ns + SLEW_NS) == course.bound_ns
         now_ns = bent_ns
 

@@ -81,7 +81,7 @@ def test_it_stays_until_members_have_come_and_all_have_left_for_so_long() -> Non
     pause = [lambda: None] * 2
     clock = Played(*nothing, comes, *nothing, goes, *pause, comes, *nothing, goes, rest=100)
     said = routed(clock, network, idle_ns * 1e-9)
-    assert said[-1] == "nobody has been here for 0.2 s"
+    assert said[-1] == "no member for 0.2 s"
     assert len(said) == 5
     assert not clock.over
     assert clock.monotonic_ns() == (10 + 1 + 10 + 1 + 2 + 1 + 10 + 1 + 4) * ROUTER_POLL_NS

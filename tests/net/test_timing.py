@@ -117,7 +117,7 @@ class Session:
         site, other = self.sites[n], self.sites[1 - n]
         arrived_ns = site.clock.monotonic_ns() + self.step[n]
         (meter,) = site.timing.meters
-        bound_ns = meter.course.bound_at(arrived_ns)
+        bound_ns = meter.offset.bound_at(arrived_ns)
         delay_ns = meter.take(message, arrived_ns)
         true_delay_ns = true_ns - other.ticked_ns[message.tick]
         site.errors_ns.append((message.tick, delay_ns - true_delay_ns, bound_ns))
@@ -218,7 +218,7 @@ def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
     assert link.take(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
     assert link.figures() == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
     assert link.close(10**12, 10**12) is None
-    assert link.course.bound_ns == 0
+    assert link.offset.bound_ns == 0
 
 
 def test_an_echo_of_what_is_not_known_any_more_says_nothing() -> None:
@@ -238,7 +238,7 @@ def test_figures_are_of_what_came_since_the_last_and_faults_since_the_start() ->
     assert link.figures() == (3, 900, -1, 1)
     assert link.figures() == (-1, -1, -1, 1)
     assert link.worst_ns == 5_000
-    link.forgive()
+    link.reset_faults()
     assert link.worst_ns == 0
 
 

@@ -26,7 +26,7 @@ from .wire import decode, encode
 from .zenoh_bus import ZenohBus
 
 FRESH_NS = 100_000_000
-"""A torque that came longer ago counts no more: the site is late, or away."""
+"""Age at which a torque is invalid: the site is late, or gone."""
 
 
 class ArmPort:
@@ -36,7 +36,7 @@ class ArmPort:
         bus: a connection that reaches the site.
         clock: the time.
         session: the session's name.
-        site: whose arm this is.
+        site: the site of the arm.
 
     Attributes:
         record: the newest record of the site, None before the first.
@@ -48,7 +48,7 @@ class ArmPort:
         self._boot = new_boot()
         self._n = 0
         self._came_ns = 0
-        self._met = self._gone = False
+        self._present = self._gone = False
         self._publish = bus.publisher(topics.key(session, site, topics.MEASURED))
         self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, 64)
         self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
@@ -59,9 +59,9 @@ class ArmPort:
         """Returns a port that reaches a site over Zenoh.
 
         Args:
-            session: the session's name; by default a scenario's name.
-            site: whose arm this is.
-            connect: where the site listens, as it says when it waits for its arm.
+            session: the session's name, by default the scenario's.
+            site: the site of the arm.
+            connect: the site's endpoints, as it prints them when it waits for its arm.
 
         Raises:
             UsageError: an endpoint cannot be used.
@@ -77,7 +77,7 @@ class ArmPort:
         self._bus.close()
 
     def send(self, q: Sequence[float], qd: Sequence[float]) -> None:
-        """Says where the arm is now.
+        """Sends the position of the arm.
 
         Args:
             q: joint angles, rad.
@@ -95,11 +95,11 @@ class ArmPort:
         self._publish(encode(message))
 
     def torque(self) -> tuple[float, ...] | None:
-        """Returns the torque to apply now, N m per joint; None where the arm is to brake.
+        """Returns the torque to apply now, N m per joint; None if the arm must brake.
 
-        That is so before the first tick, when the run is over, and while nothing newer than `FRESH_NS` came.
+        It must before the first tick, after the run, and while no record newer than `FRESH_NS` has arrived.
         """
-        self._hear()
+        self._read_messages()
         record = self.record
         if record is None or self._gone or record.mode == "diverged":
             return None
@@ -110,11 +110,10 @@ class ArmPort:
     @property
     def over(self) -> bool:
         """True once the site's run has ended, or the site is gone."""
-        self._hear()
+        self._read_messages()
         return self._gone
 
-    def _hear(self) -> None:
-        """Takes in what has come."""
+    def _read_messages(self) -> None:
         while (message := self._records.poll()) is not None:
             try:
                 record = decode(message[0], State)
@@ -126,5 +125,5 @@ class ArmPort:
             if event.kind == "end" and self.record is not None and event.boot == self.record.boot:
                 self._gone = True
         while (change := self._presence.poll()) is not None:
-            self._met = self._met or change[1]
-            self._gone = self._gone or (self._met and not change[1])
+            self._present = self._present or change[1]
+            self._gone = self._gone or (self._present and not change[1])

@@ -8,13 +8,15 @@ loss; elsewhere the receiver sees it in the tick numbers. Only the recorder take
 tests.
 """
 
+import re
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
-"""Messages that a ring holds: sixteen seconds of one peer at 1 kHz."""
+"""Capacity of a ring in messages: sixteen seconds of one peer at 1 kHz."""
 
 
 T = TypeVar("T")
@@ -28,11 +30,11 @@ class Inbox(Protocol):
 
 
 class StampedInbox(Protocol):
-    """A bounded ring of messages with the instants at which they arrived."""
+    """A bounded ring of messages with the instants of their arrival."""
 
     @property
     def overflowed(self) -> int:
-        """How many messages the full ring has lost, oldest first."""
+        """Number of messages that the full ring has dropped, oldest first."""
 
     def poll(self) -> tuple[bytes, int] | None:
         """Returns the oldest message (payload, instant of its arrival in ns), or None; never waits."""
@@ -46,98 +48,84 @@ class PresenceInbox(Protocol):
 
 
 class Query(Protocol):
-    """A question that waits for an answer."""
+    """A query that waits for an answer."""
 
     @property
     def payload(self) -> bytes:
-        """What the asker sent with it; b"" if nothing."""
+        """The payload of the query; b"" without one."""
 
     def answer(self, payload: bytes) -> None:
         """Answers it."""
 
 
 class QueryInbox(Protocol):
-    """A bounded ring of questions."""
+    """A bounded ring of queries."""
 
     def poll(self) -> Query | None:
-        """Returns the oldest question, or None; never waits."""
+        """Returns the oldest query, or None; never waits."""
 
 
 class Bus(Protocol):
     """One member's connection."""
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """Returns what publishes a payload under a key; it drops rather than waits.
+        """Returns a function that publishes a payload under a key and drops it rather than wait.
 
         Args:
             key: without wildcards.
-            patient: wait for room rather than drop, seconds at most: for who has no tick to meet and must
-                not lose what it publishes, as a replay.
+            patient: wait for room, some seconds at most: for a sender without ticks that must lose nothing.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a ring that fills with what others publish under a key expression."""
+        """Returns a ring of the messages that others publish under a key expression."""
 
     def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
-        """Returns a ring whose messages are stamped by `now_ns` as they come, in a thread of the bus."""
+        """Returns a ring whose messages are stamped by `now_ns` on arrival, in a thread of the bus."""
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls back with (key, payload) as messages come, in a thread of the bus."""
+        """Calls back with (key, payload) on arrival, in a thread of the bus."""
 
     def questions(self, key: str) -> QueryInbox:
-        """Returns a ring of the questions that others ask under a key."""
+        """Returns a ring of the queries of others under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Answers questions under a key at once, in a thread of the bus.
+        """Answers queries under a key at once, in a thread of the bus.
 
         Args:
             key: without wildcards.
-            answer: takes what the asker sent and returns what to answer, or None for no answer; short,
-                because what arrives meanwhile waits, and without exceptions.
+            answer: returns the answer to a query's payload, or None for no answer; short, because messages
+                wait meanwhile, and without exceptions.
         """
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
-        """Asks everyone who answers under a key expression; answers come into the ring as they come."""
+        """Queries all who answer under a key expression; returns the ring of their answers."""
 
     def announce(self, key: str) -> None:
         """Declares a liveliness token, which disappears with the member."""
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a ring of the tokens that appear and disappear, those that stand already first."""
+        """Returns a ring of tokens that appear and disappear, beginning with the present ones."""
 
     def close(self) -> None:
-        """Leaves; safe to call again."""
+        """Leaves; may be called again."""
+
+
+@lru_cache(256)
+def _compile_expression(expression: str) -> re.Pattern[str]:
+    chunks = []
+    for chunk in expression.split("/"):
+        literals = map(re.escape, chunk.split("$*"))
+        chunks.append({"**": "(?:/[^/]+)*", "*": "/[^/]+"}.get(chunk, "/" + "[^/]*".join(literals)))
+    return re.compile("".join(chunks))
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """True where a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of one."""
-    return _match(expression.split("/"), key.split("/"))
-
-
-def _match(pattern: list[str], chunks: list[str]) -> bool:
-    if not pattern:
-        return not chunks
-    if pattern[0] == "**":
-        return any(_match(pattern[1:], chunks[n:]) for n in range(len(chunks) + 1))
-    return bool(chunks) and _match_chunk(pattern[0], chunks[0]) and _match(pattern[1:], chunks[1:])
-
-
-def _match_chunk(pattern: str, chunk: str) -> bool:
-    if "$*" not in pattern:
-        return pattern in ("*", chunk)
-    first, *rest = pattern.split("$*")
-    if not chunk.startswith(first):
-        return False
-    at = len(first)
-    for part in rest[:-1]:
-        at = chunk.find(part, at) + len(part)
-        if at < len(part):
-            return False
-    return len(chunk) - at >= len(rest[-1]) and chunk.endswith(rest[-1])
+    """True if a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of one."""
+    return _compile_expression(expression).fullmatch("/" + key) is not None
 
 
 class _Ring(Generic[T]):
-    """A bounded ring of anything; what overflows is lost oldest first."""
+    """A bounded ring; on overflow it drops the oldest entry."""
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
@@ -154,10 +142,6 @@ class _Ring(Generic[T]):
 class StampingRing:
     """The `StampedInbox` of every bus; `take` may run in another thread than `poll`.
 
-    Args:
-        now_ns: the time.
-        capacity: how many messages it holds, 1 or more.
-
     Attributes:
         overflowed: see `StampedInbox`; every message taken is polled, waits, or is counted here.
     """
@@ -170,9 +154,9 @@ class StampingRing:
     def take(self, payload: bytes) -> None:
         """Stamps a message and appends it."""
         self._entries.append((payload, self._now_ns()))
-        # not `maxlen`: what a full deque pushes out could not be told from what `poll` has just taken
+        # not `maxlen`: a full deque cannot distinguish what it drops from what `poll` has just taken
         if len(self._entries) > self._capacity:
-            with suppress(IndexError):  # polled empty since the line before
+            with suppress(IndexError):  # `poll` has emptied it since the line before
                 self._entries.popleft()
                 self.overflowed += 1
 
@@ -185,7 +169,7 @@ class StampingRing:
 
 
 class _LocalQuery:
-    """A question inside one process."""
+    """A query inside one process."""
 
     def __init__(self, key: str, payload: bytes, replies: _Ring[tuple[str, bytes]]) -> None:
         self.payload = payload
@@ -193,12 +177,12 @@ class _LocalQuery:
         self._replies = replies
 
     def answer(self, payload: bytes) -> None:
-        """See `Question`."""
+        """See `Query`."""
         self._replies.put((self._key, payload))
 
 
 class LocalNetwork:
-    """What the `LocalBus`es of one process have in common."""
+    """The network of the `LocalBus`es of one process."""
 
     def __init__(self) -> None:
         self.members: list[LocalBus] = []
@@ -216,12 +200,12 @@ class LocalBus:
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
-        self._answering: list[tuple[str, Callable[[_LocalQuery], None]]] = []
-        self._watching: list[tuple[str, _Ring[tuple[str, bool]]]] = []
+        self._responders: list[tuple[str, Callable[[_LocalQuery], None]]] = []
+        self._presence_rings: list[tuple[str, _Ring[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
-        """See `Bus`; here is always room."""
+        """See `Bus`; there is always room."""
 
         def publish(payload: bytes) -> None:
             for member in self._network.members:
@@ -250,24 +234,24 @@ class LocalBus:
     def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
         ring = _Ring[Query]()
-        self._answering.append((key, ring.put))
+        self._responders.append((key, ring.put))
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
 
-        def at_once(question: _LocalQuery) -> None:
-            answered = answer(question.payload)
+        def answer_at_once(query: _LocalQuery) -> None:
+            answered = answer(query.payload)
             if answered is not None:
-                question.answer(answered)
+                query.answer(answered)
 
-        self._answering.append((key, at_once))
+        self._responders.append((key, answer_at_once))
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
         replies = _Ring[tuple[str, bytes]]()
         for member in self._network.members:
-            for answered, take in member._answering:
+            for answered, take in member._responders:
                 if member is not self and matches_key(key, answered):
                     take(_LocalQuery(answered, payload, replies))
         return replies
@@ -275,7 +259,7 @@ class LocalBus:
     def announce(self, key: str) -> None:
         """See `Bus`."""
         self._tokens.append(key)
-        self._tell(key, True)
+        self._notify(key, True)
 
     def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
@@ -284,7 +268,7 @@ class LocalBus:
             for token in member._tokens:
                 if member is not self and matches_key(key, token):
                     ring.put((token, True))
-        self._watching.append((key, ring))
+        self._presence_rings.append((key, ring))
         return ring
 
     def close(self) -> None:
@@ -292,10 +276,10 @@ class LocalBus:
         if self in self._network.members:
             self._network.members.remove(self)
             for token in self._tokens:
-                self._tell(token, False)
+                self._notify(token, False)
 
-    def _tell(self, token: str, alive: bool) -> None:
+    def _notify(self, token: str, alive: bool) -> None:
         for member in self._network.members:
-            for expression, ring in member._watching:
+            for expression, ring in member._presence_rings:
                 if member is not self and matches_key(expression, token):
                     ring.put((token, alive))

@@ -9,20 +9,20 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-NS_PER_S = 1_000_000_000  # `core.grid` has it too, but brings the compiler along: a router needs none
+NS_PER_S = 1_000_000_000  # `core.ticks` has it too, but loads the compiler, which a router does not need
 
 
 class Clock(Protocol):
-    """What a driver may ask of time."""
+    """The time, as every driver gets it."""
 
     def monotonic_ns(self) -> int:
-        """Returns nanoseconds of a clock that never steps; its zero means nothing."""
+        """Returns nanoseconds of a clock that never steps; its zero is arbitrary."""
 
     def unix_ns(self) -> int:
         """Returns nanoseconds since 1970, by the machine's wall clock, which may step."""
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Returns at `deadline_ns` of the monotonic clock, or at once where that has passed."""
+        """Returns at `deadline_ns` of the monotonic clock, or at once if that has passed."""
 
     def identity(self) -> str:
         """Names the monotonic clock: equal only where two processes can compare its readings."""
@@ -56,15 +56,15 @@ class SystemClock:
 
 
 class SkewedClock:
-    """A clock that runs beside another one: test injection, as of a machine that was started elsewhere.
+    """Another clock with an offset and a drift: test injection of another machine's clock.
 
     It reads start + offset + (other - start) (1 + drift), where start is the other's reading when this one
-    was made. Its identity says so, and is equal to no other: whoever knows it can undo it.
+    was made. Its identity states all of it and is unique, so that a reader of a log can undo it.
 
     Args:
-        clock: the other one; its wall clock is left as it is.
-        offset_ns: how far it is ahead at its start.
-        drift_ppb: by how much it runs faster, ns/s.
+        clock: the other one; its wall clock stays.
+        offset_ns: offset at the start.
+        drift_ppb: drift, ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
@@ -94,19 +94,14 @@ class SkewedClock:
 
 
 def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
-    """Returns the machine's clock, or one that runs beside it where an offset (s) or a drift is injected."""
+    """Returns the machine's clock, with an offset (s) and a drift if they are injected."""
     if not offset_s and not drift_ppm:
         return SystemClock()
     return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))
 
 
 class ManualClock:
-    """A clock that a test moves by hand; sleeping moves it to the deadline.
-
-    Args:
-        start_ns: its first reading.
-        epoch_unix_ns: what the wall clock shows at reading 0.
-    """
+    """A clock that a test moves by hand; sleeping moves it to the deadline."""
 
     def __init__(self, start_ns: int = 0, epoch_unix_ns: int = 0) -> None:
         self._now_ns = start_ns

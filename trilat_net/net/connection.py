@@ -25,24 +25,23 @@ _FIRST_PORT, _BLOCKS, _BLOCK = 10_240, 340, 64
 
 
 def default_endpoint(session: str, index: int) -> str:
-    """Returns where the site of that index in the scenario listens by default."""
+    """Returns the default endpoint of a site by its index in the scenario."""
     port = _FIRST_PORT + zlib.crc32(session.encode()) % _BLOCKS * _BLOCK + index % _BLOCK
     return f"tcp/127.0.0.1:{port}"
 
 
 def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
-    """Returns where every site of a session listens by default."""
+    """Returns the default endpoint of every site of a session."""
     return {site: default_endpoint(session, index) for index, site in enumerate(sites)}
 
 
 def choose_session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
-    """Returns where the sites of a session may listen: by default, or elsewhere where a port is taken."""
-    default = [default_endpoint(session, index) for index in range(len(sites))]
+    """Returns endpoints for the sites of a session: the defaults, or free ones if a port is taken."""
+    default = list(default_endpoints(session, sites).values())
     return default if all(map(_is_free, default)) else find_free_endpoints(len(sites))
 
 
 def _is_free(endpoint: str) -> bool:
-    """True where nobody has the port of a loopback endpoint at this moment."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -53,7 +52,7 @@ def _is_free(endpoint: str) -> bool:
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns loopback endpoints whose ports nobody has at this moment."""
+    """Returns loopback endpoints whose ports are free now."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for probe in sockets:
@@ -65,18 +64,18 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 RETRY_NS = 200_000_000
-"""How long to wait between two tries to reach a router."""
+"""Between two attempts to reach a router."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """How a member takes part in the network.
+    """Endpoints and mode of a member.
 
     Attributes:
         listen: endpoints to listen at.
         connect: endpoints to connect to; a client takes the first that answers. None: still to be found.
         mode: peer of the other members, client of a router, or a router.
-        own: settings of a person's own for Zenoh.
+        own: Zenoh settings of a user's file.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -86,7 +85,7 @@ class Connection:
 
     @property
     def places(self) -> Sequence[Endpoint]:
-        """Where others reach this member: where it listens, or the routers of a client."""
+        """Endpoints at which others reach this member: its own, or the routers of a client."""
         return self.listen or self.connect or ()
 
 
@@ -98,7 +97,7 @@ def resolve_member_connection(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Returns how a site, a recorder or a tool takes part.
+    """Returns the connection of a site, a recorder or a tool.
 
     With a router, named by `--router` or by a file of mode "client", a member listens nowhere and connects to
     nothing else.
@@ -106,20 +105,20 @@ def resolve_member_connection(
     Args:
         listen: `--listen`.
         connect: `--connect`.
-        routers: `--router`; the first that answers.
+        routers: `--router`; the first that answers counts.
         file: `--zenoh-config`.
-        listen_else: where to listen if nobody says.
-        connect_else: what to connect to if nobody says.
+        listen_else: default of `listen`.
+        connect_else: default of `connect`.
 
     Raises:
-        UsageError: what is said contradicts itself.
+        UsageError: options and file contradict each other.
     """
     file = file or ZenohFile("")
     if file.mode == "router":
         raise UsageError(f"{file.source}: mode: router is for `trilat router`; here it is peer or client")
     if not routers and file.mode != "client":
         return Connection(
-            _listen(listen, file, "peer", listen_else),
+            _choose_listen(listen, file, "peer", listen_else),
             _merge_endpoints(connect, file, "peer", connect_else),
             "peer",
             file.settings,
@@ -148,23 +147,23 @@ def resolve_router_connection(
     file: ZenohFile | None,
     listen_else: Sequence[str],
 ) -> Connection:
-    """Returns how a router takes part; arguments as for `member_connection`.
+    """Returns the connection of a router; arguments as for `resolve_member_connection`.
 
     Raises:
-        UsageError: what is said contradicts itself.
+        UsageError: options and file contradict each other.
     """
     file = file or ZenohFile("")
     if file.mode not in ("", "router"):
         raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
     return Connection(
-        _listen(listen, file, "router", listen_else),
+        _choose_listen(listen, file, "router", listen_else),
         _merge_endpoints(connect, file, "router", ()),
         "router",
         file.settings,
     )
 
 
-def _listen(
+def _choose_listen(
     named: Sequence[str] | None, file: ZenohFile, mode: ZenohMode, otherwise: Sequence[str]
 ) -> Sequence[Endpoint]:
     stated = file.endpoints("listen", mode)
@@ -192,29 +191,29 @@ def open_bus(
     timeout_s: float | None,
     say: Callable[[str], None],
 ) -> ZenohBus | None:
-    """Returns a bus of that connection; None where `stopped` said so before the router answered.
+    """Opens a connection; returns None if `stopped` before the router answers.
 
     Args:
-        connection: how to take part; its `connect` is known.
+        connection: the connection; its `connect` is known.
         clock: the time.
-        stopped: whether to give up.
+        stopped: True once the caller should end.
         timeout_s: how long to wait for a router, s; None for ever.
-        say: tells a person what happens.
+        say: prints a line for the user.
 
     Raises:
         UsageError: an endpoint cannot be used.
         SessionError: no router answered in time.
     """
-    begun_ns, told = clock.monotonic_ns(), False
+    begun_ns, printed = clock.monotonic_ns(), False
     while not stopped():
         try:
             return ZenohBus(connection.listen, connection.connect or (), connection.mode, connection.own)
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None
-            if not told:
+            if not printed:
                 say(f"{silent} yet; trying again")
-            told = True
+            printed = True
         clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
     return None
 
@@ -229,30 +228,30 @@ def run_router(
     say: Callable[[str], None],
     until_idle_s: float | None = None,
 ) -> None:
-    """Stands until it is stopped, or until all members have left.
+    """Runs a router until `stopped`, or until all members have left.
 
     Args:
-        bus: a router's connection.
+        bus: the router's connection.
         clock: the time.
-        stopped: whether to end now.
-        say: tells a person what happens.
-        until_idle_s: end so many seconds after the last member has left, or None.
+        stopped: True once it should end.
+        say: prints a line for the user.
+        until_idle_s: end so long after the last member has left, s; None: stay.
     """
     presence = bus.presence(topics.key("*", "*", topics.ALIVE) + "/*")
-    there: set[str] = set()
+    present: set[str] = set()
     idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
-    empty_since_ns: int | None = None  # nobody has come yet: no end
+    empty_since_ns: int | None = None  # None before the first member
     while not stopped():
         while (change := presence.poll()) is not None:
             key, alive = change
-            where = topics.parse_key(key)
-            if where is None or alive == (key in there):
+            parts = topics.parse_key(key)
+            if parts is None or alive == (key in present):
                 continue
-            (there.add if alive else there.remove)(key)
-            say(f"session {where.session}: {where.member} {'is here' if alive else 'has left'}")
-            empty_since_ns = None if there else clock.monotonic_ns()
+            (present.add if alive else present.remove)(key)
+            say(f"session {parts.session}: {parts.member} {'is here' if alive else 'has left'}")
+            empty_since_ns = None if present else clock.monotonic_ns()
         now_ns = clock.monotonic_ns()
         if empty_since_ns is not None and now_ns - empty_since_ns >= idle_ns:
-            say(f"nobody has been here for {until_idle_s:g} s")
+            say(f"no member for {until_idle_s:g} s")
             return
         clock.sleep_until(now_ns + ROUTER_POLL_NS)

@@ -9,15 +9,16 @@ from ..core.ticks import NS_PER_S, TickRecord
 from .messages import VERSION, LinkStats
 
 STATS_PER_SECOND = 10
+_LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
 
 
 def ticks_per_stats(rate_hz: int) -> int:
-    """Returns how many ticks lie between two statistics; the first are those of tick 0."""
+    """Returns the ticks from one statistics message to the next, from tick 0 on."""
     return max(1, rate_hz // STATS_PER_SECOND)
 
 
 class LoopStats:
-    """Counts what a loop does, between two statistics and since the start.
+    """Counters of a loop, since the last statistics and since the start.
 
     Args:
         site: the site that the loop steps.
@@ -25,7 +26,7 @@ class LoopStats:
         rates: tick rate of every peer, Hz, in scenario order.
 
     Attributes:
-        dropped: messages that were not accepted, by reason.
+        dropped: messages dropped, by reason.
         overruns: ticks whose work began after the next one was due.
     """
 
@@ -41,7 +42,7 @@ class LoopStats:
         self.overruns = 0
 
     def tick(self, late_us: int, busy_us: int) -> None:
-        """Books one tick: its lateness, and the computing time of the one before."""
+        """Counts one tick: its lateness, and the computing time of the one before."""
         self._late_max_us = max(self._late_max_us, late_us)
         self._busy_max_us = max(self._busy_max_us, busy_us)
         self.overruns += late_us >= self._period_us
@@ -51,17 +52,20 @@ class LoopStats:
         return k % self._every == 0
 
     def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
-        """Returns the statistics as of a tick and begins anew with the largest values.
+        """Returns the statistics as of a tick and resets the largest values.
 
         Args:
             output: the record of that tick.
-            measured: what a clock measured, by field of `LinkStats`; none in virtual time.
+            measured: the timing fields of `LinkStats`; None in virtual time.
         """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))
         age_us = {
             peer: (output.t_ns - used * NS_PER_S // rate_hz) // 1000 if used >= 0 else -1
             for peer, used, rate_hz in zip(peers, output.used, self._rates, strict=True)
+        }
+        by_peer: dict[str, Any] = {
+            field: {peer: getattr(count, field) for peer, count in counts.items()} for field in _LINK_COUNTS
         }
         stats = LinkStats(
             v=VERSION,
@@ -71,13 +75,7 @@ class LoopStats:
             t_ns=output.t_ns,
             mode=output.mode.name.lower(),
             age_us=age_us,
-            accepted={peer: count.accepted for peer, count in counts.items()},
-            late={peer: count.late for peer, count in counts.items()},
-            duplicate={peer: count.duplicate for peer, count in counts.items()},
-            refused={peer: count.refused for peer, count in counts.items()},
-            lost={peer: count.lost for peer, count in counts.items()},
-            superseded={peer: count.superseded for peer, count in counts.items()},
-            copies={peer: count.copies for peer, count in counts.items()},
+            **by_peer,
             dropped=dict(self.dropped),
             late_max_us=self._late_max_us,
             busy_max_us=self._busy_max_us,

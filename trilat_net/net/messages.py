@@ -13,14 +13,12 @@ from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.user_law import MAX_LAW_MEMORY
 
 VERSION = 3
-"""What is sent, and all that is accepted from others."""
+"""The version sent, and the only one accepted from others."""
 READABLE = (1, 2, 3)
-"""What is read in files: every version that was released."""
+"""The versions read in files: all released ones."""
 
 U64 = Annotated[int, Meta(ge=0)]
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
-
-
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
 """Nanoseconds of a clock: eighteen years, so that sums and differences of some still fit a payload."""
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
@@ -90,7 +88,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True):
-    """What a peer needs of a `State`: the fields that it reads, by the same names."""
+    """The fields of a `State` that a peer reads."""
 
     v: int
     site: str
@@ -261,20 +259,20 @@ class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a member answers when asked who it is.
+    """A member's identity, in answer to a query.
 
     Attributes:
         v: version of this schema.
         member: a site, or "recorder".
         boot: its process start.
-        scenario_sha256: hash of the resolved scenario; "" for the recorder, which learns it.
-        scenario: the resolved text; "" for the recorder.
+        scenario_sha256: hash of the resolved scenario; "" for a recorder, which learns it.
+        scenario: the resolved text; "" for a recorder.
         host: name of its machine.
         clock: identity of its monotonic clock.
         fingerprint: of its platform's arithmetic.
         needs_recorder: whether it waits for a recorder.
         running: whether its session's epoch is fixed.
-        ticks: how many ticks it has made.
+        ticks: number of its ticks.
         epoch_mono_ns: the epoch on its clock, once it is fixed.
         epoch_unix_ns: the epoch in Unix time.
         boots: the members of the session and their boots.
@@ -298,19 +296,14 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS, "tau_x": JOINTS}
 STATE_VECTORS = {
-    "q": JOINTS,
-    "qd": JOINTS,
-    "q_des": JOINTS,
-    "qd_des": JOINTS,
-    "tau": JOINTS,
-    "tau_x": JOINTS,
+    **dict.fromkeys(("q", "qd", "q_des", "qd_des", "tau", "tau_x"), JOINTS),
     "theta_hat": PARAMETERS,
 }
-"""Vectors of a record and how many numbers each has."""
+"""Lengths of a record's vectors."""
 
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Returns the JSON Schema of a message type, root object, as viewers want it."""
+    """Returns the JSON Schema of a message type, with a root object as viewers need it."""
     (_,), components = msgspec.json.schema_components([kind])
     schema: dict[str, Any] = components[kind.__name__]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

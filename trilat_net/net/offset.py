@@ -1,6 +1,4 @@
-"""Offset and drift of another clock.
-
-Estimated from stamps that crossed a network, and the slewed offset in use.
+"""Offset and drift of another clock, estimated from stamps that crossed a network, and the slewed offset.
 
 Invariant: stamps prove every bound, for any delays, however unequal the two directions. A message is
 never received before it was sent, so with offset = other clock - own clock
@@ -29,11 +27,10 @@ from numpy.typing import NDArray
 from ..core.ticks import NS_PER_S
 
 WINDOWS_KEPT = 60
-"""Windows that are kept."""
 DRIFT_LIMIT = 500_000.0
 """Largest drift of one clock against another, ns/s."""
 WANDER = 1_000.0
-"""How far the drift may be from its mean over the windows kept, ns/s."""
+"""Largest deviation of the drift from its mean over the windows kept, ns/s."""
 _NOISE_NS = 3_000.0
 _PRIOR = 100_000.0  # of the drift, ns/s: decides only while the windows span less than a second
 _ROUNDS = 3
@@ -42,28 +39,23 @@ Array = NDArray[np.float64]
 
 
 class OffsetLimit(NamedTuple):
-    """What an offset is at most (a ceiling) or at least (a floor).
-
-    Attributes:
-        at_ns: when, on the own clock.
-        offset_ns: the limit.
-    """
+    """Upper limit (ceiling) or lower limit (floor) of an offset at an instant of the own clock."""
 
     at_ns: int
     offset_ns: int
 
 
 class OffsetEstimate(NamedTuple):
-    """What is known of an offset at an instant.
+    """An offset and its drift at an instant, with their limits.
 
     Attributes:
-        at_ns: that instant, on the own clock.
+        at_ns: the instant, on the own clock.
         offset_ns: the other clock minus the own one.
-        drift: by how much it grows, ns/s.
-        low_ns: what the offset is at least.
-        high_ns: what it is at most.
-        drift_low: what the drift is at least, ns/s.
-        drift_high: what it is at most, ns/s.
+        drift: its growth, ns/s.
+        low_ns: lower limit of the offset.
+        high_ns: upper limit of the offset.
+        drift_low: lower limit of the drift, ns/s.
+        drift_high: upper limit of the drift, ns/s.
     """
 
     at_ns: int
@@ -79,12 +71,12 @@ class OffsetEstimate(NamedTuple):
         return self.offset_ns + round((at_ns - self.at_ns) * self.drift / NS_PER_S)
 
     def including(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Returns the same with limits that contradict it inside what is possible."""
+        """Returns the same, widened to include limits that contradict it."""
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         return self._replace(low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets]))
 
     def bound_at(self, at_ns: int, offset_ns: int) -> int:
-        """Returns how far the offset can be from a value at another instant, ns."""
+        """Returns the largest distance of the offset from a value at another instant, ns."""
         passed_s = (at_ns - self.at_ns) / NS_PER_S
         up, down = self.drift_high, self.drift_low
         if passed_s < 0.0:
@@ -95,12 +87,12 @@ class OffsetEstimate(NamedTuple):
 
 
 def exact_offset(offset_ns: int) -> OffsetEstimate:
-    """Returns the estimate where both clocks are one: exact, and for ever."""
+    """Returns the estimate of an offset that is exact for ever, as of two readings of one clock."""
     return OffsetEstimate(0, offset_ns, 0.0, offset_ns, offset_ns, 0.0, 0.0)
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Returns an offset and its bound for people."""
+    """Returns an offset and its bound as text."""
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
@@ -108,8 +100,8 @@ class OffsetEstimator:
     """The ceilings and floors of one clock, and the line between them.
 
     Attributes:
-        broken: how often the limits contradicted each other, so that old ones had to go: a clock stepped,
-            or was slewed harder than DRIFT_LIMIT.
+        broken: how often the limits contradicted each other, so that the older ones were dropped: a clock
+            stepped, or was slewed harder than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -118,32 +110,24 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Takes what one window says; None where nothing came on that way."""
+        """Takes the limits of one window; None if nothing arrived in that direction."""
         if ceiling is not None:
             self._ceilings.append(ceiling)
         if floor is not None:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Returns what is known now, or None where one of the ways has said nothing yet.
-
-        Args:
-            now_ns: the own clock, at or after every window.
-        """
+        """Returns the estimate now, at or after every window; None while one direction has no limit."""
         while self._ceilings and self._floors:
             lines = _Lines(self._ceilings, self._floors, now_ns)
             if lines.possible:
                 return lines.estimate()
             self.broken += 1
-            self._forget()
+            kept = max(len(self._ceilings), len(self._floors)) // 2
+            for limits in (self._ceilings, self._floors):
+                while len(limits) > kept:
+                    limits.popleft()
         return None
-
-    def _forget(self) -> None:
-        """Drops the older half of the limits, or all that are left."""
-        kept = max(len(self._ceilings), len(self._floors)) // 2
-        for limits in (self._ceilings, self._floors):
-            while len(limits) > kept:
-                limits.popleft()
 
 
 class _Lines:
@@ -169,7 +153,7 @@ class _Lines:
         return times / NS_PER_S, values
 
     def estimate(self) -> OffsetEstimate:
-        """Returns the line in the middle, and what all lines span now."""
+        """Returns the line in the middle, and the span of all lines now."""
         slope = min(max(self._slope(), self.flattest), self.steepest)
         middle = 0.5 * (
             np.min(self._widest - slope * self._above_s) + np.max(self._lowest - slope * self._below_s)
@@ -190,8 +174,8 @@ class _Lines:
     def _slope(self) -> float:
         """Returns the drift: least squares of one slope for ceilings and floors.
 
-        A window in which nothing came through quickly says little: it weighs by how far it is from the
-        best, which depends on the slope, hence some rounds.
+        A window of slow messages tells little: its weight falls with its distance from the best one, which
+        depends on the slope, hence some rounds.
         """
         slope, drift_weight = 0.0, _PRIOR**-2
         for n in range(_ROUNDS):
@@ -212,11 +196,11 @@ class _Lines:
 
 
 SLEW_NS = 1_000_000_000
-"""How long it takes to reach a new estimate."""
+"""Time to reach a new estimate."""
 
 
 class _SlewSegment:
-    """The way towards one estimate and on along it, from an instant and a value on."""
+    """The slew from an instant and a value to one estimate, and on along it."""
 
     def __init__(self, from_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
         self.from_ns, self.estimate = from_ns, estimate
@@ -240,35 +224,31 @@ class _SlewSegment:
 
 
 class SlewedOffset:
-    """An offset over time, the other clock minus the own one.
-
-    Args:
-        estimate: what it begins with.
-    """
+    """The offset in use over time, the other clock minus the own one."""
 
     def __init__(self, estimate: OffsetEstimate) -> None:
-        self._leg = self._before = _SlewSegment(estimate.at_ns, estimate.offset_ns, estimate)
+        self._segment = self._before = _SlewSegment(estimate.at_ns, estimate.offset_ns, estimate)
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """What it goes by."""
-        return self._leg.estimate
+        """The estimate that it slews to."""
+        return self._segment.estimate
 
     @property
     def bound_ns(self) -> int:
-        """How far it is from the true offset at most, from its last bend on for BEND_NS; then it grows."""
-        return self._leg.bound_ns
+        """Its largest error, for SLEW_NS from the last `slew_to` on; then it grows."""
+        return self._segment.bound_ns
 
-    def bend(self, at_ns: int, estimate: OffsetEstimate) -> None:
-        """Goes by a new estimate from an instant of the own clock on."""
-        self._leg, self._before = _SlewSegment(at_ns, self.at(at_ns), estimate), self._leg
+    def slew_to(self, at_ns: int, estimate: OffsetEstimate) -> None:
+        """Slews to a new estimate from an instant of the own clock on."""
+        self._segment, self._before = _SlewSegment(at_ns, self.at(at_ns), estimate), self._segment
 
     def at(self, at_ns: int) -> int:
-        """Returns the offset in force at an instant, not before the last bend but one, ns."""
-        leg = self._leg
-        return leg.at(at_ns) if at_ns >= leg.from_ns else self._before.at(at_ns)
+        """Returns the offset at an instant, not before the last but one `slew_to`, ns."""
+        segment = self._segment
+        return segment.at(at_ns) if at_ns >= segment.from_ns else self._before.at(at_ns)
 
     def bound_at(self, at_ns: int) -> int:
-        """Returns how far the offset in force can be from the true one at such an instant, ns."""
-        leg = self._leg
-        return leg.bound_at(at_ns) if at_ns >= leg.from_ns else self._before.bound_at(at_ns)
+        """Returns its largest error at such an instant, ns."""
+        segment = self._segment
+        return segment.bound_at(at_ns) if at_ns >= segment.from_ns else self._before.bound_at(at_ns)

@@ -25,7 +25,7 @@ QUERY_EVERY_NS = 200_000_000
 
 
 class QueryReply(NamedTuple):
-    """An answer: when it was asked for, ns of the asker's clock; its key; its payload."""
+    """An answer: the time of its query, ns of the own clock; its key; its payload."""
 
     asked_ns: int
     key: str
@@ -61,32 +61,28 @@ class RepeatedQuery:
 
 
 PINGS = 20
-"""Answers from a member until its clock counts as known."""
+"""Round trips until a member's clock counts as known."""
 PINGS_PER_WINDOW = 5
-"""Of so many the tightest are kept."""
+"""Round trips of which the tightest limits are kept."""
 PING_PACE_NS = 10_000_000
-"""Between two pings until then."""
+"""Between two pings until all clocks are known."""
 PING_REST_NS = 250_000_000
-"""Between two pings afterwards, so that what is known does not grow old."""
+"""Between two pings afterwards, so that the estimates stay fresh."""
 GLANCE_NS = 100_000
-"""How often to poll while an answer is under way: it is stamped when it is found."""
-_KEPT = 10_000
+"""Between two polls while an answer is under way: polling stamps it."""
+_ROUND_TRIPS_KEPT = 10_000
 _STRAGGLE_NS = 20_000_000
 
 
 def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
-    """Answers pings for as long as the bus stands."""
+    """Answers pings until the bus is closed."""
 
     def answer(_: bytes) -> bytes:
         came_ns = clock.monotonic_ns()
-        pong = Pong(
-            member=info.member,
-            boot=info.boot,
-            clock=info.clock,
-            came_ns=came_ns,
-            left_ns=clock.monotonic_ns(),
+        left_ns = clock.monotonic_ns()
+        return encode(
+            Pong(member=info.member, boot=info.boot, clock=info.clock, came_ns=came_ns, left_ns=left_ns)
         )
-        return encode(pong)
 
     bus.respond(topics.key(session, info.member, topics.PING), answer)
 
@@ -101,16 +97,16 @@ class RoundTrips:
     Attributes:
         member: its name.
         clock: identity of its clock.
-        rtts_ns: the round trips, without the time that it held them; the latest.
+        rtts_ns: the latest round trips, without the time that the member held them.
         shortest_ns: the shortest of all.
-        estimator: all that they say of its clock.
-        latest: where it stood last, or None before some answers.
+        estimator: the limits of its clock's offset.
+        latest: the latest estimate, None before the first.
     """
 
     def __init__(self, pong: Pong, enough: int) -> None:
         self._enough = enough
         self.member, self.clock = pong.member, pong.clock
-        self.rtts_ns: deque[int] = deque(maxlen=_KEPT)
+        self.rtts_ns: deque[int] = deque(maxlen=_ROUND_TRIPS_KEPT)
         self.shortest_ns = 0
         self.estimator = OffsetEstimator()
         self.latest: OffsetEstimate | None = None
@@ -119,11 +115,11 @@ class RoundTrips:
 
     @property
     def known(self) -> bool:
-        """True where there are enough round trips, and they agree."""
+        """True once there are enough round trips that agree."""
         return self._agreeing >= self._enough
 
     def take(self, asked_ns: int, pong: Pong, now_ns: int) -> None:
-        """Takes one round trip; one that cannot be is passed over."""
+        """Takes one round trip; ignores an impossible one."""
         rtt_ns = now_ns - asked_ns - (pong.left_ns - pong.came_ns)
         if rtt_ns < 0 or pong.left_ns < pong.came_ns:
             return
@@ -132,19 +128,16 @@ class RoundTrips:
         self._window.append(
             (OffsetLimit(asked_ns, pong.came_ns - asked_ns), OffsetLimit(now_ns, pong.left_ns - now_ns))
         )
-        if len(self._window) == PINGS_PER_WINDOW:
-            self._close(now_ns)
-
-    def _close(self, now_ns: int) -> None:
-        """Keeps the tightest of some, and draws the line."""
+        if len(self._window) < PINGS_PER_WINDOW:
+            return
         drift = self.latest.drift / NS_PER_S if self.latest else 0.0
 
-        def level(limit: OffsetLimit) -> float:
+        def offset_now(limit: OffsetLimit) -> float:
             return limit.offset_ns - drift * (limit.at_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
         self._window = []
-        self.estimator.add(min(ceilings, key=level), max(floors, key=level))
+        self.estimator.add(min(ceilings, key=offset_now), max(floors, key=offset_now))
         estimate = self.estimator.estimate(now_ns)
         self._agreeing = self._agreeing + PINGS_PER_WINDOW if estimate else 0
         self.latest = estimate or self.latest
@@ -160,50 +153,46 @@ class Pinger:
         enough: round trips until a member's clock counts as known.
 
     Attributes:
-        trips: what came of it, by the boot of who answered.
+        trips: round trips by the boot of the member.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, enough: int = PINGS) -> None:
         self.trips: dict[int, RoundTrips] = {}
         self._clock, self._enough = clock, enough
-        self._asking = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
-        self._asked_ns = -PING_REST_NS
+        self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
         self._glance_until_ns = 0
 
     def poll(self, wanted: Collection[int]) -> None:
-        """Asks if it is time, and takes the answers that have come.
+        """Sends a ping if it is due, and takes the answers that have arrived.
 
         Args:
-            wanted: boots of the members to learn the clocks of; nobody is asked where there are none.
+            wanted: boots of the members whose clocks to learn; without any, it sends no pings.
         """
-        if wanted:
-            pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
-            if self._clock.monotonic_ns() - self._asked_ns >= pace_ns:
-                self._asked_ns = self._asking.ask()
-                self._glance_until_ns = self._asked_ns + 2 * self.slowest_ns() + _STRAGGLE_NS
-        while (answer := self._asking.poll()) is not None:
+        pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
+        if wanted and self._query.repeat(pace_ns):
+            self._glance_until_ns = self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
+        while (reply := self._query.poll()) is not None:
             now_ns = self._clock.monotonic_ns()
-            where = topics.parse_key(answer.key)
+            parts = topics.parse_key(reply.key)
             try:
-                pong = decode(answer.payload, Pong)
+                pong = decode(reply.payload, Pong)
             except WireError:
                 continue  # a stranger's
-            if where is not None and where.member == pong.member and pong.boot in wanted:
-                self.trips.setdefault(pong.boot, RoundTrips(pong, self._enough)).take(
-                    answer.asked_ns, pong, now_ns
-                )
+            if parts is not None and parts.member == pong.member and pong.boot in wanted:
+                trips = self.trips.setdefault(pong.boot, RoundTrips(pong, self._enough))
+                trips.take(reply.asked_ns, pong, now_ns)
 
     def know(self, boots: Collection[int]) -> bool:
-        """True where enough answers have come from all of these."""
+        """True once the clocks of all these members are known."""
         return all(boot in self.trips and self.trips[boot].known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
-        """Returns where a member's clock stands, as last known: exactly here where nobody had to ask."""
+        """Returns the latest estimate of a member's clock; exactly the own clock without pings to it."""
         trips = self.trips.get(boot)
         return exact_offset(0) if trips is None or trips.latest is None else trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns all that is known of a member's clock, or None where it is the own one."""
+        """Returns the limits of a member's clock, or None if it is the own clock."""
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator
 
@@ -212,18 +201,18 @@ class Pinger:
         return max((trips.shortest_ns for trips in self.trips.values()), default=0)
 
     def pause_ns(self, otherwise_ns: int) -> int:
-        """Returns how long to wait before the next poll, ns: short while answers are under way."""
+        """Returns the time until the next poll, ns: short while answers are under way."""
         under_way = self._clock.monotonic_ns() < self._glance_until_ns
         return min(GLANCE_NS, otherwise_ns) if under_way else otherwise_ns
 
 
 def describe_clocks(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> list[str]:
-    """Returns a sentence for every member whose clock is another one, as of an instant of the own clock."""
+    """Returns a sentence for every member on another clock, as of an instant of the own clock."""
     texts = []
     for name, boot in boots.items():
         if boot in pinger.trips:
             estimate = pinger.estimate(boot)
             offset_ns = estimate.offset_at(at_ns)
-            known_text = format_offset(offset_ns, estimate.bound_at(at_ns, offset_ns))
-            texts.append(f"clock of {name}: another one, {known_text}")
+            offset = format_offset(offset_ns, estimate.bound_at(at_ns, offset_ns))
+            texts.append(f"clock of {name}: another one, {offset}")
     return texts

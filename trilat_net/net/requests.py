@@ -14,19 +14,19 @@ from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber
 
 BACKFILL_MESSAGES = 64
 BACKFILL_BYTES = 40_000
-"""Most messages in one `Past`, and most bytes of them, unless a single message has more."""
+"""Most messages in one `Backfill`, and most bytes of them, unless a single message has more."""
 
 
 class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a member answers to a ping, at once.
+    """A member's answer to a ping.
 
     Attributes:
         v: version of this schema.
         member: a site, or "recorder".
         boot: its process start.
         clock: identity of its monotonic clock.
-        came_ns: that clock when the ping had come.
-        left_ns: that clock when the answer was given.
+        came_ns: reading of that clock on arrival of the ping.
+        left_ns: its reading when the answer was sent.
     """
 
     v: int = VERSION
@@ -38,14 +38,14 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class ChangeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A change that somebody asks a site for, as in a scenario's timeline, from as soon as it can be.
+    """A change requested from a site, as in a scenario's timeline, from the earliest possible tick on.
 
     Attributes:
         v: version of this schema.
         link: the link to change, as in "m1->s", or "".
-        dominance: the site whose shares to change, or "".
-        to: what the link or the row is to be.
-        ramp_s: how long shares take, s.
+        dominance: the site whose dominance row to change, or "".
+        to: new values of the link or the row.
+        ramp_s: duration of a change of the row, s.
     """
 
     v: int = VERSION
@@ -56,14 +56,14 @@ class ChangeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class ChangeReply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a site answers to an `Order`.
+    """A site's reply to a `ChangeRequest`.
 
     Attributes:
         v: version of this schema.
-        member: who answers.
-        accepted: whether it does it.
-        text: from when on, or why not.
-        tick: its first tick, at its own rate, for which the change holds; -1 where it was refused.
+        member: the site.
+        accepted: whether it makes the change.
+        text: the tick from which the change holds, or the reason for refusing it.
+        tick: first tick, at the site's rate, for which the change holds; -1 if refused.
     """
 
     v: int = VERSION
@@ -74,15 +74,15 @@ class ChangeReply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class BackfillRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Messages that a recorder lacks and asks their site for.
+    """A recorder's request for missing messages of a site.
 
     A message's number is its tick for a record, its place from 0 for statistics and events.
 
     Attributes:
         v: version of this schema.
-        channel: of which channel.
-        first: number of the first one wanted.
-        last: number of the last one, the same or more.
+        channel: the channel.
+        first: number of the first message.
+        last: number of the last message, the same or more.
     """
 
     v: int = VERSION
@@ -92,16 +92,16 @@ class BackfillRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class Backfill(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a site still has of what it was asked for: consecutive messages, as they were published.
+    """The requested messages that a site still has: consecutive, as they were published.
 
     Attributes:
         v: version of this schema.
         member: the site.
         boot: its process start.
-        channel: of which channel.
-        first: number of the first message here: the one asked for, or the oldest that is left.
-        payloads: the messages, at most a bounded chunk; none where there is nothing (yet, or any more).
-        made: how many messages of this channel the site has published so far.
+        channel: the channel.
+        first: number of the first message here: the one requested, or the oldest one kept.
+        payloads: the messages, a bounded number; empty if there are none (yet, or any more).
+        made: number of messages of this channel that the site has published.
     """
 
     v: int = VERSION
@@ -117,16 +117,16 @@ MEASUREMENT_VECTORS = {"q": JOINTS, "qd": JOINTS}
 
 
 class ArmMeasurement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One measurement of an arm.
+    """One measurement of an external arm.
 
     Attributes:
         v: version of this schema.
-        site: whose arm it is.
+        site: the site of the arm.
         boot: the start of the arm's program, random: a site listens to one of them.
-        n: which measurement of that start it is, from 0.
+        n: number of the measurement of that start, from 0.
         q: joint angles.
         qd: joint velocities.
-        sent_ns: when it was sent, ns of the program's own monotonic clock.
+        sent_ns: time of sending, ns of the program's own monotonic clock.
     """
 
     v: int = VERSION

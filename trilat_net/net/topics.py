@@ -10,7 +10,7 @@ MEASURED = "measured"
 
 
 class KeyParts(NamedTuple):
-    """What a key says: `trilat/<session>/<member>/<channel>`, and a boot behind `alive`."""
+    """The parts of a key."""
 
     session: str
     member: str
@@ -24,7 +24,7 @@ def key(session: str, member: str, channel: str) -> str:
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Returns what a key says, or None where it is none of ours."""
+    """Returns the parts of a key, or None if it is not a key of this program."""
     root, _, rest = key.partition("/")
     parts = rest.split("/")
     return KeyParts(*parts) if root == ROOT and len(parts) in (3, 4) else None

@@ -8,9 +8,9 @@ Payloads are MessagePack maps with string keys and plain lists, encoded by `msgp
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import msgpack
 import msgspec
@@ -41,27 +41,39 @@ from .requests import (
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
 MAX_PAST_BYTES = 2 * MAX_BYTES
-"""Most bytes of a message; of an `Info`, which holds a whole scenario, traces and all; of a `Past`, which
-holds messages."""
+"""Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
 
+_Sent = (
+    LinkStats
+    | Event
+    | Info
+    | RecorderStats
+    | Pong
+    | ChangeRequest
+    | ChangeReply
+    | BackfillRequest
+    | Backfill
+    | ArmMeasurement
+)
 _pack = msgpack.Packer().pack
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
-    kind: msgspec.msgpack.Decoder(kind)
-    for kind in (
-        *(State, PeerSample, LinkStats, Event, Info, RecorderStats),
-        *(Pong, ChangeRequest, ChangeReply, BackfillRequest, Backfill, ArmMeasurement),
-    )
+    kind: msgspec.msgpack.Decoder(kind) for kind in (State, PeerSample, *get_args(_Sent))
 }
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 
-_SAMPLE_CHECK = (tuple(SAMPLE_VECTORS), attrgetter(*SAMPLE_VECTORS), tuple(SAMPLE_VECTORS.values()))
-_STATE_CHECK = (tuple(STATE_VECTORS), attrgetter(*STATE_VECTORS), tuple(STATE_VECTORS.values()))
-_MEASUREMENT_CHECK = (
-    tuple(MEASUREMENT_VECTORS),
-    attrgetter(*MEASUREMENT_VECTORS),
-    tuple(MEASUREMENT_VECTORS.values()),
-)
+
+def _vector_check(
+    lengths: Mapping[str, int],
+) -> tuple[tuple[str, ...], Callable[[Any], Any], tuple[int, ...]]:
+    return tuple(lengths), attrgetter(*lengths), tuple(lengths.values())
+
+
+_CHECKS = {
+    PeerSample: _vector_check(SAMPLE_VECTORS),
+    State: _vector_check(STATE_VECTORS),
+    ArmMeasurement: _vector_check(MEASUREMENT_VECTORS),
+}
 
 
 def encode_state(
@@ -82,18 +94,18 @@ def encode_state(
         boot: its process start.
         peers: its peers in scenario order.
         output: the record.
-        arrivals: what the tick took in.
+        arrivals: the samples that the tick took in.
         late_us: wake-up minus deadline, us.
         busy_us: computing time of the tick before, us.
-        sent_ns: when it is sent, ns since the epoch on the own clock; None in virtual time: as nominal.
-        echo: of each peer the newest sample that came: (index of the peer, its tick, arrival as `sent_ns`).
+        sent_ns: time of sending, ns since the epoch on the own clock; None in virtual time: nominal.
+        echo: newest sample of each peer: (index of the peer, its tick, arrival as `sent_ns`).
 
     Raises:
         WireError: a number is not finite.
     """
     (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem) = output
     numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem]
-    # a sum is finite only if its terms are; the second look is for terms whose sum overflows
+    # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
     if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
     packed: bytes = _pack(
@@ -125,47 +137,22 @@ def encode_state(
     return packed
 
 
-def encode(
-    message: LinkStats
-    | Event
-    | Info
-    | RecorderStats
-    | Pong
-    | ChangeRequest
-    | ChangeReply
-    | BackfillRequest
-    | Backfill
-    | ArmMeasurement,
-) -> bytes:
+def encode(message: _Sent) -> bytes:
     """Returns the payload of any message but a `State`."""
     packed: bytes = _pack(msgspec.structs.asdict(message))
     return packed
 
 
-M = TypeVar(
-    "M",
-    State,
-    PeerSample,
-    LinkStats,
-    Event,
-    Info,
-    RecorderStats,
-    Pong,
-    ChangeRequest,
-    ChangeReply,
-    BackfillRequest,
-    Backfill,
-    ArmMeasurement,
-)
+M = TypeVar("M", bound=msgspec.Struct)
 
 
 def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:
-    """Returns the message that a payload holds.
+    """Returns the message of a payload.
 
     Args:
-        payload: as it came.
+        payload: the bytes received.
         kind: the type that the key promises.
-        versions: schema versions that are accepted: one from others, `messages.READABLE` from a file.
+        versions: accepted schema versions: one from the network, `messages.READABLE` from a file.
 
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
@@ -174,31 +161,28 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
     if len(payload) > limit:
         raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
     try:
-        message: M = _DECODERS[kind].decode(payload)
+        message: Any = _DECODERS[kind].decode(payload)
     except (ValueError, RecursionError) as error:
         raise WireError("malformed", str(error)) from None
     if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    if isinstance(message, PeerSample | State | ArmMeasurement):
-        _check_numbers(message)
-    return message
+    check = _CHECKS.get(kind)
+    if check is not None:
+        names, vectors_of, lengths = check
+        vectors = vectors_of(message)
+        # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
+        if tuple(map(len, vectors)) != lengths or not _isfinite(sum(map(sum, vectors))):
+            _check_vectors(message, names, vectors, lengths)
+    return message  # type: ignore[no-any-return]
 
 
-def _check_numbers(message: PeerSample | State | ArmMeasurement) -> None:
+def _check_vectors(
+    message: Any, names: Sequence[str], vectors: Sequence[list[float]], lengths: Sequence[int]
+) -> None:
     """Refuses vectors of the wrong length and numbers that are not finite."""
-    if isinstance(message, ArmMeasurement):
-        fields, vectors_of, lengths = _MEASUREMENT_CHECK
-        number = message.n
-    else:
-        fields, vectors_of, lengths = _STATE_CHECK if isinstance(message, State) else _SAMPLE_CHECK
-        number = message.tick
-    vectors = vectors_of(message)
-    # a sum is finite only if its terms are; what follows is for the message that fails, and for finite
-    # terms whose sum overflows
-    if tuple(map(len, vectors)) == lengths and _isfinite(sum(map(sum, vectors))):
-        return
-    for name, vector, length in zip(fields, vectors, lengths, strict=True):
+    for name, vector, length in zip(names, vectors, lengths, strict=True):
         if len(vector) != length:
             raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
         if not all(map(_isfinite, vector)):
+            number = message.n if isinstance(message, ArmMeasurement) else message.tick
             raise WireError("not finite", f"{name} of {message.site} at {number}")

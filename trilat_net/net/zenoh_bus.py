@@ -20,7 +20,7 @@ from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make
 
 ASK_TIMEOUT_S = 3.0
 MAX_DEPTH = 100
-"""Of a configuration; Zenoh's parser recurses, and overflows its stack where that goes deep."""
+"""Nesting of a configuration; Zenoh's recursive parser overflows its stack on deep nesting."""
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
@@ -44,7 +44,7 @@ class _ZenohReplies:
     def poll(self) -> tuple[str, bytes] | None:
         try:
             reply = self._replies.try_recv()
-        except zenoh.ZError:  # every answer has come: the channel is closed
+        except zenoh.ZError:  # every answer has arrived: the channel is closed
             return None
         if reply is None or reply.ok is None:
             return None
@@ -59,38 +59,31 @@ class _ZenohPresenceRing:
     def poll(self) -> tuple[str, bool] | None:
         while (sample := self._subscriber.try_recv()) is not None:
             key = str(sample.key_expr)
-            if key not in self._own:  # liveliness knows no locality: own tokens come too
+            if key not in self._own:  # liveliness has no locality: own tokens arrive too
                 return key, sample.kind == zenoh.SampleKind.PUT
         return None
 
 
 class _ZenohQuery:
     def __init__(self, query: zenoh.Query, key: str) -> None:
-        self._query = query
-        self._key = key
+        self._query, self._key = query, key
 
     @property
     def payload(self) -> bytes:
-        return _query_payload(self._query)
+        return b"" if self._query.payload is None else self._query.payload.to_bytes()
 
     def answer(self, payload: bytes) -> None:
-        with self._query as query:  # a query ends for the asker only when it is dropped
+        with self._query as query:  # a query ends for its sender only when it is dropped
             query.reply(self._key, payload)
 
 
 class _ZenohQueryRing:
     def __init__(self, queryable: Any, key: str) -> None:
-        self._queryable = queryable
-        self._key = key
+        self._queryable, self._key = queryable, key
 
     def poll(self) -> _ZenohQuery | None:
         query = self._queryable.try_recv()
         return None if query is None else _ZenohQuery(query, self._key)
-
-
-def _query_payload(query: zenoh.Query) -> bytes:
-    """Returns what came with a question."""
-    return b"" if query.payload is None else query.payload.to_bytes()
 
 
 class ZenohBus:
@@ -99,10 +92,10 @@ class ZenohBus:
     Args:
         listen: endpoints to listen at, as in "tcp/127.0.0.1:7447".
         connect: endpoints to connect to, again and again until they answer; a client connects to the first
-            that answers now, and again and again should it lose it.
-        mode: what the session is to Zenoh; peers reach those whom they connect to, clients and routers
-            everyone whom a router reaches.
-        own: settings of a person's own, as `read_zenoh_file` returns them.
+            that answers now, and again if it loses it.
+        mode: the Zenoh mode; peers reach those that they connect to, clients and routers all that a router
+            reaches.
+        own: settings of a user's file, as `read_zenoh_file` returns them.
 
     Raises:
         UsageError: an endpoint is malformed, or cannot be listened at.
@@ -116,7 +109,7 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         own: Mapping[str, Any] | None = None,
     ) -> None:
-        zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # says nothing without RUST_LOG
+        zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # logs nothing without RUST_LOG
         try:
             config = zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own)))
             self._session: Any = zenoh.open(config)
@@ -129,7 +122,7 @@ class ZenohBus:
         self._tokens: set[str] = set()
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """See `Bus`; one who takes nothing for 5 s, while a patient one waits, loses its connection."""
+        """See `Bus`; a receiver that blocks a patient publisher for 5 s loses its connection."""
         publisher = self._session.declare_publisher(
             key,
             congestion_control=CongestionControl.BLOCK if patient else CongestionControl.DROP,
@@ -140,66 +133,57 @@ class ZenohBus:
         put: Callable[[bytes], None] = publisher.put
         return put
 
+    def _subscribe(self, key: str, handler: Any) -> Any:
+        return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
+
+    def _serve(self, key: str, handler: Any) -> Any:
+        return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
+
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """See `Bus`."""
-        return _ZenohRing(
-            self._session.declare_subscriber(
-                key, handlers.RingChannel(capacity), allowed_origin=Locality.REMOTE
-            )
-        )
+        return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)))
 
     def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """See `Bus`."""
         ring = StampingRing(now_ns, capacity)
-        self._call(key, lambda sample: ring.take(sample.payload.to_bytes()))
+        self.tap(key, lambda _key, payload: ring.take(payload))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
-        self._call(key, lambda sample: callback(str(sample.key_expr), sample.payload.to_bytes()))
 
-    def _call(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
-        """Calls back as messages come, in the thread that received them."""
-        self._kept.append(
-            self._session.declare_subscriber(
-                key, handlers.Callback(callback, indirect=False), allowed_origin=Locality.REMOTE
-            )
-        )
+        def call(sample: zenoh.Sample) -> None:
+            callback(str(sample.key_expr), sample.payload.to_bytes())
+
+        self._kept.append(self._subscribe(key, handlers.Callback(call, indirect=False)))
 
     def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
-        return _ZenohQueryRing(
-            self._session.declare_queryable(key, handlers.RingChannel(64), allowed_origin=Locality.REMOTE),
-            key,
-        )
+        return _ZenohQueryRing(self._serve(key, handlers.RingChannel(64)), key)
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
 
-        def at_once(query: zenoh.Query) -> None:
-            with query:  # a query ends for the asker only when it is dropped
-                payload = answer(_query_payload(query))
+        def answer_at_once(query: zenoh.Query) -> None:
+            with query:  # a query ends for its sender only when it is dropped
+                payload = answer(b"" if query.payload is None else query.payload.to_bytes())
                 if payload is not None:
                     query.reply(key, payload)
 
-        self._kept.append(
-            self._session.declare_queryable(
-                key, handlers.Callback(at_once, indirect=False), allowed_origin=Locality.REMOTE
-            )
-        )
+        self._kept.append(self._serve(key, handlers.Callback(answer_at_once, indirect=False)))
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
         return _ZenohReplies(
             self._session.get(
                 key,
-                handlers.FifoChannel(256),  # a ring forgets its answers when the last one has come
+                handlers.FifoChannel(256),  # a ring forgets its answers when the last one has arrived
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
                 timeout=ASK_TIMEOUT_S,
                 allowed_destination=Locality.REMOTE,
                 payload=payload,
-                # answers take these from the question: nobody who answers waits for an asker that hangs
+                # answers inherit these: no member that answers waits for a receiver that hangs
                 congestion_control=CongestionControl.DROP,
                 priority=Priority.REAL_TIME,
             )
@@ -225,10 +209,7 @@ class ZenohBus:
 
 
 def read_zenoh_file(path: Path) -> ZenohFile:
-    """Returns a person's own Zenoh configuration.
-
-    Args:
-        path: a file of Zenoh's own kind, JSON5 or JSON.
+    """Returns a user's Zenoh configuration, a file in JSON5 or JSON.
 
     Raises:
         UsageError: it cannot be read, is no configuration, or contradicts what a session needs.
@@ -239,11 +220,11 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise UsageError(f"{path}: is no text in UTF-8") from None
-    return check_zenoh_file(str(path), _parsed(str(path), text), _refusal)
+    return check_zenoh_file(str(path), _parse_json5(str(path), text), _find_refusal)
 
 
-def _parsed(source: str, text: str) -> object:
-    """Returns what JSON5 says, by Zenoh's own parser: its `metadata` may be anything."""
+def _parse_json5(source: str, text: str) -> object:
+    """Parses JSON5 with Zenoh's own parser: its `metadata` may be anything."""
     if max(accumulate((c in "[{") - (c in "]}") for c in text), default=0) > MAX_DEPTH:
         raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
     try:
@@ -253,7 +234,7 @@ def _parsed(source: str, text: str) -> object:
         expected = re.search(r"= (expected .*)", str(error))
         where = f"line {int(place[1]) - 1}, column {place[2]}: " if place else ""
         raise UsageError(
-            f"{source}: {where}no JSON5: {expected[1] if expected else _reason(error)}"
+            f"{source}: {where}no JSON5: {expected[1] if expected else _first_line(error)}"
         ) from None
     objects: list[object] = json.loads(config.get_json("metadata"))
     if len(objects) != 1:
@@ -261,17 +242,17 @@ def _parsed(source: str, text: str) -> object:
     return objects[0]
 
 
-def _refusal(settings: Mapping[str, Any]) -> str:
-    """Says why Zenoh refuses a configuration; "" where it takes it."""
+def _find_refusal(settings: Mapping[str, Any]) -> str:
+    """Returns Zenoh's reason for refusing a configuration; "" if it accepts it."""
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
-        return _reason(error)
+        return _first_line(error)
     return ""
 
 
-def _reason(error: zenoh.ZError) -> str:
-    """Puts what Zenoh says into one line, without the lines of its source."""
+def _first_line(error: zenoh.ZError) -> str:
+    """Returns Zenoh's message without the lines of its source."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
@@ -280,10 +261,9 @@ def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
 
 
 def _open_problem(error: zenoh.ZError, listen: Sequence[Endpoint], connect: Sequence[Endpoint]) -> str:
-    """Puts Zenoh's refusal to open a session into one sentence."""
     if "in use" in str(error) or "AddrInUse" in str(error):
         return (
             f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
             "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
         )
-    return f"cannot open a Zenoh session with {_endpoint_texts([*listen, *connect])}: {_reason(error)}"
+    return f"cannot open a Zenoh session with {_endpoint_texts([*listen, *connect])}: {_first_line(error)}"

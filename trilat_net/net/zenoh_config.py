@@ -49,10 +49,10 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     own: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a member of a session.
+    """Returns the Zenoh configuration of a session member.
 
     Args:
-        listen: where it listens.
+        listen: endpoints to listen at.
         connect: where it connects to; a client takes the first that answers.
         mode: what it is to Zenoh.
         own: the `settings` of a `ZenohFile`.
@@ -86,19 +86,19 @@ def make_zenoh_config(
             "shared_memory": {"enabled": False},
         },
     }
-    return _merged(needed, own or {})
+    return _merge(needed, own or {})
 
 
-def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     both = dict(base)
     for key, value in own.items():
         under = both.get(key)
-        both[key] = _merged(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+        both[key] = _merge(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
     return both
 
 
 class _Requirement(NamedTuple):
-    """What a key must be, where a file states it."""
+    """Condition on the value of a key in a user's file."""
 
     holds: Callable[[Any], bool]
     must: str
@@ -143,20 +143,20 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
     "downsampling": _UNTOUCHED,
     "low_pass_filter": _UNTOUCHED,
 }
-"""What a session needs, by the path of the key in Zenoh's configuration."""
+"""Requirements of a session by the path of the key in Zenoh's configuration."""
 
 _FILES = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
-"""Keys that name files. Zenoh opens those of a connecting side late, and then tries again for ever."""
+"""Keys that name files. Zenoh opens those of a connecting side late, and then retries for ever."""
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """A person's own Zenoh configuration, as far as it goes with a session; made by `understood`.
+    """A user's Zenoh configuration, checked; made by `check_zenoh_file`.
 
     Attributes:
         source: the file.
-        mode: the mode that it states, or "".
-        settings: what it states besides mode and endpoints.
+        mode: its mode, or "".
+        settings: its settings without mode and endpoints.
     """
 
     source: str
@@ -165,7 +165,7 @@ class ZenohFile:
     _endpoints: Mapping[str, Any] = field(default_factory=dict)
 
     def endpoints(self, side: Literal["listen", "connect"], mode: ZenohMode) -> list[Endpoint] | None:
-        """Returns the endpoints that it states for a mode, or None where it states none."""
+        """Returns its endpoints for a mode, or None without any."""
         stated = self._endpoints.get(side)
         if isinstance(stated, dict) and "locators" not in stated:
             stated = stated.get(mode)
@@ -175,43 +175,44 @@ class ZenohFile:
 
 
 def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]) -> ZenohFile:
-    """Returns what a file says, checked.
+    """Checks the content of a user's file.
 
     Args:
         source: the file.
-        stated: what is in it.
-        refusal: why Zenoh refuses a configuration, or "".
+        stated: its content.
+        refusal: returns Zenoh's reason for refusing a configuration, or "".
 
     Raises:
-        UsageError: it is no configuration of Zenoh's, or contradicts what a session needs.
+        UsageError: it is no Zenoh configuration, or contradicts a requirement of a session.
     """
     if not isinstance(stated, dict):
-        raise UsageError(f"{source}: a Zenoh configuration is one object in braces, not {_shown(stated)}")
+        raise UsageError(
+            f"{source}: a Zenoh configuration is one object in braces, not {_short_json(stated)}"
+        )
     settings = _without_nulls(stated)
     if refusal(settings):
-        path, reason = _culprit(settings, refusal, ()) or ((), refusal(settings))
-        raise UsageError(f"{source}: {'/'.join(path)}: {_nearest(path, reason)}")
+        path, reason = _find_refused_key(settings, refusal, ()) or ((), refusal(settings))
+        raise UsageError(f"{source}: {'/'.join(path)}: {_suggest_key(path, reason)}")
     for key, value in _leaves(settings, ()):
         need = REQUIREMENTS.get(key)
         if need is not None and not need.holds(value):
-            raise UsageError(f"{source}: {key}: {_shown(value)} must be {need.must}")
+            raise UsageError(f"{source}: {key}: {_short_json(value)} must be {need.must}")
         if re.fullmatch(_FILES, key):
-            _readable(source, key, value)
+            try:
+                Path(str(value)).read_bytes()
+            except OSError as error:
+                raise UsageError(f"{source}: {key}: {value} cannot be read: {error.strerror}") from None
     mode = settings.pop("mode", "")
     endpoints = {
         side: settings[side].pop("endpoints")
         for side in ("listen", "connect")
-        if _has_endpoints(settings, side)
+        if "endpoints" in settings.get(side, {})
     }
     return ZenohFile(source, mode, settings, endpoints)
 
 
-def _has_endpoints(settings: Mapping[str, Any], side: str) -> bool:
-    return "endpoints" in settings.get(side, {})
-
-
 def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """A null in Zenoh's files says that nothing is said."""
+    """Drops nulls, which are unset keys in Zenoh's files."""
     return {
         key: _without_nulls(value) if isinstance(value, dict) else value
         for key, value in stated.items()
@@ -228,23 +229,23 @@ def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tupl
             yield "/".join(here), value
 
 
-def _culprit(
+def _find_refused_key(
     settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
 ) -> tuple[tuple[str, ...], str] | None:
-    """Returns the path of the key that Zenoh refuses, and why; each key is tried alone."""
+    """Finds the key that Zenoh refuses, and its reason, by trying each key alone."""
     for key, value in settings.items():
         here = (*path, key)
         alone: Any = value
         for part in reversed(here):
             alone = {part: alone}
         if reason := refusal(alone):
-            deeper = _culprit(value, refusal, here) if isinstance(value, dict) else None
+            deeper = _find_refused_key(value, refusal, here) if isinstance(value, dict) else None
             return deeper or (here, reason)
     return None
 
 
-def _nearest(path: Sequence[str], reason: str) -> str:
-    """Says an unknown key with the one that it resembles most, and any other refusal as it is."""
+def _suggest_key(path: Sequence[str], reason: str) -> str:
+    """Adds the most similar key to the refusal of an unknown key."""
     unknown = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
     if unknown is None or not path or unknown[1] != path[-1]:
         return reason
@@ -253,13 +254,6 @@ def _nearest(path: Sequence[str], reason: str) -> str:
     return f"no key of Zenoh's; {choice}"
 
 
-def _readable(source: str, path: str, name: object) -> None:
-    try:
-        Path(str(name)).read_bytes()
-    except OSError as error:
-        raise UsageError(f"{source}: {path}: {name} cannot be read: {error.strerror}") from None
-
-
-def _shown(value: object) -> str:
+def _short_json(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
