@@ -1,5 +1,7 @@
 """Changes while a session runs, by its timeline and by `trilat set`: the run is reproduced bit for bit."""
 
+import pytest
+
 from tests.cli.running import trilat
 from trilat_net.core.ticks import Mode
 
@@ -21,6 +23,7 @@ timeline=[
 ]"""
 
 
+@pytest.mark.long
 def test_a_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
     """With a stale peer at the end, that a site holds for."""
     options = ("--set", SCRIPT.strip().replace("\n", ""), "--set", "on_stale.action=hold", "--duration", "6")

@@ -6,6 +6,7 @@ All clocks are one underneath, so that the true delay of every sample is known t
 import json
 
 import numpy as np
+import pytest
 
 from tests.cli.running import trilat
 from tests.truth import judged, offset_errors
@@ -22,6 +23,7 @@ IDLE_US = 200.0
 """A bound that a machine with nothing else to do reaches; then the estimates must be as good as promised."""
 
 
+@pytest.mark.long
 def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "12")
     session.recorder(*SKEWS["recorder"])
@@ -71,4 +73,4 @@ def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage
 
 def test_a_ping_that_nobody_answers_says_where_it_looked(stage: Stage) -> None:
     done = trilat("ping", "--session", "nobody-here", "--timeout", "0.5", cwd=stage.folder)
-    done.refuses("nobody of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1)
+    done.refuses("no site of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1)

@@ -15,6 +15,7 @@ from trilat_net.scenario import load_scenario
 from .processes import Session, Stage
 
 
+@pytest.mark.long
 def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5", "--stay", "60")
     session.recorder("--conclude")
@@ -29,6 +30,7 @@ def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None
     assert (stage.folder / "report.html").exists()
 
 
+@pytest.mark.long
 def test_a_run_that_diverged_fails_though_its_log_is_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

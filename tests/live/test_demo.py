@@ -31,6 +31,7 @@ def recording(stage: Stage) -> Path:
     return log
 
 
+@pytest.mark.long
 def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
@@ -64,7 +65,11 @@ def test_ctrl_c_during_the_run_ends_all_and_finishes_the_file(stage: Stage) -> N
 
 
 @pytest.mark.parametrize(
-    ("number", "when"), [(signal.SIGINT, "site m "), (signal.SIGTERM, "record ")], ids=["SIGINT", "SIGTERM"]
+    ("number", "when"),
+    [
+        pytest.param(signal.SIGINT, "site m ", id="SIGINT"),
+        pytest.param(signal.SIGTERM, "record ", id="SIGTERM", marks=pytest.mark.long),
+    ],
 )
 def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
     number: int, when: str, stage: Stage
@@ -78,6 +83,7 @@ def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
+@pytest.mark.long
 def test_ctrl_c_before_any_child_is_started_is_130(stage: Stage) -> None:
     running = demo(stage)
     running.prints("s live: ")
@@ -86,6 +92,7 @@ def test_ctrl_c_before_any_child_is_started_is_130(stage: Stage) -> None:
     assert running.ended()
 
 
+@pytest.mark.long
 def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Stage) -> None:
     running = demo(stage, duration="0.5")
     running.prints("checking the log and drawing")

@@ -86,7 +86,12 @@ def clocks_as_injected(log: Log) -> None:
 
 
 @pytest.mark.parametrize(
-    "order", [ALL, ("recorder", "s", "m2", "m1"), ("m2", "recorder", "m1", "s")], ids=" ".join
+    "order",
+    [
+        pytest.param(ALL, id="in order"),
+        pytest.param(("recorder", "s", "m2", "m1"), id="backwards", marks=pytest.mark.long),
+        pytest.param(("m2", "recorder", "m1", "s"), id="mixed", marks=pytest.mark.long),
+    ],
 )
 def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: Stage, apart: Machines) -> None:
     bridged(apart, ALL)
@@ -100,6 +105,7 @@ def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: St
     clocks_as_injected(log)
 
 
+@pytest.mark.long
 def test_machines_that_cannot_reach_each_other_meet_at_a_router(stage: Stage, apart: Machines) -> None:
     starred(apart, "centre", ALL)
     assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
@@ -145,6 +151,7 @@ def heard(log: Log, site: str, peer: str) -> Heard:
     return Heard(arrivals, [state.tick - state.used[peer] for state in states], outages)
 
 
+@pytest.mark.long
 def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: Machines) -> None:
     """Once for less than Zenoh's lease, so that what waited comes in a burst, and once for longer.
 

@@ -3,6 +3,8 @@
 import signal
 from pathlib import Path
 
+import pytest
+
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
@@ -57,6 +59,7 @@ def from_the_start(path: Path) -> Log:
     return log
 
 
+@pytest.mark.long
 def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_end(stage: Stage) -> None:
     """With small buffers on the way, so that the network drops what it cannot deliver."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "7")
@@ -94,6 +97,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_
     assert verify(torn).passed
 
 
+@pytest.mark.long
 def test_two_recorders_at_once_have_the_same_records(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
     session.all()

@@ -3,6 +3,8 @@
 import signal
 from pathlib import Path
 
+import pytest
+
 from tests.recorder.play.logs import session_payloads
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
@@ -87,6 +89,7 @@ def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(st
     assert "interrupted" in replay.text()
 
 
+@pytest.mark.long
 def test_read_by_another_process_and_as_fast_as_can_be_nothing_is_lost(stage: Stage) -> None:
     path = virtual_log(stage.folder)
     again = Again(stage, path)

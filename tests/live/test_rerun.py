@@ -2,6 +2,8 @@
 
 from itertools import combinations
 
+import pytest
+
 from tests.cli.running import trilat
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.virtual_comparison import find_late_samples
@@ -22,6 +24,7 @@ LINKS = (
 )
 
 
+@pytest.mark.long
 def test_any_sites_of_a_session_are_what_they_were(stage: Stage) -> None:
     """Late samples, losses, duplicates, an outage, a stale peer, a measured link, and a change by command."""
     options = [word for text in LINKS for word in ("--set", text)]

@@ -2,6 +2,8 @@
 
 import signal
 
+import pytest
+
 from tests.net.certificates import Certificates
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
@@ -45,6 +47,7 @@ class Routed:
         return {name: process.code() for name, process in self.members.items()}
 
 
+@pytest.mark.long
 def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) -> None:
     made = Certificates(stage.folder)
     own = stage.folder / "zenoh.json5"

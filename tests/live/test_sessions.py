@@ -2,6 +2,8 @@
 
 import signal
 
+import pytest
+
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -37,6 +39,7 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(stage: Stage) ->
         assert "lost" not in kinds
 
 
+@pytest.mark.long
 def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> None:
     """With the `digital` scheme and a leader that comes last; and a second m1 is refused meanwhile."""
     session = Session(stage, "paper", PAPER, "--duration", "8", "--set", 'scheme="digital"')
@@ -80,6 +83,7 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
     assert int(log.accounts["dropped: oversized"]) > 0
 
 
+@pytest.mark.long
 def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3", "--set", "link.delay_ms=2000")
     session.all()
@@ -98,6 +102,7 @@ def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(st
     assert twins.plain.identical == twins.fed.identical == 9_000
 
 
+@pytest.mark.long
 def test_a_recorder_that_comes_last_is_waited_for_where_it_is_needed(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     for name in ("s", "m", "recorder"):
@@ -132,6 +137,7 @@ def test_separate_terminals_without_endpoints_and_two_sessions_that_do_not_meet(
         assert "lost" not in {event.kind for event in log.events}
 
 
+@pytest.mark.long
 def test_a_recorder_that_is_interrupted_finishes_its_file_and_the_sites_go_on(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "2")
     session.all()
@@ -147,6 +153,7 @@ def test_a_recorder_that_is_interrupted_finishes_its_file_and_the_sites_go_on(st
     assert "m: 2000 ticks" in session.processes["m"].text()
 
 
+@pytest.mark.long
 def test_a_site_that_leaves_its_limits_ends_the_session_and_says_so(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10")
     session.all()
@@ -162,6 +169,7 @@ def test_a_site_that_leaves_its_limits_ends_the_session_and_says_so(stage: Stage
         assert log[name].states[-1].mode == "diverged"
 
 
+@pytest.mark.long
 def test_who_waits_in_vain_says_for_whom_and_leaves_no_file(stage: Stage) -> None:
     site = Session(stage, "paper", PAPER).site("m2", "--join-timeout", "1")
     apart = Session(stage, "paper", PAPER)
@@ -174,6 +182,7 @@ def test_who_waits_in_vain_says_for_whom_and_leaves_no_file(stage: Stage) -> Non
     assert not apart.log.exists()
 
 
+@pytest.mark.long
 def test_a_busy_port_is_named(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"))
     holder = ZenohBus(session.endpoints[:1])
@@ -185,6 +194,7 @@ def test_a_busy_port_is_named(stage: Stage) -> None:
     assert f"{session.endpoints[0]}: the port is in use" in site.text()
 
 
+@pytest.mark.long
 def test_another_scenario_is_refused_with_both_hashes(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"))
     leader = session.site("m")

@@ -3,6 +3,7 @@
 from collections import defaultdict
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -15,6 +16,7 @@ from .processes import Session, Stage, whole
 BUCKET_NS = 20_000_000
 
 
+@pytest.mark.long
 def test_a_recorded_session_is_read_by_everybody(stage: Stage) -> None:
     """Its views have the extremes of its records; its bag has them all."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
