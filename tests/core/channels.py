@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from trilat_net.core.channel import schedule_deliveries
@@ -14,13 +15,13 @@ from trilat_net.core.vectors import Points
 from trilat_net.scenario.delay_models import LinkBase
 
 Ints = NDArray[np.int64]
-SEEDS = (1, 2, 3, 20_240_229, 2**63 - 1)
+SEEDS = (1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3, 20_240_229, 2**63 - 1)))
 LINK_NAME = "m1->s"
 _BLOCK = 8192
 
 
 class Channel(NamedTuple):
-    """The arguments of `foresee`: a link's row, its models, its pages and its points."""
+    """The arguments of `schedule_deliveries`: a link's row, its models, its pages and its points."""
 
     row: Any
     models: NDArray[Any]

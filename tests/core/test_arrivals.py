@@ -176,13 +176,6 @@ def test_an_ancient_sample_counts_as_lost(name: str) -> None:
 # Single kinds.
 
 
-def test_in_order_samples_come_into_use_one_after_the_other_and_not_before_their_time() -> None:
-    release = np.array(releases("in order", 2000, 1000, 1000))
-    assert (np.diff(release) >= 0).all()
-    free = np.array(releases("in order", 1, 1000, 1000))
-    assert free[0] == release[0]
-
-
 def test_newest_wins_under_jitter_shortens_the_age_and_in_order_lengthens_it() -> None:
     """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
 

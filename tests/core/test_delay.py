@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
-from tests.core.draws import philox_in_integers
+from tests.core.philox_reference import philox_in_integers
 from trilat_net.core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd, clamp_delay_us, trace_delay_us
 from trilat_net.core.philox import link_key
 from trilat_net.scenario.delay_models import (
@@ -25,7 +25,6 @@ from trilat_net.scenario.delay_models import (
     UniformDelay,
 )
 from trilat_net.scenario.delay_traces import format_trace, parse_trace
-from trilat_net.scenario.resolve_links import PRESETS
 
 COUNT = 1_000_000
 SIGMAS = 4.0
@@ -248,14 +247,3 @@ def test_delays_are_whole_microseconds_from_zero_to_ten_seconds(delay_us: float)
     assert 0 <= rounded <= MAX_DELAY_US
     if 0 <= delay_us <= MAX_DELAY_US:
         assert abs(rounded - delay_us) <= 0.5
-
-
-@pytest.mark.parametrize(
-    "name", [name for name, keys in PRESETS.items() if keys["model"] == "hyperexponential"]
-)
-def test_a_mobile_preset_never_goes_below_its_floor(name: str) -> None:
-    keys = {key: value for key, value in PRESETS[name].items() if key != "model"}
-    link = HyperExponentialDelay(**keys)
-    delays = due(channel([link.core()]), 20_000)
-    kept = delays >= 0
-    assert ((delays - np.arange(20_000) * 10**6)[kept] >= 1e6 * link.floor_ms).all()

@@ -164,12 +164,6 @@ def test_recorded_torque_is_linear_between_its_points(rows: list[tuple[float, ..
     assert found == pytest.approx(expected, abs=1e-9)
 
 
-def test_two_recordings_keep_apart() -> None:
-    one = TorqueSource(TorqueKind.RECORDED, table=np.array([[0.0, 1.0, 2.0], [9.0, 1.0, 2.0]]))
-    two = TorqueSource(TorqueKind.RECORDED, table=np.array([[0.0, 10.0, 20.0], [9.0, 10.0, 20.0]]))
-    assert torque(3.0, np.zeros(2), np.zeros(2), one, two).tolist() == [11.0, 22.0]
-
-
 def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
     rest = np.zeros(2)
     held = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)

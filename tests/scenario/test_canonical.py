@@ -15,6 +15,7 @@ NAMES = ("m1", "m2", "s")
 EVERY = [f"{j}->{i}" for i in NAMES for j in NAMES if i != j]
 pair = st.tuples(st.floats(0.01, 50), st.floats(0.01, 50)).map(list)
 vector = st.floats(0.01, 50) | pair
+texts = st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]) | st.text(max_size=60)
 
 laws = st.fixed_dictionaries(
     {"law": st.just("adaptive")},
@@ -66,7 +67,14 @@ overrides = st.fixed_dictionaries(
         "timeline": changes(),
         "seed": st.integers(0, 2**63 - 1),
         "expect": st.fixed_dictionaries({}, optional={"stable": st.booleans()}),
-        "title": st.text(max_size=30),
+        "title": texts,
+        "about": texts,
+        "assumed": st.lists(st.text(max_size=20), max_size=3),
+        "sites.s.q0_rad": st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2),
+        "sites.m2.rate_hz": st.integers(1, 20_000),
+        "arm.m1_kg": st.floats(0.001, 1e6),
+        "duration_s": st.floats(1e-6, 86_400.0),
+        "scheme": st.sampled_from(["second_order", "digital"]),
     },
 )
 
@@ -78,6 +86,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
     again = parse_scenario(scenario.text)
     assert again.text == scenario.text
     assert again == scenario
+    assert (again.sha256, list(again.sites)) == (scenario.sha256, list(scenario.sites))
     assert msgspec.to_builtins(again.timeline) == msgspec.to_builtins(scenario.timeline)
     for name in scenario.names:
         one, other = scenario.setup(name), again.setup(name)

@@ -14,7 +14,7 @@ from trilat_net.core.channel import LOST
 from trilat_net.core.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase, NoDelay
+from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
 def link(keys: dict[str, Any]) -> LinkBase:
@@ -27,13 +27,6 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
         load_scenario("paper", {"link": keys})
     assert error.value.exit_code == 2
     return error.value
-
-
-def test_the_models_are_eleven() -> None:
-    assert set(DELAY_MODELS) == {
-        *("none", "constant", "uniform", "normal", "gamma", "lognormal", "hyperexponential"),
-        *("ar1", "sine", "trace", "measured"),
-    }
 
 
 @given(keys=links())
@@ -88,14 +81,6 @@ def test_a_table_without_a_model_changes_single_keys_and_one_with_a_model_begins
     assert made["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
 
 
-def test_links_draw_from_keys_of_their_own_and_of_the_seed() -> None:
-    def keys(seed: int) -> set[int]:
-        scenario = load_scenario("paper", {"seed": seed})
-        return {link.key for name in scenario.names for link in scenario.setup(name).links}
-
-    assert len(keys(1) | keys(2)) == 12
-
-
 @pytest.mark.parametrize(
     ("keys", "random", "measured"),
     [
@@ -111,13 +96,8 @@ def test_links_draw_from_keys_of_their_own_and_of_the_seed() -> None:
 def test_whether_anything_is_drawn_and_whether_the_network_decides(
     keys: dict[str, Any], random: bool, measured: bool
 ) -> None:
-    assert (
-        load_scenario("paper", {"link": keys}).random,
-        load_scenario("paper", {"link": keys}).measured,
-    ) == (
-        random,
-        measured,
-    )
+    scenario = load_scenario("paper", {"link": keys})
+    assert (scenario.random, scenario.measured) == (random, measured)
     later = [{"at_s": 1, "link": "m1->s", "to": keys}]
     if keys.get("model") != "trace":
         changed = load_scenario("paper", {"timeline": later})
@@ -131,11 +111,8 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
     ("keys", "path", "words"),
     [
         ({"model": "unifrom"}, "link.model", "did you mean 'uniform'"),
-        ({"model": ["uniform"]}, "link.model", "must be one of"),
         ({"model": 3}, "link.model", "must be one of"),
         ({"preset": "5G"}, "link.preset", "did you mean '5g'"),
-        ({"preset": "frankfurt-banglore"}, "link.preset", "did you mean 'frankfurt-bangalore'"),
-        ({"preset": 4}, "link.preset", "must be one of"),
         ({"preset": "4g", "model": "uniform"}, "link.model", "the preset '4g' is 'hyperexponential'"),
         ({"preset": "4g", "delay_ms": 5}, "link.delay_ms", "unknown key"),
         ({"model": "uniform", "delay_ms": 5, "deviation_ms": 1}, "link.deviation_ms", "unknown key"),
@@ -158,37 +135,28 @@ def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) 
         ({"delay_ms": -1}, "delay_ms"),
         ({"delay_ms": 10_001}, "delay_ms"),
         ({"delay_ms": "much"}, "delay_ms"),
-        ({"delay_ms": True}, "delay_ms"),
         ({"delay_ms": 5, "loss": 1.1}, "loss"),
-        ({"delay_ms": 5, "loss": -0.1}, "loss"),
         ({"delay_ms": 5, "duplicate": 2}, "duplicate"),
         ({"delay_ms": 5, "loss_bad": 0}, "loss_bad"),
         ({"delay_ms": 5, "loss_burst": -1}, "loss_burst"),
         ({"delay_ms": 5, "playout_ms": 10_001}, "playout_ms"),
-        ({"delay_ms": 5, "order": "oldest"}, "order"),
         ({"delay_ms": 5, "order": "in order"}, "order"),
         ({"delay_ms": 5, "outages_s": [[1, 2, 3]]}, "outages_s[0]"),
-        ({"delay_ms": 5, "outages_s": [1, 2]}, "outages_s[0]"),
         ({"delay_ms": 5, "outages_s": [[-1, 2]]}, "outages_s[0][0]"),
         ({"delay_ms": 5, "outages_s": [[n, n + 0.5] for n in range(1001)]}, "outages_s"),
         ({"model": "normal", "delay_ms": 5, "deviation_ms": 0}, "deviation_ms"),
         ({"model": "gamma", "delay_ms": 0, "deviation_ms": 1}, "delay_ms"),
         ({"model": "ar1", "delay_ms": 5, "deviation_ms": 1, "correlation": 1.0}, "correlation"),
-        ({"model": "ar1", "delay_ms": 5, "deviation_ms": 1, "correlation": -0.1}, "correlation"),
         ({"model": "sine", "delay_ms": 5, "amplitude_ms": 1, "period_s": 0}, "period_s"),
         ({"model": "trace", "trace": "0 5", "at_end": "stop"}, "at_end"),
-        ({"model": "trace", "trace": 5}, "trace"),
         ({"delay_ms": math.nan}, "delay_ms"),
-        ({"delay_ms": 5, "loss": math.inf}, "loss"),
         # what no range of a single key shows
         ({"model": "uniform", "delay_ms": 5, "half_width_ms": 6}, "half_width_ms"),
         ({"model": "sine", "delay_ms": 5, "amplitude_ms": 6, "period_s": 1}, "amplitude_ms"),
         ({"model": "uniform", "delay_ms": 9000, "half_width_ms": 2000}, "model"),
         ({"model": "gamma", "delay_ms": 5000, "deviation_ms": 2000}, "model"),
-        ({"model": "gamma", "delay_ms": 1e-300, "deviation_ms": 1e4}, "deviation_ms"),
         ({"model": "gamma", "delay_ms": 1e4, "deviation_ms": 1e-300}, "deviation_ms"),
         ({"model": "lognormal", "delay_ms": 1e-300, "deviation_ms": 1e4}, "deviation_ms"),
-        ({"delay_ms": 5, "outages_s": [[2, 2]]}, "outages_s[0]"),
         ({"delay_ms": 5, "outages_s": [[1, 2], [5, 3]]}, "outages_s[1]"),
         ({"delay_ms": 5, "loss": 0.1, "loss_burst": 0.5}, "loss_burst"),
         ({"delay_ms": 5, "loss": 0.9, "loss_burst": 2}, "loss_burst"),
@@ -240,8 +208,3 @@ def test_extreme_numbers_are_refused_or_have_moments(
 
 def test_a_trace_may_reach_the_limit_whatever_its_deviation() -> None:
     assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None
-
-
-def test_loss_without_bursts_is_by_itself() -> None:
-    model = NoDelay(loss=0.3).core()
-    assert (model.loss_good, model.enter) == (0.3, 0.0)

@@ -52,13 +52,10 @@ def test_what_a_log_names_is_imported_only_where_it_defines_a_class_of_that_name
     ("law", "fact"),
     [
         ("nowhere_at_all:Law", "there is no module nowhere_at_all"),
-        ("tests.nowhere:Law", "there is no module tests.nowhere"),
         ("tests.laws.deeper:Law", "there is no module tests.laws.deeper"),
         ("sys:Law", "there is no module sys"),
         ("tests.laws", "must be one of"),
-        ("tests..laws:Law", "must be as in package.module:Law"),
         (".laws:Law", "must be as in package.module:Law"),
-        ("tests.laws:", "must be as in package.module:Law"),
     ],
 )
 def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: str) -> None:
@@ -72,7 +69,6 @@ def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: 
     ("overrides", "fact"),
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
-        ({"control.law": "tests.laws:no_class"}, "defines no class no_class"),
         ({"control.law": "tests.laws:NoLaw"}, "has no torque, memory, recall"),
         ({"control.law": LAW, "control.Kdd": 2}, "cannot be made with Kdd = 2: TypeError"),
         ({"control.law": "tests.laws:Pair"}, "is for 2 sites, and here are 3"),

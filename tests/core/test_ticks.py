@@ -22,9 +22,3 @@ def test_the_first_tick_at_a_time_is_the_first(rate_hz: int, due_ns: int) -> Non
     tick = first_tick_at(due_ns, rate_hz)
     assert Fraction(tick, rate_hz) * 10**9 >= due_ns > Fraction(tick - 1, rate_hz) * 10**9
     assert tick_ns(tick, rate_hz) >= due_ns > tick_ns(tick - 1, rate_hz)
-
-
-@given(rate_hz=rates, tick=st.integers(0, 10**7))
-def test_a_tick_is_the_first_at_its_own_time(rate_hz: int, tick: int) -> None:
-    assert first_tick_at(tick_ns(tick, rate_hz), rate_hz) == tick
-    assert first_tick_at(tick_ns(tick, rate_hz) + 1, rate_hz) == tick + 1

@@ -71,7 +71,7 @@ def test_a_record_holds_the_state_at_its_tick_and_its_inputs() -> None:
 
 
 _PROGRAM = """
-from tests.core.test_site import executed
+from tests.core.test_site_step import executed
 for scheme in ("second_order", "digital"):
     print("\\n".join(executed("asymmetric", scheme=scheme, duration_s=0.25, link__delay_ms=20,
                               links={"m2->m1": {"delay_ms": 33.5}})))
@@ -197,17 +197,8 @@ LARGEST = 1e9
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize(
     "key",
-    [
-        "control.Gamma",
-        "control.Lambda",
-        "control.theta_hat0",
-        "control.Kp",
-        "control.Kd",
-        "arm.g_m_s2",
-        "sites.m1.q0_rad",
-        "sites.m1.qd0_rad_s",
-        "limits.tau_limit_nm",
-    ],
+    [f"control.{gain}" for gain in ("Gamma", "Lambda", "theta_hat0", "Kp", "Kd")]
+    + ["arm.g_m_s2", "sites.m1.q0_rad", "sites.m1.qd0_rad_s", "limits.tau_limit_nm"],
 )
 def test_absurd_scenarios_are_refused_or_end_in_a_stop_but_never_in_numbers_that_are_none(
     key: str, scheme: str

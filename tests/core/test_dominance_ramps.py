@@ -89,16 +89,6 @@ def test_a_row_sums_to_one_at_all_times(
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_shares_are_continuous_where_a_ramp_takes_time(
-    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
-) -> None:
-    """Also where one begins within another: no step is larger than the steepest slope allows."""
-    slow = [ramp for ramp in ramps if ramp.end_ns - ramp.start_ns > S // 100]
-    alpha, later = shares(t_ns, first, slow)[0], shares(t_ns + 1000, first, slow)[0]
-    assert max(abs(a - b) for a, b in zip(alpha, later, strict=True)) <= 1000 / (S // 100) + 1e-12
-
-
-@given(first=rows(), ramps=ramp_lists(), t_ns=times)
 def test_the_derivative_is_the_finite_difference(
     first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
 ) -> None:
@@ -109,14 +99,6 @@ def test_the_derivative_is_the_finite_difference(
     there, _ = shares(t_ns + step_ns, first, ramps)
     for a, b, rate in zip(here, there, rates, strict=True):
         assert (b - a) / (step_ns * 1e-9) == pytest.approx(rate, rel=1e-6, abs=1e-9)
-
-
-def test_a_ramp_that_begins_within_another_starts_from_where_that_one_is() -> None:
-    first, half, all_first = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-    ramps = [DominanceRamp(0, 10 * S, half), DominanceRamp(5 * S, 7 * S, all_first)]
-    assert shares(5 * S, first, ramps) == ([0.5, 0.5, 0.0], [-0.25, -0.25, 0.5])
-    assert shares(6 * S, first, ramps)[0] == [0.25, 0.25, 0.5]
-    assert shares(7 * S, first, ramps) == ([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
 
 
 # In a site.

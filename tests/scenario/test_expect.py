@@ -40,13 +40,10 @@ def test_every_other_key_asks_something_also_where_its_value_is_nothing(keys: di
         ("stabel", True, ["expect.stabel", "did you mean 'stable'"]),
         ("stable", 1, ["expect.stable", "expected bool"]),
         ("rms_error_max_rad", -0.1, ["expect.rms_error_max_rad"]),
-        ("rms_error_max_rad", float("nan"), ["expect.rms_error_max_rad", "finite"]),
         ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
         ("late_samples_max", 1.5, ["expect.late_samples_max"]),
         ("end_pose_rad", {"x": [0.0, 0.0]}, ["expect.end_pose_rad.x", "m1, m2, s"]),
-        ("end_pose_rad", {"s": [0.0]}, ["expect.end_pose_rad.s"]),
         ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
-        ("peak_error_min_rad", 3.0, ["expect.peak_error_min_rad", "peak_error_max_rad"]),
     ],
 )
 def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, facts: list[str]) -> None:
@@ -86,7 +83,6 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
         ({"site": ""}, ["expect.windows[0].site", "wall_mean_n is of one site"]),
         ({"wall_mean_n": [9, 7]}, ["expect.windows[0].wall_mean_n", "[9, 7]"]),
         ({"wall_mean_n": 8}, ["expect.windows[0].wall_mean_n"]),
-        ({"from_s": -1.0}, ["expect.windows[0].from_s"]),
     ],
     ids=str,
 )

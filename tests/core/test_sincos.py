@@ -33,13 +33,6 @@ def test_one_is_odd_and_the_other_even(x: float) -> None:
     assert (t, d) == (-s, c)
 
 
-def test_known_values() -> None:
-    assert sincos(0.0) == (0.0, 1.0)
-    s, c = sincos(math.pi / 6)
-    assert s == pytest.approx(0.5, abs=1e-16)
-    assert c == pytest.approx(math.sqrt(0.75), abs=2e-16)
-
-
 @pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf, 2.0**31])
 def test_what_is_no_angle_has_none(x: float) -> None:
     s, c = sincos(x)
