@@ -1,4 +1,1 @@
-"""Records every channel of a session into one MCAP file (`record_process`).
-
-And plays a log again (`play`).
-"""
+"""Records every channel of a session into one MCAP file (`record_process`), and plays logs (`play`)."""

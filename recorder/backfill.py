@@ -21,21 +21,21 @@ from trilat_net.net.wire import decode, encode
 from .site_reception import SiteMessage, SiteReception
 
 GRACE_NS = 50_000_000
-"""How long to wait for what may only be late before it is asked for."""
+"""Time for a message that may only be late, before it is requested."""
 SILENT_NS = 1_000_000_000
-"""After how long without a word a site is asked whether it has said any; and three of its periods."""
+"""Silence, and three periods of the site, after which the site is asked for its newest messages."""
 ANSWER_NS = (300_000_000, 3_000_000_000)
-"""How long to wait for an answer, at first and at most: twice as long after each that did not come."""
+"""First and longest timeout of a request; it doubles after each request without an answer."""
 REST_NS = 250_000_000
-"""Before the next question, where an answer brought nothing that was wanted."""
+"""Pause after an answer that brought nothing requested."""
 MAX_VAIN_REQUESTS = 20
 """So many of these in a row, and the channel's gaps are given up."""
 GIVE_UP_NS = 10_000_000_000
-"""How long to ask a site that has ended and does not answer."""
+"""Time for a site that has ended to answer."""
 
 
 class RepairedMessage(NamedTuple):
-    """One message out of a site's memory."""
+    """One message out of a site's retransmission buffer."""
 
     channel: str
     message: SiteMessage
@@ -43,30 +43,28 @@ class RepairedMessage(NamedTuple):
 
 
 class _OpenRequest(NamedTuple):
-    """A question under way."""
-
     wanted: BackfillRequest
     answers: Inbox
     asked_ns: int
 
 
 class GapRepair:
-    """What one site is asked for.
+    """The requests to one site.
 
     Args:
         bus: the connection.
         session: the session's name.
-        sender: the site.
-        dropped: where answers that are none are counted, by reason.
-        now_ns: the time, on the recorder's clock.
+        reception: the site's messages so far.
+        dropped: counts invalid answers, by reason.
+        now_ns: the recorder's clock.
     """
 
     def __init__(
-        self, bus: Bus, session: str, sender: SiteReception, dropped: Counter[str], now_ns: int = 0
+        self, bus: Bus, session: str, reception: SiteReception, dropped: Counter[str], now_ns: int = 0
     ) -> None:
         self._progress_ns = now_ns
-        self._bus, self._key = bus, topics.key(session, sender.name, topics.PAST)
-        self._sender, self._dropped = sender, dropped
+        self._bus, self._key = bus, topics.key(session, reception.name, topics.PAST)
+        self._reception, self._dropped = reception, dropped
         self._turns = list(SITE_CHANNELS)
         self._probes: set[str] = set()
         self._probed_ns = now_ns
@@ -74,39 +72,38 @@ class GapRepair:
         self._vain = dict.fromkeys(SITE_CHANNELS, 0)
         self._open: _OpenRequest | None = None
         self._due_ns: int | None = None
-        # fewer at once where answers do not come
-        self._patience_ns, self._chunk = ANSWER_NS[0], BACKFILL_MESSAGES
+        # fewer messages per request while answers do not arrive
+        self._timeout_ns, self._chunk = ANSWER_NS[0], BACKFILL_MESSAGES
         self._ended_ns: int | None = None
 
     def probe(self) -> None:
-        """Asks next what the site has made so far, of every channel."""
+        """Requests the newest messages of every channel next."""
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Yields what was missing and has come; asks for more.
+        """Yields missing messages that have arrived; requests more.
 
         Args:
             now_ns: the time.
-            alive: whether the site is there to be asked.
+            alive: whether the site is present.
         """
         if self._open is not None:
-            yield from self._hear(self._open, now_ns)
+            yield from self._read_answers(self._open, now_ns)
         if alive:
-            self._notice_silence(now_ns)
+            silent_ns = now_ns - max(self._reception.heard_ns or 0, self._probed_ns)
+            if self._reception.made is None and silent_ns > max(SILENT_NS, 3 * self._reception.period_ns):
+                self._probed_ns = now_ns
+                self.probe()
             if self._open is None:
-                self._ask(now_ns)
-        self._give_up(now_ns)
+                self._request(now_ns)
+        if self._reception.made is not None:
+            if self._ended_ns is None:
+                self._ended_ns = now_ns
+            if now_ns - max(self._ended_ns, self._progress_ns) > GIVE_UP_NS:
+                self._reception.give_up()
 
-    def _notice_silence(self, now_ns: int) -> None:
-        """A site that should have been heard is asked, once for each time that it should have been."""
-        patience_ns = max(SILENT_NS, 3 * self._sender.period_ns)
-        last_ns = max(self._sender.heard_ns or 0, self._probed_ns)
-        if self._sender.made is None and now_ns - last_ns > patience_ns:
-            self._probed_ns = now_ns
-            self.probe()
-
-    def _ask(self, now_ns: int) -> None:
-        wanted = self._wanted()
+    def _request(self, now_ns: int) -> None:
+        wanted = self._next_request()
         if wanted is None:
             self._due_ns = None
             return
@@ -117,10 +114,10 @@ class GapRepair:
             self._turns.append(wanted.channel)
             self._open = _OpenRequest(wanted, self._bus.ask(self._key, encode(wanted)), now_ns)
 
-    def _wanted(self) -> BackfillRequest | None:
-        """Returns what to ask for next: channel by channel in turn, gap by gap."""
+    def _next_request(self) -> BackfillRequest | None:
+        """Returns the next request: channel by channel in turn, gap by gap."""
         for channel in self._turns:
-            account = self._sender.accounts[channel]
+            account = self._reception.accounts[channel]
             gap = account.wanted(self._next[channel]) or account.wanted()
             if gap is None and channel in self._probes:
                 gap = (account.last + 1, account.last + self._chunk)
@@ -129,68 +126,58 @@ class GapRepair:
                 return BackfillRequest(channel=channel, first=gap[0], last=last)  # type: ignore[arg-type]
         return None
 
-    def _hear(self, question: _OpenRequest, now_ns: int) -> Iterator[RepairedMessage]:
-        """Takes the answer, if it has come; asks on if it should have."""
-        while (reply := question.answers.poll()) is not None:
+    def _read_answers(self, request: _OpenRequest, now_ns: int) -> Iterator[RepairedMessage]:
+        """Takes a valid answer if it has arrived; closes the request if it should have."""
+        while (reply := request.answers.poll()) is not None:
             try:
-                past = self._understood(reply[1], question.wanted)
+                past = self._decode(reply[1], request.wanted)
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
-            trip_ns = now_ns - question.asked_ns
-            self._patience_ns = min(max(ANSWER_NS[0], 4 * trip_ns), ANSWER_NS[1])
+            trip_ns = now_ns - request.asked_ns
+            self._timeout_ns = min(max(ANSWER_NS[0], 4 * trip_ns), ANSWER_NS[1])
             self._chunk = min(2 * self._chunk, BACKFILL_MESSAGES)
             self._open = None
-            yield from self._take(past, question.wanted, now_ns)
+            yield from self._take(past, request.wanted, now_ns)
             return
-        if now_ns - question.asked_ns >= self._patience_ns:
-            self._patience_ns = min(2 * self._patience_ns, ANSWER_NS[1])
+        if now_ns - request.asked_ns >= self._timeout_ns:
+            self._timeout_ns = min(2 * self._timeout_ns, ANSWER_NS[1])
             self._chunk = max(1, self._chunk // 2)
             self._open = None
 
-    def _understood(self, payload: bytes, wanted: BackfillRequest) -> Backfill:
-        """Returns an answer to a question.
-
-        Raises:
-            WireError: it is none.
-        """
+    def _decode(self, payload: bytes, wanted: BackfillRequest) -> Backfill:
         past = decode(payload, Backfill)
-        self._sender.trust(past)
+        self._reception.check_sender(past)
         if past.channel != wanted.channel or past.first > max(past.made, wanted.first):
             raise WireError("out of range", f"{past.channel} from {past.first} on, of {past.made}")
         return past
 
     def _take(self, past: Backfill, wanted: BackfillRequest, now_ns: int) -> Iterator[RepairedMessage]:
-        """Takes what an answer brings, and learns what it says of the rest."""
+        """Takes the messages of an answer, and what it implies of the others."""
         channel = past.channel
-        account = self._sender.accounts[channel]
+        account = self._reception.accounts[channel]
         self._probes.discard(channel)
-        self._sender.expect(channel, past.made)
+        self._reception.expect(channel, past.made)
         if past.first > wanted.first:
             account.give_up(past.first)
-        some = False
+        useful = False
         for number, payload in enumerate(past.payloads, past.first):
             try:
-                message = self._sender.read(channel, payload)
+                message = self._reception.read(channel, payload)
                 if message.number != number:
                     raise WireError("out of range", f"{channel} {message.number} in the place of {number}")
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
-            if self._sender.refill(channel, message):
-                some = True
+            if self._reception.refill(channel, message):
+                useful = True
                 yield RepairedMessage(channel, message, payload)
         self._next[channel] = max(past.first + len(past.payloads), wanted.first + 1)
-        self._settle(channel, wanted, now_ns, some=some)
-
-    def _settle(self, channel: str, wanted: BackfillRequest, now_ns: int, *, some: bool) -> None:
-        """Notes whether an answer was of use: if it was not, the next question may wait."""
-        account = self._sender.accounts[channel]
-        still = account.wanted(wanted.first)
+        gap = account.wanted(wanted.first)
         self._due_ns = now_ns
-        if some:
+        if useful:
             self._progress_ns = now_ns
-        if some or still is None or still[0] > wanted.first:
+        if useful or gap is None or gap[0] > wanted.first:
             self._vain[channel] = 0
             return
         self._due_ns = now_ns + REST_NS
@@ -198,12 +185,3 @@ class GapRepair:
         if self._vain[channel] >= MAX_VAIN_REQUESTS:
             self._vain[channel] = 0
             account.give_up(account.last + 1)
-
-    def _give_up(self, now_ns: int) -> None:
-        """A site that has ended and answers no more is asked no more."""
-        if self._sender.made is None:
-            return
-        if self._ended_ns is None:
-            self._ended_ns = now_ns
-        if now_ns - max(self._ended_ns, self._progress_ns) > GIVE_UP_NS:
-            self._sender.give_up()

@@ -10,13 +10,13 @@ from typing import NamedTuple
 from trilat_net.net.clock import Clock
 
 CAPACITY = 200_000
-"""Messages that wait at most: a minute of three sites at 1 kHz."""
+"""Capacity in messages: a minute of three sites at 1 kHz."""
 KEYS = 1_000
-"""Keys whose losses are counted apart."""
+"""Keys whose losses are counted separately."""
 
 
 class InboundMessage(NamedTuple):
-    """One message as it came in: its key, its bytes, and when, on the monotonic clock."""
+    """One message: its key, its bytes, and its arrival on the monotonic clock."""
 
     key: str
     payload: bytes
@@ -25,9 +25,6 @@ class InboundMessage(NamedTuple):
 
 class InboundQueue:
     """A queue between the bus's thread, which takes, and the writer's, which drains.
-
-    Args:
-        clock: what stamps.
 
     Attributes:
         overflowed: messages lost because the queue was full, by key.
@@ -39,22 +36,18 @@ class InboundQueue:
         self.overflowed: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        """Returns how many wait."""
+        """Returns the number of waiting messages."""
         return len(self._queue)
 
     def take(self, key: str, payload: bytes) -> None:
-        """Takes one message; called by the bus."""
+        """Stamps and appends one message; called by the bus."""
         if len(self._queue) >= CAPACITY:
             self.overflowed[key if len(self.overflowed) < KEYS else "others"] += 1
             return
         self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
 
     def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
-        """Yields what waits, oldest first.
-
-        Args:
-            until_ns: what came after this instant waits on; None for all.
-        """
+        """Yields the waiting messages that arrived until an instant, oldest first; all without one."""
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
             yield queue.popleft()

@@ -11,8 +11,6 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 
-import msgspec
-
 from trilat_net import process
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, RunFailed, SessionError
@@ -28,14 +26,14 @@ from trilat_net.net.messages import Info
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import Epoch, SessionJoin
 from trilat_net.process import Interrupt
-from trilat_net.scenario import Scenario, parse_embedded
+from trilat_net.scenario import parse_embedded
 
 from .inbound_queue import InboundQueue
 from .session_recording import RecorderReport, Recording
 
 POLL_NS = 10_000_000
 FLUSH_NS = 80_000_000
-"""How often the log is handed to the operating system: a crash loses this, and at most two polls."""
+"""Between two flushes: a crash loses this, and at most two polls."""
 
 
 class Recorder:
@@ -47,8 +45,8 @@ class Recorder:
         session: the session's name.
         boot: this process's boot.
         storage: where the log goes.
-        stopped: True once the recorder was asked to end.
-        say: tells a person what happens.
+        stopped: True once the recorder should end.
+        say: prints a line for the user.
     """
 
     def __init__(
@@ -63,34 +61,28 @@ class Recorder:
     ) -> None:
         self._bus, self._clock, self._session, self._storage = bus, clock, session, storage
         self._stopped, self._say = stopped, say
-        self._tap = InboundQueue(clock)
+        self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
-            bus.tap(topics.key(session, "*", channel), self._tap.take)
+            bus.tap(topics.key(session, "*", channel), self._queue.take)
         self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
-        self._publisher = EventPublisher(
-            bus,
-            session,
-            Info(
-                member=topics.RECORDER,
-                boot=boot,
-                scenario_sha256="",
-                scenario="",
-                host=platform.node(),
-                clock=clock.identity(),
-                fingerprint=compute_fingerprint(),
-            ),
-            partial(self._tap.take, topics.key(session, topics.RECORDER, topics.EVENT)),
+        info = Info(
+            member=topics.RECORDER,
+            boot=boot,
+            scenario_sha256="",
+            scenario="",
+            host=platform.node(),
+            clock=clock.identity(),
+            fingerprint=compute_fingerprint(),
         )
+        keep = partial(self._queue.take, topics.key(session, topics.RECORDER, topics.EVENT))
+        self._publisher = EventPublisher(bus, session, info, keep)
         self._joining = SessionJoin(bus, clock, session, self._publisher, ())
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for a session to begin.
+        """Waits for a session to begin; returns its epoch, or None if `stopped`.
 
         Args:
             timeout_s: how long, s; None for as long as it takes.
-
-        Returns:
-            The epoch, or None where the recorder was asked to end before.
 
         Raises:
             SessionError: none began in time.
@@ -115,9 +107,13 @@ class Recorder:
 
         Raises:
             UsageError: the file cannot be made.
-            LogRefused: the disk refused; says what is kept.
+            LogRefused: the disk refused; the message names what is kept.
         """
-        scenario = self._scenario(epoch)
+        scenario = next(
+            parse_embedded(info.scenario, info.member)
+            for info in self._joining.membership.met.values()
+            if info.scenario and epoch.boots.get(info.member) == info.boot
+        )
 
         def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
             return LogWriter(
@@ -129,72 +125,55 @@ class Recorder:
 
         with LogParts(self._storage, begin) as log:
             recording = Recording(log, scenario, self._session, epoch, self._bus, self._publisher)
-            log.so_far = partial(recording.account_texts, self._tap)
+            log.so_far = partial(recording.account_texts, self._queue)
             boot = self._publisher.info.boot
             report = RecorderReport(
-                *(self._bus, self._clock, self._session, boot, epoch, recording, self._tap),
+                *(self._bus, self._clock, self._session, boot, epoch, recording, self._queue),
                 lambda: log.written_bytes,
             )
             self._begin(recording, epoch, log.path)
-            left = self._tap
+            discarded = InboundQueue(self._clock)  # on a full disk there is no room for the queue
+            discarded.overflowed = self._queue.overflowed
+            rest = self._queue
             try:
                 self._run(recording, report)
             except LogRefused:
-                left = self._nothing()
+                rest = discarded
                 raise
             finally:
-                report.say()
-                self._finish(recording, left)
+                report.publish()
+                try:
+                    recording.finish(rest)
+                except LogRefused:
+                    recording.finish(discarded)
+                    raise
         return recording
 
-    def _finish(self, recording: Recording, left: InboundQueue) -> None:
-        """Writes what is left and the end of the log; where the disk refuses what is left, the end."""
-        try:
-            recording.finish(left)
-        except LogRefused:
-            recording.finish(self._nothing())
-            raise
-
-    def _nothing(self) -> InboundQueue:
-        """Returns a queue in which nothing waits: on a full disk there is no room for it."""
-        tap = InboundQueue(self._clock)
-        tap.overflowed = self._tap.overflowed
-        return tap
-
-    def _scenario(self, epoch: Epoch) -> Scenario:
-        """Returns the scenario, as a member of the session has it."""
-        return next(
-            parse_embedded(info.scenario, info.member)
-            for info in self._joining.membership.met.values()
-            if info.scenario and epoch.boots.get(info.member) == info.boot
-        )
-
     def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Says that it is one of the session's members, or that it comes late."""
+        """Reports that the session begins, or that the recorder joins late."""
         own, now_ns = self._publisher.info, self._clock.monotonic_ns()
-        self._publisher.info = msgspec.structs.replace(own, running=True)
-        how = "the session begins"
+        self._publisher.update(running=True)
+        text = "the session begins"
         if epoch.boots.get(own.member) != own.boot:
-            how = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
-            recording.away()
-            self._attend(recording)
-            recording.late(now_ns)
-        self._say(f"recorder: {how}, writing {path}")
-        for text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
-            self._say(f"recorder: {text}")
+            text = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
+            recording.assume_gone()
+            self._watch_presence(recording)
+            recording.join_late(now_ns)
+        self._say(f"recorder: {text}, writing {path}")
+        for clock_text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
+            self._say(f"recorder: {clock_text}")
 
-    def _attend(self, recording: Recording) -> None:
-        """Notes who has come and who has gone."""
+    def _watch_presence(self, recording: Recording) -> None:
         while (change := self._presence.poll()) is not None:
             recording.presence(*change)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
-        """Takes and writes until the session is over."""
+        """Writes until the session is over."""
         flushed_ns = self._clock.monotonic_ns()
         while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
             self._publisher.answer_queries()
-            recording.write(self._tap, self._clock.monotonic_ns())
-            self._attend(recording)
+            recording.write(self._queue, self._clock.monotonic_ns())
+            self._watch_presence(recording)
             report.poll()
             now_ns = self._clock.monotonic_ns()
             if now_ns - flushed_ns >= FLUSH_NS:
@@ -218,13 +197,12 @@ def record_session(
     Args:
         session: the session's name.
         storage: where the log goes.
-        connection: how it takes part in the network; without endpoints to connect to it asks the session's
-            first site, on this machine.
+        connection: how to reach the session, see `connect_to_session`.
         join_timeout_s: how long to wait for the session to begin, s, or None.
         clock: the time.
-        say: tells a person what happens.
-        afterwards: what to do with the finished log of a session that nobody interrupted. The recorder is a
-            member of the session until that is done: sites that shall stay wait for it.
+        say: prints a line for the user.
+        afterwards: works on the finished log of a session that was not interrupted. The recorder remains a
+            member until that is done: sites with `--stay` wait for it.
 
     Returns:
         The exit code: 0, or 128 and the number of the signal that ended it.

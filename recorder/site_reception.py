@@ -17,17 +17,16 @@ from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
-"""What people call the messages of a channel."""
-_ANY = 1 << 40
+_MANY = 1 << 40
 
 
 class SiteMessage(NamedTuple):
-    """What a payload of a site says.
+    """A decoded message of a site.
 
     Attributes:
-        number: its number in its channel; -1 where it has none.
-        sequence: what the file calls it by.
-        t_ns: when it was sent, ns since the epoch on the sender's clock; below 0 where it was before.
+        number: its number in its channel; -1 without one.
+        sequence: its sequence number in the file.
+        t_ns: time of sending, ns since the epoch on the sender's clock; negative before it.
         content: the message itself.
     """
 
@@ -38,18 +37,18 @@ class SiteMessage(NamedTuple):
 
 
 class SiteReception:
-    """One start of one site.
+    """The messages received from one start of one site, and those missing.
 
     Args:
         scenario: the session's.
-        name: which of its sites.
-        boot: the start of it that is a member; None where it never was.
+        name: the site.
+        boot: the start of it that is a member; None if none is.
 
     Attributes:
-        name: its name.
-        accounts: what it has sent and what it owes, by channel.
-        made: how many ticks it made, once it has said its end; else None.
-        heard_ns: when it was heard last, on the recorder's clock; None before.
+        name: the site.
+        accounts: its messages by channel.
+        made: number of its ticks, once its end event has arrived; else None.
+        heard_ns: arrival of its last message, on the recorder's clock; None before.
     """
 
     def __init__(self, scenario: Scenario, name: str, boot: int | None) -> None:
@@ -61,18 +60,22 @@ class SiteReception:
         self._rate_hz = scenario.sites[name].rate_hz
         self._every = ticks_per_stats(self._rate_hz)
         self._ticks = scenario.ticks(name)
-        self._most = {topics.STATE: self._ticks, topics.LINK: self._linked(self._ticks), topics.EVENT: _ANY}
+        self._most = {
+            topics.STATE: self._ticks,
+            topics.LINK: self._count_stats(self._ticks),
+            topics.EVENT: _MANY,
+        }
 
     @property
     def period_ns(self) -> int:
-        """Time between two of its records."""
+        """Its tick period."""
         return 1_000_000_000 // self._rate_hz
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Returns what a payload says.
+        """Decodes a payload.
 
         Raises:
-            WireError: it is no message of this site's channel, and why.
+            WireError: it is no message of this site's channel.
         """
         if channel == topics.STATE:
             state = decode(payload, State)
@@ -95,56 +98,56 @@ class SiteReception:
         return message
 
     def take(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
-        """Books a message that came by itself; False where it is there already."""
+        """Counts a published message; False if it is a duplicate."""
         self.heard_ns = came_ns
         new = message.number < 0 or self.accounts[channel].take(message.number, came_ns)
-        self._learn(message.content)
+        self._imply(message.content)
         return new
 
     def refill(self, channel: str, message: SiteMessage) -> bool:
-        """Books a message from the site's memory; False where it is there already."""
+        """Counts a backfilled message; False if it is a duplicate."""
         new = self.accounts[channel].refill(message.number)
-        self._learn(message.content)
+        self._imply(message.content)
         return new
 
-    def trust(self, past: Backfill) -> None:
-        """Refuses an answer that this start of the site cannot have given.
+    def check_sender(self, past: Backfill) -> None:
+        """Refuses an answer that this start of the site did not give.
 
         Raises:
-            WireError: and why.
+            WireError: its sender is another one.
         """
         if past.member != self.name or past.boot != self._boot:
             raise WireError("stranger", f"{past.member}, start {past.boot}, answers for {self.name}")
 
     def expect(self, channel: str, made: int) -> None:
-        """Books how many messages of a channel there are at least; no more than the scenario allows."""
+        """Counts the messages of a channel that exist at least; no more than the scenario allows."""
         self.accounts[channel].expect(min(made, self._most[channel]))
 
-    def _learn(self, content: State | LinkStats | Event) -> None:
-        """Books what must exist because this does."""
+    def _imply(self, content: State | LinkStats | Event) -> None:
+        """Counts the messages that must exist because this one does."""
         if isinstance(content, LinkStats):
             self.expect(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "end":
             self.made = content.ticks
             self.expect(topics.STATE, content.ticks)
-            self.expect(topics.LINK, self._linked(content.ticks))
+            self.expect(topics.LINK, self._count_stats(content.ticks))
 
-    def _linked(self, ticks: int) -> int:
-        """Returns how many statistics go with so many ticks."""
+    def _count_stats(self, ticks: int) -> int:
+        """Returns the number of statistics messages of so many ticks."""
         return -(-ticks // self._every)
 
     @property
     def full(self) -> bool:
-        """True once it has ended and nothing is missing that could still be had."""
+        """True once it has ended and no missing message can still be had."""
         return self.made is not None and not any(account.wanted() for account in self.accounts.values())
 
     def give_up(self) -> None:
-        """Books all that is missing now as lost for good."""
+        """Counts all missing messages as lost for good."""
         for account in self.accounts.values():
             account.give_up(account.last + 1)
 
     def shortage(self) -> str:
-        """Says what is missing, "" where nothing is."""
+        """Describes the missing messages; "" without any."""
         return ", ".join(
             f"{account.missing} of {account.expected} {CHANNEL_NOUNS[channel]} "
             f"({' '.join(account.gap_texts(5))})"

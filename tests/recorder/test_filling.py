@@ -367,9 +367,9 @@ def test_times_come_from_the_monotonic_clock_however_the_wall_clock_steps() -> N
 
     run = Run(Way(lost=set(range(50, 80))), Stepping(MONO_NS, UNIX_NS - MONO_NS))
     run.live(S // 2)
-    run.desk.report.say()
+    run.desk.report.publish()
     run.live(2100 * MS)
-    run.desk.report.say()
+    run.desk.report.publish()
     run.until_stored()
     messages = list(run.desk.messages())
     times = [message.log_time for _, message in messages]

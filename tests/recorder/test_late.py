@@ -26,10 +26,10 @@ def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
         events = [happening(name, 0, "ready", t_ns=-1), happening(name, 1), end(name, n=2)]
         site.made = {"state": states(name), "link": [statistics(name)], "event": events}
     desk.wait(40 * S)
-    desk.recording.away()
+    desk.recording.assume_gone()
     for name in there:
         desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True)
-    desk.recording.late(desk.clock.monotonic_ns())
+    desk.recording.join_late(desk.clock.monotonic_ns())
     return desk, sites
 
 

@@ -21,7 +21,7 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
     desk.take("nobody", topics.STATE, records[0])
     desk.report.flushed(3 * MS)
     desk.report.flushed(2 * MS)
-    desk.report.say()
+    desk.report.publish()
     (stats,) = heard(desk)
     assert (stats.expected["m/state"], stats.received["m/state"]) == (30, 28)
     assert (stats.missing["m/state"], stats.gaps) == (2, {"m/state": ["10-11"]})
@@ -35,7 +35,7 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
         *(f"{site}/{channel}" for site in ("m", "s") for channel in ("state", "link", "event")),
         *("recorder/event", "recorder/stats"),
     }
-    desk.report.say()
+    desk.report.publish()
     assert heard(desk)[0].flush_max_us == 0
 
 
@@ -46,7 +46,7 @@ def test_it_counts_what_came_from_a_sites_memory_and_what_waits() -> None:
     desk.take("m", topics.STATE, states("m")[0], states("m")[-1])
     desk.rounds(30, site)
     desk.tap.take("somewhere", b"")
-    desk.report.say()
+    desk.report.publish()
     (stats,) = heard(desk)
     assert stats.refilled["m/state"] == TICKS - 2
     assert stats.missing["m/state"] == 0
@@ -82,7 +82,7 @@ def test_it_fits_a_message_however_much_is_missing() -> None:
             desk.recording.accounts[key].take(number + 2**39)
     for name in names:
         desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[key]
-    desk.report.say()
+    desk.report.publish()
     (stats,) = heard(desk)
     assert sum(map(len, stats.gaps.values())) <= 600
     assert len(encode(stats)) < MAX_BYTES
@@ -92,7 +92,7 @@ def test_a_whole_run_is_whole_in_its_last_words() -> None:
     desk = Desk()
     desk.whole("m", "s")
     desk.take("m", topics.EVENT, end("m"))
-    desk.report.say()
+    desk.report.publish()
     (stats,) = heard(desk)
     assert set(stats.missing.values()) == {0}
     assert stats.gaps == {}
