@@ -7,35 +7,32 @@ different sessions are refused. The order in which the parts are given does not 
 import hashlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
+from contextlib import suppress
+from typing import Any
 
 from ..errors import LogError, WireError
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats
 from ..net.wire import decode
-from . import record_columns
 from .log_layout import ACCOUNTS, PART
 from .mcap_reader import ChannelMessages, LogContents
-
-MessageKeys = Callable[[Sequence[bytes]], Sequence[Hashable]]
-"""Tells what makes each message of a channel one of its kind: its tick, or its number."""
+from .record_columns import decode_ticks
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Returns the parts of a session as one.
+    """Returns the parts of a session, one or more in any order, as one.
 
-    Args:
-        parts: one or more, in any order. Where they are several, the accounts are left with what is none of
-            a channel, summed up: what is missing of a channel is for the whole to say.
+    The accounts of several keep only the counts that are none of a channel, summed up.
 
     Raises:
-        LogError: they are of different sessions, or tell a message differently, or one cannot be read.
+        LogError: they are of different sessions, or disagree on a message, or one cannot be read.
     """
     if len(parts) == 1:
         return parts[0]
     for other in parts[1:]:
-        _same_session(parts[0], other)
-    ordered = sorted(parts, key=_begins)
+        _refuse_other_session(parts[0], other)
+    ordered = sorted(parts, key=_first_time)
     first, last = ordered[0], ordered[-1]
     names = dict.fromkeys(topic for part in ordered for topic in part.channels)
     whole = all(part.ended and not part.damaged for part in parts)
@@ -43,33 +40,32 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
         tuple(part.source for part in ordered),
         first.session,
         first.scenario,
-        {**first.metadata, ACCOUNTS: _other_counts(ordered)},
-        {topic: _joined(topic, ordered) for topic in names},
-        whole and sorted(map(_place, parts)) == [*range(1, len(parts) + 1)],
+        {**first.metadata, ACCOUNTS: _sum_other_counts(ordered)},
+        {topic: _merge_channel(topic, ordered) for topic in names},
+        whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
         last.ended,
         [damage for part in ordered for damage in part.damaged],
     )
 
 
-def _begins(part: LogContents) -> tuple[int, str]:
-    """Orders parts: by their first message, those without any last."""
+def _first_time(part: LogContents) -> tuple[int, str]:
+    """Returns the time of a part's first message, after all others if it has none, and its name."""
     first = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
     return min(first, default=1 << 63), part.source
 
 
-def _place(part: LogContents) -> int:
-    """Returns which part it says it is; one that was never split is the first."""
+def _part_index(part: LogContents) -> int:
     text = part.metadata.get(PART, {}).get("index", "1")
     return int(text) if text.isdecimal() and len(text) < 10 else 0
 
 
-def _other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
-    """Returns what recorders have counted besides channels, as messages that were dropped, by reason.
+def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
+    """Returns the recorders' counts that are none of a channel, as of dropped messages by reason.
 
     A recorder counts on from part to part, so that its last part has it all.
     """
     last: dict[int | str, dict[str, str]] = {
-        _recorder(part) or part.source: part.metadata.get(ACCOUNTS, {}) for part in parts
+        _recorder_boot(part) or part.source: part.metadata.get(ACCOUNTS, {}) for part in parts
     }
     sums: Counter[str] = Counter()
     for counts in last.values():
@@ -79,39 +75,35 @@ def _other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
     return {name: str(count) for name, count in sums.items()}
 
 
-def _recorder(part: LogContents) -> int:
-    """Returns the boot of the recorder that wrote a part; 0 where it said nothing there."""
-    session = part.session["session"]
-    said, told = (
-        part.channels.get("/" + topics.key(session, topics.RECORDER, channel))
-        for channel in (topics.STATS, topics.EVENT)
-    )
-    try:
-        if said is not None and said.payloads:
-            return decode(said.payloads[-1], RecorderStats, READABLE).boot
-        if told is not None and told.payloads:
-            return decode(told.payloads[-1], Event, READABLE).boot
-    except WireError:
-        pass  # told where its messages are read
+def _recorder_boot(part: LogContents) -> int:
+    """Returns the boot of the recorder that wrote a part; 0 if it has no message of its own there."""
+    kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
+    for channel, kind in kinds.items():
+        topic = "/" + topics.key(part.session["session"], topics.RECORDER, channel)
+        messages = part.channels.get(topic)
+        if messages is not None and messages.payloads:
+            with suppress(WireError):  # raised when its messages are read
+                message: RecorderStats | Event = decode(messages.payloads[-1], kind, READABLE)
+                return message.boot
+            return 0
     return 0
 
 
-def _same_session(part: LogContents, other: LogContents) -> None:
-    ours, theirs = _facts(part), _facts(other)
+def _refuse_other_session(part: LogContents, other: LogContents) -> None:
+    ours, theirs = _common_facts(part), _common_facts(other)
     differ = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if ours[name] != theirs[name]]
     if differ:
         raise LogError(f"{other.source}: is no part of the session in {part.source}: {'; '.join(differ)}")
 
 
-def _facts(part: LogContents) -> dict[str, str]:
-    """Returns what the parts of a session have in common."""
-    told = {name: part.session.get(name, "unknown") for name in ("session", "driver", "epoch_unix_ns")}
-    return {**told, "scenario": hashlib.sha256(part.scenario).hexdigest()[:16]}
+def _common_facts(part: LogContents) -> dict[str, str]:
+    facts = {name: part.session.get(name, "unknown") for name in ("session", "driver", "epoch_unix_ns")}
+    return {**facts, "scenario": hashlib.sha256(part.scenario).hexdigest()[:16]}
 
 
-def _joined(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
+def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
     """Returns a topic's messages of all parts, each once, in the order of the parts."""
-    whole = ChannelMessages()
+    merged = ChannelMessages()
     having = [part for part in parts if topic in part.channels]
     if len(having) == 1:
         return having[0].channels[topic]
@@ -120,66 +112,48 @@ def _joined(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
     for part in having:
         channel = part.channels[topic]
         fresh: dict[Hashable, int] = {}
-        for n, number in enumerate(_numbers(topic, channel, part.source)):
+        for n, key in enumerate(_find_keys(topic, channel, part.source)):
             payload = channel.payloads[n]
-            place = places.get(number)
+            place = places.get(key)
             if place is None:
-                fresh[number] = len(whole.payloads)
-                whole.add(payload, channel.log_ns[n], channel.publish_ns[n])
-            elif whole.payloads[place] != payload:
-                told = having[bisect_right(ends, place)].source
-                raise LogError(f"{told} and {part.source} differ: {_named(topic, number)} is not the same")
+                fresh[key] = len(merged.payloads)
+                merged.add(payload, channel.log_ns[n], channel.publish_ns[n])
+            elif merged.payloads[place] != payload:
+                names = f"{having[bisect_right(ends, place)].source} and {part.source}"
+                raise LogError(f"{names} differ: {_describe_message(topic, key)} is not the same")
         places |= fresh
-        ends.append(len(whole.payloads))
-    return whole
+        ends.append(len(merged.payloads))
+    return merged
 
 
-def _numbers(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
-    kind = topic.rpartition("/")[2]
+def _find_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
+    """Returns a key per message: its tick, its boot and number, or its boot and time."""
+    payloads = channel.payloads
     try:
-        return _NUMBERED[kind](channel.payloads)
+        match topic.rpartition("/")[2]:
+            case topics.STATE:
+                ticks: list[int] = decode_ticks(payloads).tolist()
+                return ticks
+            case topics.LINK:
+                return [decode(payload, LinkStats, READABLE).tick for payload in payloads]
+            case topics.EVENT:
+                events = [decode(payload, Event, READABLE) for payload in payloads]
+                # before version 3 events have no number; their content is the key
+                keys = zip(events, payloads, strict=True)
+                return [(event.boot, event.n) if event.n >= 0 else payload for event, payload in keys]
+        stats = (decode(payload, RecorderStats, READABLE) for payload in payloads)
+        return [(one.boot, one.t_ns) for one in stats]
     except WireError as error:
         raise LogError(f"{source}: a message on {topic} cannot be read: {error}") from None
 
 
-def _named(topic: str, number: Hashable) -> str:
+def _describe_message(topic: str, key: Hashable) -> str:
     member, kind = topic.split("/")[-2:]
-    match number:
+    match key:
         case int():
-            what = "record" if kind == topics.STATE else "statistics"
-            return f"the {what} of tick {number} of {member}"
+            return f"the {'record' if kind == topics.STATE else 'statistics'} of tick {key} of {member}"
         case (_, int(n)):
-            return (
-                f"event {n} of {member}" if kind == topics.EVENT else f"statistics of the {member} at {n} ns"
-            )
+            if kind == topics.EVENT:
+                return f"event {n} of {member}"
+            return f"statistics of the {member} at {n} ns"
     return f"a message of {member}"
-
-
-def _link_numbers(payloads: Sequence[bytes]) -> Sequence[Hashable]:
-    return [decode(payload, LinkStats, READABLE).tick for payload in payloads]
-
-
-def _event_numbers(payloads: Sequence[bytes]) -> Sequence[Hashable]:
-    """Tells events by boot and number; those of before version 3 by what they say."""
-    events = (decode(payload, Event, READABLE) for payload in payloads)
-    return [
-        (event.boot, event.n) if event.n >= 0 else payload
-        for event, payload in zip(events, payloads, strict=True)
-    ]
-
-
-def _stats_numbers(payloads: Sequence[bytes]) -> Sequence[Hashable]:
-    return [(s.boot, s.t_ns) for s in (decode(payload, RecorderStats, READABLE) for payload in payloads)]
-
-
-def _state_numbers(payloads: Sequence[bytes]) -> Sequence[Hashable]:
-    ticks: list[int] = record_columns.decode_ticks(payloads).tolist()
-    return ticks
-
-
-_NUMBERED: dict[str, MessageKeys] = {
-    topics.STATE: _state_numbers,
-    topics.LINK: _link_numbers,
-    topics.EVENT: _event_numbers,
-    topics.STATS: _stats_numbers,
-}

@@ -1,7 +1,7 @@
 """Fields of many encoded records as arrays.
 
 Invariant: only the requested fields are decoded, and each is checked as in a complete record: type,
-length, finite values.
+length, finite values. Every function raises `WireError` for the first payload that is no such record.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,74 +31,45 @@ _TYPES: dict[str, Any] = {
     "rx": list[Stamp],
     **{field: tuple.__class_getitem__((float,) * count) for field, count in STATE_VECTORS.items()},
 }
-"""What a field is, where that is narrower than in `State`: of a fixed length, of a few words."""
-_LATER = {"sent_ns": 0}
-"""Fields that records of older versions lack, and what stands for them."""
+"""Types of fields that are narrower here than in `State`: of a fixed length, of a few words."""
+_DEFAULTS = {"sent_ns": 0}
+"""Values of fields that records of older versions lack."""
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Returns the tick of every record, shape (K,).
-
-    Raises:
-        WireError: a payload is too long, or no record, or one of a version that nobody reads.
-    """
+    """Returns the tick of every record, shape (K,); records of every readable version are accepted."""
     if any(len(payload) > MAX_BYTES for payload in payloads):
-        raise _reason(payloads)
-    pairs = _gathered(payloads, "v", "tick").reshape(-1, 2)
+        raise _explain(payloads)
+    pairs = _decode_numbers(payloads, "v", "tick").reshape(-1, 2)
     if not np.isin(pairs[:, 0], READABLE).all():
-        raise _reason(payloads)
+        raise _explain(payloads)
     return pairs[:, 1].copy()
 
 
 def decode_ints(payloads: Sequence[bytes], field: str) -> Ints:
-    """Returns a whole number of every record, shape (K,).
-
-    Raises:
-        WireError: a payload has none there, or one that 64 bits do not hold.
-    """
-    return _gathered(payloads, field)
+    """Returns a whole number of 64 bits of every record, shape (K,)."""
+    return _decode_numbers(payloads, field)
 
 
-def decode_vectors(payloads: Sequence[bytes], field: str) -> Array:
-    """Returns a vector of every record, shape (K, how many numbers it has).
-
-    Raises:
-        WireError: a payload has no such vector there, or one that is not finite.
-    """
-    count = STATE_VECTORS[field]
-    values = chain.from_iterable(_each(payloads, field))
-    rows: Array = _array(payloads, values, np.float64, count * len(payloads)).reshape(-1, count)
-    if not np.isfinite(rows).all():
-        raise _reason(payloads)
-    return rows
-
-
-def decode_many_vectors(payloads: Sequence[bytes], fields: Sequence[str]) -> dict[str, Array]:
-    """Returns several vectors of every record by their fields, shape (K, how many numbers it has) each.
-
-    One pass over the records, where `vectors` takes one per field.
-
-    Raises:
-        WireError: as `vectors`.
-    """
+def decode_vectors(payloads: Sequence[bytes], *fields: str) -> dict[str, Array]:
+    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in one pass."""
     counts = [STATE_VECTORS[field] for field in fields]
-    found = _each(payloads, *fields)
-    values = chain.from_iterable(found if len(fields) == 1 else chain.from_iterable(found))
-    rows: Array = _array(payloads, values, np.float64, sum(counts) * len(payloads))
+    values = chain.from_iterable(_decode_fields(payloads, *fields))
+    if len(fields) > 1:
+        values = chain.from_iterable(values)
+    rows: Array = _to_array(payloads, values, np.float64, sum(counts) * len(payloads))
     rows = rows.reshape(-1, sum(counts))
     if not np.isfinite(rows).all():
-        raise _reason(payloads)
+        raise _explain(payloads)
+    if len(fields) == 1:
+        return {fields[0]: rows}
     parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
     return {field: part.copy() for field, part in zip(fields, parts, strict=True)}
 
 
 def decode_strings(payloads: Sequence[bytes], field: str) -> Strings:
-    """Returns a word of every record, shape (K,).
-
-    Raises:
-        WireError: a payload has none there.
-    """
-    return _array(payloads, _each(payloads, field), np.object_, len(payloads))
+    """Returns a word, or another object, of every record, shape (K,)."""
+    return _to_array(payloads, _decode_fields(payloads, field), np.object_, len(payloads))
 
 
 def decode_per_peer(
@@ -109,11 +80,8 @@ def decode_per_peer(
     Args:
         payloads: the records.
         field: a field that holds a number per peer.
-        peers: which peers.
-        absent: what stands for a peer that a record does not name.
-
-    Raises:
-        WireError: a payload holds something else there.
+        peers: names of the peers.
+        absent: number of a peer that a record does not name.
     """
     places = [f"peer{n}" for n in range(len(peers))]
     entry = msgspec.defstruct(
@@ -122,70 +90,63 @@ def decode_per_peer(
         rename=dict(zip(places, peers, strict=True)),
         gc=False,
     )
-    take = attrgetter(*(f"{field}.{place}" for place in places))
-    found = _each(payloads, field, kind=entry, take=take)
+    decoder, take = _make_decoder({field: entry}), attrgetter(*(f"{field}.{place}" for place in places))
+    found = map(take, map(decoder.decode, payloads))
     values = found if len(peers) == 1 else chain.from_iterable(found)
-    rows = _array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(-1, len(peers))
+    rows = _to_array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(-1, len(peers))
     return {peer: rows[:, n].copy() for n, peer in enumerate(peers)}
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Returns what came in: how many per record, shape (K,), and all in order as in `rx`, shape (N, 3).
-
-    Raises:
-        WireError: a payload lists something else there.
-    """
+    """Returns the arrivals: how many per record, shape (K,), and all in order as in `rx`, shape (N, 3)."""
     counts = np.zeros(len(payloads), dtype=np.int64)
 
-    def entries() -> Iterator[int]:
-        for n, listed in enumerate(_each(payloads, "rx")):
-            counts[n] = len(listed)
-            for entry in listed:
+    def iterate_entries() -> Iterator[int]:
+        for n, arrivals in enumerate(_decode_fields(payloads, "rx")):
+            counts[n] = len(arrivals)
+            for entry in arrivals:
                 yield from entry
 
-    rows = _array(payloads, entries(), np.int64, -1).reshape(-1, 3)
+    rows = _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
     return counts, rows
 
 
-def _gathered(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Returns some whole numbers of every record, one record after the other."""
-    found = _each(payloads, *fields)
+def _decode_numbers(payloads: Sequence[bytes], *fields: str) -> Ints:
+    """Returns whole numbers of every record, one record after the other."""
+    found = _decode_fields(payloads, *fields)
     values = found if len(fields) == 1 else chain.from_iterable(found)
-    return _array(payloads, values, np.int64, len(fields) * len(payloads))
+    return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
 
-def _each(
-    payloads: Sequence[bytes],
-    *fields: str,
-    kind: Any = None,
-    take: Callable[[Any], Any] | None = None,
-) -> Iterator[Any]:
-    """Yields some fields of every record, decoding them on the way."""
-    decoder = _decoder(fields) if kind is None else _made({fields[0]: kind})
-    return map(take or attrgetter(*fields), map(decoder.decode, payloads))
+def _decode_fields(payloads: Sequence[bytes], *fields: str) -> Iterator[Any]:
+    """Yields a field of every record, or a tuple of several."""
+    take: Callable[[Any], Any] = attrgetter(*fields)
+    return map(take, map(_find_decoder(fields).decode, payloads))
 
 
 @cache
-def _decoder(fields: tuple[str, ...]) -> msgspec.msgpack.Decoder[Any]:
+def _find_decoder(fields: tuple[str, ...]) -> msgspec.msgpack.Decoder[Any]:
     types = {field.name: field.type for field in msgspec.structs.fields(State)} | _TYPES
-    return _made({field: types[field] for field in fields})
+    return _make_decoder({field: types[field] for field in fields})
 
 
-def _made(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of these fields alone; it passes over all others."""
-    fields = [(name, kind, _LATER[name]) if name in _LATER else (name, kind) for name, kind in types.items()]
+def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
+    """Returns a decoder of these fields alone; it skips all others."""
+    fields = [
+        (name, kind, _DEFAULTS[name]) if name in _DEFAULTS else (name, kind) for name, kind in types.items()
+    ]
     return msgspec.msgpack.Decoder(msgspec.defstruct("Fields", fields, frozen=True, gc=False))
 
 
-def _array(payloads: Sequence[bytes], values: Iterable[Any], kind: Any, count: int) -> NDArray[Any]:
+def _to_array(payloads: Sequence[bytes], values: Iterable[Any], kind: Any, count: int) -> NDArray[Any]:
     try:
         return np.fromiter(values, kind, count)
     except (ValueError, OverflowError, RecursionError) as error:
-        raise _reason(payloads, str(error)) from None
+        raise _explain(payloads, str(error)) from None
 
 
-def _reason(payloads: Sequence[bytes], else_text: str = "a number is out of range") -> WireError:
-    """Returns what is wrong with the first payload that is no record, told as for a record of its own."""
+def _explain(payloads: Sequence[bytes], else_text: str = "a number is out of range") -> WireError:
+    """Returns the error of the first payload that is no record, as that record alone would raise it."""
     for payload in payloads:
         try:
             decode(payload, State, READABLE)

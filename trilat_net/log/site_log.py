@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import process
 from ..core.ticks import NS_PER_S
@@ -29,8 +28,6 @@ MAX_DECODED_RECORDS = 1 << 16
 """Records of a site that are held decoded, at most: a minute at 1 kHz, some 150 MB."""
 BLOCK_RECORDS = 1 << 11
 """Records that are decoded together."""
-
-
 HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
 """Records whose decoded form takes more than this, and than so many times their payloads, are held few at a
@@ -38,28 +35,18 @@ time: they were made to take much."""
 HEAVY_BLOCK, HEAVY_BLOCKS = 128, 8
 """Heavy records that are decoded together, and how many times that many are held."""
 
+DecodeStates = Callable[[Sequence[bytes]], list[State]]
+"""Decodes some records, or raises an error for one that is none."""
+
 
 class LazyRecords(Sequence[State]):
-    """Records decoded a block at a time; the blocks looked at last are held.
+    """Records decoded a block at a time; the blocks used last are held, fewer of heavy records."""
 
-    Args:
-        payloads: the records as published.
-        decoded: decodes some of them.
-        heavy: whether they take much each.
-    """
-
-    def __init__(
-        self,
-        payloads: Sequence[bytes],
-        decoded: Callable[[Sequence[bytes]], list[State]],
-        *,
-        heavy: bool = False,
-    ) -> None:
+    def __init__(self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False) -> None:
         self._size, self._held = (
             (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS // BLOCK_RECORDS)
         )
-        self._payloads = payloads
-        self._decoded = decoded
+        self._payloads, self._decode_block = payloads, decode_block
         self._blocks: OrderedDict[int, list[State]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -84,7 +71,7 @@ class LazyRecords(Sequence[State]):
     def _block(self, number: int) -> list[State]:
         block = self._blocks.get(number)
         if block is None:
-            block = self._decoded(self._payloads[number * self._size : (number + 1) * self._size])
+            block = self._decode_block(self._payloads[number * self._size : (number + 1) * self._size])
             self._blocks[number] = block
             if len(self._blocks) > self._held:
                 self._blocks.popitem(last=False)
@@ -93,44 +80,31 @@ class LazyRecords(Sequence[State]):
         return block
 
 
-def decode_records(
-    payloads: Sequence[bytes], decoded: Callable[[Sequence[bytes]], list[State]]
-) -> Sequence[State]:
-    """Returns the records of a site, in the order of their payloads.
-
-    Args:
-        payloads: the records as published.
-        decoded: decodes some of them, or raises what is to be raised where one is none.
-    """
+def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
+    """Returns the records of a site, in the order of their payloads: a list if they are not too many."""
     if len(payloads) > MAX_DECODED_RECORDS:
-        return LazyRecords(payloads, decoded)
+        return LazyRecords(payloads, decode_block)
     room = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
     held: list[State] = []
     with process.pause_gc():
         for first in range(0, len(payloads), BLOCK_RECORDS):
-            block = decoded(payloads[first : first + BLOCK_RECORDS])
-            room -= sum(map(_weight, block))
+            block = decode_block(payloads[first : first + BLOCK_RECORDS])
+            room -= sum(map(_estimate_bytes, block))
             if room < 0:
-                return LazyRecords(payloads, decoded, heavy=True)
+                return LazyRecords(payloads, decode_block, heavy=True)
             held += block
     return held
 
 
-def _weight(state: State) -> int:
-    """Returns how many bytes a record takes, about."""
+def _estimate_bytes(state: State) -> int:
     lists = len(state.rx) + len(state.echo) + len(state.cmd)
     return 2_000 + 130 * lists + 100 * len(state.used) + 32 * len(state.mem)
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Records by their tick; of several with one tick, the last.
+    """Records, in order of their ticks (K,), by tick; of several with one tick, the last."""
 
-    Args:
-        states: the records in order of their ticks.
-        ticks: those, shape (K,).
-    """
-
-    def __init__(self, states: Sequence[State], ticks: NDArray[np.int64]) -> None:
+    def __init__(self, states: Sequence[State], ticks: Ints) -> None:
         self._states = states
         self._ticks = ticks.tolist()
 
@@ -168,20 +142,17 @@ class SiteLog:
     Args:
         name: the site.
         peers: its peers, in scenario order.
-        rate_hz: its tick rate.
+        rate_hz: its tick rate, Hz.
         payloads: the records as published.
-        source: what errors call the file.
-        times: when they came; None where nobody will ask.
+        source: the file's name in errors.
+        times: when they came; by default 0.
 
     Attributes:
-        name: the site.
-        peers: its peers, in scenario order.
-        rate_hz: its tick rate, Hz.
         payloads: the records as published, in tick order.
         tick: their ticks, shape (K,).
 
     Raises:
-        LogError: a record cannot be read; every property raises it too, for what it alone looks at.
+        LogError: a record cannot be read; every property raises it too, for the fields that it decodes.
     """
 
     def __init__(
@@ -193,19 +164,18 @@ class SiteLog:
         source: str,
         times: MessageTimes | None = None,
     ) -> None:
-        self.name = name
-        self.peers = peers
-        self.rate_hz = rate_hz
+        self.name, self.peers, self.rate_hz = name, peers, rate_hz
         self._source = source
         self.payloads = payloads
-        with self._told():
+        with self._reading():
             self.tick: Ints = record_columns.decode_ticks(payloads)
+        zeros = np.zeros(len(payloads), dtype=np.int64)
+        self._times = times or MessageTimes(zeros, zeros)
         if (self.tick[1:] < self.tick[:-1]).any():
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = [payloads[n] for n in order.tolist()]
-            times = None if times is None else MessageTimes(*(column[order] for column in times))
-        self._times = times
+            self._times = MessageTimes(*(column[order] for column in self._times))
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -214,51 +184,40 @@ class SiteLog:
         if not len(self):
             return f"<{self.name}: no records>"
         first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
-        missing = self.missing or "none"
-        return (
-            f"<{self.name}: {len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s, "
-            f"{missing} missing>"
-        )
+        records = f"{len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
+        return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _reading(self) -> Iterator[None]:
         try:
             yield
         except WireError as error:
             raise LogError(f"{self._source}: a record of {self.name} cannot be read: {error}") from None
 
     def _vectors(self, field: str) -> Array:
-        with self._told():
-            return record_columns.decode_vectors(self.payloads, field)
+        with self._reading():
+            return record_columns.decode_vectors(self.payloads, field)[field]
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vectors in one pass, for who will ask for all of them: three times as fast.
-
-        Args:
-            fields: their names in `State`, which are those of the properties.
-        """
+        """Decodes several vectors by their names in one pass, three times as fast as one by one."""
         absent = [field for field in fields if field not in self.__dict__]
         if absent:
-            with self._told():
-                self.__dict__.update(record_columns.decode_many_vectors(self.payloads, absent))
+            with self._reading():
+                self.__dict__.update(record_columns.decode_vectors(self.payloads, *absent))
 
     def numbers(self, field: str) -> Ints:
         """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
-        with self._told():
+        with self._reading():
             return record_columns.decode_ints(self.payloads, field)
 
     def record(self, n: int) -> State:
-        """Returns one record, decoded and checked alone.
-
-        Args:
-            n: its place; -1 is the last one.
-        """
-        return self._decoded([self.payloads[n]])[0]
+        """Returns the record at a place, decoded and checked alone; -1 is the last one."""
+        return self._decode([self.payloads[n]])[0]
 
     @cached_property
     def states(self) -> Sequence[State]:
         """The records, decoded and checked as a whole."""
-        return decode_records(self.payloads, self._decoded)
+        return decode_records(self.payloads, self._decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
@@ -267,8 +226,8 @@ class SiteLog:
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
-    def _decoded(self, payloads: Sequence[bytes]) -> list[State]:
-        with self._told():
+    def _decode(self, payloads: Sequence[bytes]) -> list[State]:
+        with self._reading():
             return [decode(payload, State, READABLE) for payload in payloads]
 
     @property
@@ -289,21 +248,17 @@ class SiteLog:
     @property
     def log_time_ns(self) -> Ints:
         """When each record came, shape (K,), Unix ns."""
-        return self._when().log_ns
+        return self._times.log_ns
 
     @property
     def publish_time_ns(self) -> Ints:
         """When each record was sent, by its own stamp, shape (K,), Unix ns."""
-        return self._when().publish_ns
-
-    def _when(self) -> MessageTimes:
-        zeros = np.zeros(len(self), dtype=np.int64)
-        return self._times if self._times is not None else MessageTimes(zeros, zeros)
+        return self._times.publish_ns
 
     @cached_property
     def mode(self) -> Strings:
-        """What the site was doing, shape (K,): "run", "hold", "brake", "return" or "diverged"."""
-        with self._told():
+        """Mode of the site, shape (K,): "run", "hold", "brake", "return" or "diverged"."""
+        with self._reading():
             return record_columns.decode_strings(self.payloads, "mode")
 
     @cached_property
@@ -364,33 +319,31 @@ class SiteLog:
     @cached_property
     def used(self) -> dict[str, Ints]:
         """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
-        with self._told():
+        with self._reading():
             return record_columns.decode_per_peer(self.payloads, "used", self.peers, absent=-1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
         """How many samples each record took in, shape (K,), and all of them as in `rx`, shape (N, 3)."""
-        with self._told():
+        with self._reading():
             return record_columns.decode_arrivals(self.payloads)
+
+    @cached_property
+    def _changes(self) -> dict[int, list[str]]:
+        with self._reading():
+            lists = record_columns.decode_strings(self.payloads, "cmd")
+        return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
 
     def changes(self) -> dict[int, list[str]]:
         """Returns the changes that the site took in, by tick, as `cmd` names them."""
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
-    @cached_property
-    def _changes(self) -> dict[int, list[str]]:
-        with self._told():
-            lists = record_columns.decode_strings(self.payloads, "cmd")
-        return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
-
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Returns now minus the stamp of the sample in use, shape (K,), s; NaN before the first.
+        """Returns now minus the stamp of the sample in use of a peer with that tick rate, shape (K,), s.
 
-        Args:
-            peer: which peer.
-            rate_hz: that peer's tick rate.
+        NaN stands for none, before the first sample.
         """
         used = self.used[peer]
-        age = self.t_ns - used * NS_PER_S // rate_hz
-        seconds: Array = np.where(used >= 0, age / NS_PER_S, np.nan)
-        return seconds
+        age_ns = self.t_ns - used * NS_PER_S // rate_hz
+        age_s: Array = np.where(used >= 0, age_ns / NS_PER_S, np.nan)
+        return age_s
