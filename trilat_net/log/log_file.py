@@ -23,20 +23,23 @@ from .log_layout import active_path
 from .mcap_records import MAGIC
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""What a disk says that takes no more."""
+"""Errors of a disk that takes no more."""
 RESERVE_STEP_BYTES = 1 << 19
-"""It grows by this."""
+"""Step by which a reserve grows."""
+
+
+class ReservedSpace(Protocol):
+    """Space reserved on a disk."""
+
+    def grow(self, size: int) -> None:
+        """Reserves so many bytes at least."""
+
+    def release(self) -> None:
+        """Gives the space back, for good."""
 
 
 class DiskReserve:
-    """A file without a name.
-
-    Args:
-        folder: where it lies, on the disk that it keeps room on.
-
-    Attributes:
-        size: how much room it keeps, bytes.
-    """
+    """Space reserved on a disk, as a file without a name in a folder there; `size` is its length, bytes."""
 
     def __init__(self, folder: Path) -> None:
         self.size = 0
@@ -45,7 +48,7 @@ class DiskReserve:
         self._possible = True
 
     def grow(self, size: int) -> None:
-        """Keeps room for `size` bytes at least.
+        """Reserves so many bytes at least.
 
         Raises:
             OSError: the disk has no room for it.
@@ -60,12 +63,12 @@ class DiskReserve:
         except OSError as error:
             if error.errno in DISK_FULL_ERRNOS:
                 raise
-            self.release()  # no such thing on this disk
+            self.release()  # this disk cannot reserve space
         else:
             self.size = wanted
 
     def release(self) -> None:
-        """Gives the room back, for good."""
+        """Gives the space back, for good."""
         self._possible = False
         self.size = 0
         if self._file is not None:
@@ -74,7 +77,7 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Makes a file that long, with every block of it on the disk."""
+    """Lengthens a file, with every block of it on the disk."""
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(descriptor, begin, end - begin)
@@ -89,29 +92,23 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
 
 
 SYNC_PERIOD_NS = 1_000_000_000
-"""How often, where it is not at once."""
+"""Period of syncing in a thread."""
 
 
 class FileSync:
-    """The syncing of one file.
-
-    Args:
-        descriptor: the file's.
-        durable: at once, each time; else once a second, in a thread beside.
-        now_ns: the time.
-    """
+    """Syncing of one file: at once if `durable`, else once a second in a thread."""
 
     def __init__(self, descriptor: int, durable: bool, now_ns: Callable[[], int]) -> None:
         self._descriptor, self._durable, self._now_ns = descriptor, durable, now_ns
         self._done_ns = now_ns()
-        self._beside: threading.Thread | None = None
+        self._thread: threading.Thread | None = None
         self._trouble: OSError | None = None
 
-    def due(self) -> None:
-        """Is called when there is something new; puts it onto the disk, or sees to it.
+    def sync_new(self) -> None:
+        """Puts new data onto the disk, now or in a thread when it is time.
 
         Raises:
-            OSError: the disk refuses now, or refused what was there before.
+            OSError: the disk refuses now, or refused earlier data.
         """
         if self._durable:
             _datasync(self._descriptor)
@@ -119,10 +116,10 @@ class FileSync:
         if self._trouble is not None:
             raise self._trouble
         now_ns = self._now_ns()
-        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (self._beside and self._beside.is_alive()):
+        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (self._thread and self._thread.is_alive()):
             self._done_ns = now_ns
-            self._beside = threading.Thread(target=self._run, name="sync", daemon=True)
-            self._beside.start()
+            self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+            self._thread.start()
 
     def _run(self) -> None:
         try:
@@ -131,18 +128,18 @@ class FileSync:
             self._trouble = error
 
     def wait(self) -> None:
-        """Returns once nothing is under way beside; after it the file may be closed."""
-        if self._beside is not None:
-            self._beside.join()
+        """Waits for the thread; then the file may be closed."""
+        if self._thread is not None:
+            self._thread.join()
 
 
 def _datasync(descriptor: int) -> None:
-    """Puts a file's content onto the disk, and as much of what is known of it as reading it back needs."""
+    """Puts a file's content onto the disk, and its metadata as far as reading it back needs them."""
     getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
-"""Room that is kept for the accounts."""
+"""Space that is reserved for the accounts."""
 _ELSEWHERE = "take another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
@@ -153,35 +150,25 @@ _ADVICE = {
 }
 
 
-class ReservedSpace(Protocol):
-    """What keeps room on the disk, see `Ballast`."""
-
-    def grow(self, size: int) -> None:
-        """Keeps room for so many bytes."""
-
-    def release(self) -> None:
-        """Gives it back."""
-
-
 class LogFile:
-    """A file that is written in order and survives whatever ends that.
+    """A file that is written in order and survives any end of its writer.
 
-    What is written stays in memory until `flush`, so that the file always ends where a flush ended.
+    Written data stay in memory until `flush`, so that the file always ends at the end of a flush.
 
     Args:
-        path: its name once it is whole.
-        force: whether it may replace what exists.
-        durable: whether every flush puts it onto the disk; else that happens once a second, beside.
-        working: its name until then; by default `active(path)`.
-        room: what keeps room for its end; by default a `Ballast` beside it.
+        path: its name once it is complete.
+        force: True if it may replace a file.
+        durable: True if every flush syncs it; else that happens once a second, in a thread.
+        working: its name until then; by default `active_path(path)`.
+        room: space reserved for its end; by default a `DiskReserve` in its folder.
         opened: opens a file without a buffer, by name and mode.
-        now_ns: the time.
+        now_ns: the clock.
 
     Attributes:
-        path: its name once it is whole.
+        path: its name once it is complete.
         working: its name until then.
-        size: how many bytes it has; all of them were flushed.
-        trouble: what the disk refused first, or None.
+        size: its bytes; all of them were flushed.
+        trouble: the first error of the disk, or None.
 
     Raises:
         UsageError: it exists, or cannot be made.
@@ -204,7 +191,7 @@ class LogFile:
         self._force = force
         try:
             refuse_existing(path, force=force, unfinished=self.working)
-            self._raw = (opened or _opened)(self.working, "wb" if force else "xb")
+            self._raw = (opened or _open_unbuffered)(self.working, "wb" if force else "xb")
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
         sync_folder(path.parent)
@@ -221,15 +208,15 @@ class LogFile:
         return len(data)
 
     def reserve(self, size: int) -> None:
-        """Is told how many bytes the end of the file will take."""
+        """Sets how many bytes the end of the file will take."""
         self._owed = size
 
     def flush(self) -> None:
         """Hands everything to the operating system, in one piece where it takes that.
 
         Raises:
-            OSError: the disk refuses. The first time, what was pending has been written all the same if the
-                room that was kept for it sufficed. The end of the file may follow, and nothing else.
+            OSError: the disk refuses. The first time, pending data have been written all the same if the
+                reserved space sufficed. The end of the file may follow, and nothing else.
         """
         if self._broken and self.trouble:
             raise self.trouble
@@ -238,7 +225,7 @@ class LogFile:
                 self._room.grow(len(self._pending) + self._owed + RESERVE_MARGIN_BYTES)
             self._put()
             if not self.trouble:
-                self._syncing.due()
+                self._syncing.sync_new()
         except OSError as error:
             self.trouble = self.trouble or error
             self._room.release()
@@ -249,7 +236,7 @@ class LogFile:
             raise
 
     def _put(self) -> None:
-        """Writes what is pending, or the rest of it."""
+        """Writes pending data, or the rest of them."""
         while self._done < len(self._pending):
             taken = self._raw.write(memoryview(self._pending)[self._done :])
             if not taken:
@@ -260,7 +247,7 @@ class LogFile:
         self._pending, self._done = bytearray(), 0
 
     def _cut(self) -> None:
-        """Takes back what could not be written whole: the file ends where the last flush ended."""
+        """Removes what was written in part: the file ends at the end of the last flush."""
         self._broken = True
         self._pending, self._done = bytearray(), 0
         with suppress(OSError):
@@ -268,11 +255,11 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True once the file ends with its end mark."""
+        """True once the file ends with the end mark."""
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
-        """Closes the file, and gives it its name if it is whole; what is empty is removed.
+        """Closes the file, and gives it its name if it is complete; an empty one is removed.
 
         Raises:
             UsageError: its name is taken by now.
@@ -299,19 +286,18 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it, whatever is in it."""
+        """Closes the file and removes it."""
         with suppress(OSError):
             self.close()
         self.working.unlink(missing_ok=True)
         self.size = 0
 
     def refused(self, error: OSError) -> LogRefused:
-        """Returns what to say of a file that the disk refused, once it is closed."""
+        """Returns the error of a file that the disk refused, once it is closed."""
         what, advice = _ADVICE.get(error.errno or 0, (error.strerror or str(error), _ELSEWHERE))
         if self._published:
-            return LogRefused(
-                f"{self.path}: {what}; the log ends there, finished, with {_content(self.path)}; {advice}"
-            )
+            content = _describe_content(self.path)
+            return LogRefused(f"{self.path}: {what}; the log ends there, finished, with {content}; {advice}")
         if not self.size:
             return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
         return LogRefused(
@@ -320,12 +306,11 @@ class LogFile:
         )
 
 
-def _opened(path: Path, mode: str) -> Any:
+def _open_unbuffered(path: Path, mode: str) -> Any:
     return path.open(mode, buffering=0)
 
 
-def _content(path: Path) -> str:
-    """Returns what is in a finished file, in words."""
+def _describe_content(path: Path) -> str:
     from mcap.reader import make_reader
 
     with path.open("rb") as stream:
@@ -342,14 +327,9 @@ def _content(path: Path) -> str:
 def open_new_log(path: Path, *, force: bool = False, durable: bool = False) -> Iterator[LogFile]:
     """Opens a log for writing; at the end closes it, and gives it its name if it was finished.
 
-    Args:
-        path: its name.
-        force: whether it may replace what exists.
-        durable: whether every flush puts it onto the disk.
-
     Raises:
         UsageError: it exists, or cannot be made.
-        LogRefused: the disk refused something; says what is kept, and where.
+        LogRefused: the disk refused; the text states what is kept, and where.
     """
     with close_log_file(LogFile(path, force=force, durable=durable)) as file:
         yield file
@@ -357,10 +337,10 @@ def open_new_log(path: Path, *, force: bool = False, durable: bool = False) -> I
 
 @contextmanager
 def close_log_file(file: LogFile) -> Iterator[LogFile]:
-    """Closes a log's file at the end, whatever ends it, and says what is kept where the disk refused.
+    """Closes a log's file at the end of a `with` statement, whatever ends it.
 
     Raises:
-        LogRefused: the disk refused something.
+        LogRefused: the disk refused; the text states what is kept, and where.
     """
     refused: LogRefused | None = None
     try:

@@ -4,6 +4,7 @@ Invariant: a channel that the filter excludes is neither in the file nor in its 
 states the filter. Provenance holds versions, commit and platform, but no path, time or host name.
 """
 
+import glob
 import platform
 import re
 import subprocess
@@ -22,19 +23,17 @@ from ..net.bus import matches_key
 from ..net.messages import Event, LinkStats, RecorderStats, State
 
 ACTIVE_SUFFIX = ".active"
-"""What a file's name ends with until it is whole."""
+"""Ending of a file's name until it is complete."""
 _NUMBER = re.compile(r"(.+)-(\d{3,})")
 
 
 def active_path(path: Path) -> Path:
-    """Returns where a log is while it is written."""
-    return (
-        path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
-    )  # "." is a folder, and refused as one
+    """Returns the name of a log while it is written; "." is a folder, and refused as one."""
+    return path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
 
 
 def describe_unfinished(path: Path) -> str:
-    """Returns what to say besides where a log is not there, but one that was not finished is; else ""."""
+    """Returns a hint at an unfinished log of a name that is not there; else ""."""
     if path.exists() or not active_path(path).exists():
         return ""
     torn = active_path(path)
@@ -52,7 +51,7 @@ def find_parts(path: Path) -> dict[int, Path]:
     for name in (path, active_path(path)):
         if name.exists():
             found.setdefault(1, name)
-    for name in sorted(path.parent.glob(f"{_literal(path.stem)}-*")):
+    for name in sorted(path.parent.glob(f"{glob.escape(path.stem)}-*")):
         bare = name.with_name(name.name.removesuffix(ACTIVE_SUFFIX))
         number = _NUMBER.fullmatch(bare.stem)
         if number and number[1] == path.stem and bare.suffix == path.suffix:
@@ -60,43 +59,33 @@ def find_parts(path: Path) -> dict[int, Path]:
     return found
 
 
-def _literal(text: str) -> str:
-    """Returns a text as a glob that matches nothing else."""
-    return re.sub(r"([*?\[])", r"[\1]", text)
-
-
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """What is taken.
-
-    Attributes:
-        include: key expressions of the only channels that are; none: all.
-        exclude: key expressions of channels that are not.
-    """
+    """Filter of channels by key expressions; an empty `include` takes all that `exclude` does not match."""
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
     def takes(self, key: str) -> bool:
-        """Says whether a channel is taken."""
+        """True if the filter takes a channel."""
         if any(matches_key(expression, key) for expression in self.exclude):
             return False
         return not self.include or any(matches_key(expression, key) for expression in self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Returns what the file says of it; nothing where all is taken."""
-        told = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
-        return {name: text for name, text in told.items() if text}
+        """Returns the filter as metadata of the session; {} if it takes all."""
+        texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
+        return {name: text for name, text in texts.items() if text}
 
 
 ALL_CHANNELS = ChannelFilter()
 
 
 def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
-    """Returns what a person asks for; a leading slash, as topics have it, is fine.
+    """Returns the filter for the options of a command; a leading slash, as topics have it, is ignored.
 
     Raises:
-        UsageError: a text is no key expression: it would match nothing, and say nothing.
+        UsageError: a text is no key expression; it would silently match nothing.
     """
     for option, texts in (("--include", include), ("--exclude", exclude)):
         for text in texts:
@@ -119,7 +108,7 @@ _PACKAGES = ("trilat-net", "numpy", "numba", "msgpack", "msgspec", "mcap", "ecli
 
 
 def _git(*arguments: str) -> str | None:
-    """Returns what git prints about this source tree, or None where it is no checkout."""
+    """Returns the output of git for this source tree, or None if it is no checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -134,7 +123,7 @@ def _git(*arguments: str) -> str | None:
 
 @cache
 def collect_provenance() -> dict[str, str]:
-    """Returns what a log must say of the program that made it."""
+    """Returns versions, commit and platform of the program."""
     commit = _git("rev-parse", "HEAD")
     changed = _git("status", "--porcelain", "--untracked-files=no")
     facts = {

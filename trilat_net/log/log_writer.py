@@ -46,15 +46,15 @@ class LogWriter:
     """One log, from its header to its last account.
 
     Args:
-        stream: where the bytes go, opened for writing.
+        stream: receives the bytes.
         scenario: the resolved scenario.
         session: the session's name.
         driver: "live" or "virtual".
         epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
-        facts: what else to say of the session.
-        part: which part of a log this is, where it has several.
-        choice: which channels it takes.
-        views_hz: messages a second of the standard channels beside its own, see `views`; 0 for none.
+        facts: further metadata of the session.
+        part: metadata of a part of a log.
+        choice: the channels that it takes.
+        views_hz: messages a second of the channels for viewers, see `VizChannels`; 0 for none.
 
     Raises:
         LogRefused: the disk refused.
@@ -74,13 +74,13 @@ class LogWriter:
         views_hz: float = 0.0,
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
-        self._over = ""  # why nothing more can be added
+        self._ended = ""  # why nothing more can be added
         self._views = (
             VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view) if views_hz else None
         )
         self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
-        self._standard: dict[str, int] = {}  # what there is of standard schemas and channels
+        self._standard: dict[str, int] = {}  # standard schemas and channels in the file
         self._file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}")
         about = {
             "schema_version": str(VERSION),
@@ -103,7 +103,7 @@ class LogWriter:
             self._file.flush()
 
     def _register(self, scenario: Scenario, session: str, choice: ChannelFilter) -> dict[str, int | None]:
-        """Returns the channel of every key of the session; None where it is not to be taken."""
+        """Registers the channels of the session; returns them by key, None for those that are excluded."""
         schemas = {
             name: self._file.register_schema(
                 f"trilat.{kind.__name__}.v{VERSION}", "jsonschema", json.dumps(json_schema(kind)).encode()
@@ -129,22 +129,22 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True once nothing more can be added: it is finished, or the disk has refused."""
-        return bool(self._over)
+        """True once nothing more can be added: it is finished, or the disk refused."""
+        return bool(self._ended)
 
     @property
     def messages(self) -> int:
-        """How many messages it has."""
+        """Number of messages."""
         return self._file.messages
 
     @property
     def written_bytes(self) -> int:
-        """How many bytes were written so far."""
+        """Number of bytes written so far."""
         return self._file.position
 
     @property
     def most_bytes(self) -> int:
-        """How long the file would be at most, its accounts aside, if it were finished now."""
+        """Largest length of the file without its accounts, if it were finished now."""
         views = MAX_PENDING_BYTES * len(self._views.lanes) if self._views is not None else 0
         return self._file.position + self._file.pending + self._file.owed + views
 
@@ -160,18 +160,18 @@ class LogWriter:
         """Writes one message, if the log takes its channel.
 
         Args:
-            key: its key: a channel of the session.
+            key: key of its channel.
             payload: its bytes.
             t_ns: when it was sent, ns since the epoch.
             log_time_ns: when it arrived, Unix ns.
             number: its sequence number.
-            message: what it says, for those who cannot read its bytes.
+            message: the decoded message, for the channels for viewers.
 
         Raises:
             LogRefused: the disk refused, now (then this message is the last one) or before.
         """
-        if self._over:
-            raise LogRefused(self._over)
+        if self._ended:
+            raise LogRefused(self._ended)
         channel = self._channels[key]
         if channel is None:
             return
@@ -188,7 +188,7 @@ class LogWriter:
             raise self._refused(error) from None
 
     def _put_view(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Writes a message of a standard channel, which is made when its first one comes."""
+        """Writes a message of a standard channel, which is registered with its first one."""
         channel = self._standard.get(topic)
         if channel is None and self._views is not None:
             kind, about = self._views.channels[topic]
@@ -213,15 +213,15 @@ class LogWriter:
         """Writes the accounts, the index and the end mark, once; the stream stays open.
 
         Args:
-            accounts: per topic what arrived and what is missing; and what else was counted, by name. Those
-                of channels that the log does not take are left out.
+            accounts: the accounts by topic, and other counts by name. Those of channels that the log does not
+                take are left out.
 
         Raises:
             LogRefused: the disk refused.
         """
-        if self._over == _FINISHED:
+        if self._ended == _FINISHED:
             return
-        whole, self._over = not self._over, _FINISHED
+        whole, self._ended = not self._ended, _FINISHED
         left_out = {f"/{key}" for key, channel in self._channels.items() if channel is None}
         with self._refusing():
             try:
@@ -244,29 +244,29 @@ class LogWriter:
         refused = LogRefused(
             f"the log cannot be written: {error.strerror}; what was flushed before is intact"
         )
-        self._over = self._over or str(refused)
+        self._ended = self._ended or str(refused)
         return refused
 
 
 _FINISHED = "the log is finished"
 
 ACCOUNTS_BYTES = 16 << 10
-"""Room that the accounts of a part may take, and the views that go with one message."""
+"""Space for the accounts of a part, and for the messages for viewers that one message causes."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Where a log goes, and how.
+    """Place and form of a log.
 
     Attributes:
         path: its name; parts add their number to it.
-        force: whether it may replace what exists.
-        durable: whether every flush puts it onto the disk.
-        split_bytes: no part is longer than this.
-        split_ns: nor does one take messages over a longer time.
-        carry_on: where there is a log of that name, finished or not, write the part after it.
-        choice: which channels it takes.
-        views_hz: messages a second of the standard channels beside its own, see `views`; 0 for none.
+        force: True if it may replace a file.
+        durable: True if every flush syncs it.
+        split_bytes: largest length of a part.
+        split_ns: longest time of a part.
+        carry_on: True to write the part after a log of that name, finished or not.
+        choice: the channels that it takes.
+        views_hz: messages a second of the channels for viewers, see `VizChannels`; 0 for none.
     """
 
     path: Path
@@ -280,11 +280,11 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """Whether it is to have parts from the start."""
+        """True if it has parts from the start."""
         return self.split_bytes is not None or self.split_ns is not None
 
     def first(self) -> tuple[int, str]:
-        """Returns the number of the part to begin with, 0 for a log without parts; and which is before it.
+        """Returns the number of the part to begin with, 0 for a log without parts, and the part before it.
 
         Raises:
             UsageError: the name is taken, and not just one of `force` and `carry_on` is given.
@@ -315,7 +315,7 @@ def make_log_storage(
     durable: bool,
     views_hz: float = 0.0,
 ) -> LogStorage:
-    """Returns what a person asks for; see `Storage`.
+    """Returns the storage for the options of a command.
 
     Raises:
         UsageError: a part cannot be that small or that large.
@@ -337,15 +337,15 @@ def make_log_storage(
 
 
 class LogParts:
-    """A `LogWriter` over as many files as it takes; to be used in a `with` statement.
+    """A `LogWriter` over as many files as it takes; for use in a `with` statement.
 
     Args:
-        storage: where it goes.
-        begin: begins the log in a file; told what to say of the part, nothing of a log without parts.
-        opened: opens a file by name; else `LogFile`.
+        storage: place and form of the log.
+        begin: begins the log in a file, with the metadata of the part ({} for a log without parts).
+        opened: opens a file by name; by default `LogFile`.
 
     Attributes:
-        so_far: the accounts, to stand in a part that is full.
+        so_far: returns the accounts for a part that is full.
 
     Raises:
         UsageError: the name is taken, or the file cannot be made.

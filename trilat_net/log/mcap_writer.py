@@ -28,25 +28,25 @@ _OWED_ALWAYS = 512  # statistics without its counts, offsets of six groups, data
 
 
 class Sink(Protocol):
-    """Where bytes go: any file, or what keeps them until `flush`."""
+    """A file, or a buffer that keeps bytes until `flush`."""
 
     def write(self, data: bytes, /) -> int:
         """Takes bytes and returns how many."""
 
     def flush(self) -> None:
-        """Hands them on."""
+        """Writes them."""
 
 
 @runtime_checkable
 class ReservingSink(Protocol):
-    """A `Sink` that can keep room for what is still to come."""
+    """A `Sink` that can reserve space for the end of the file."""
 
     def reserve(self, size: int) -> None:
-        """Is told how many bytes the end of the file will take."""
+        """Sets how many bytes the end of the file will take."""
 
 
 def pack_text(text: str) -> bytes:
-    """Returns a text as a record holds it: its length before it."""
+    """Returns a text as a record holds it, after its length."""
     data = text.encode()
     return struct.pack("<I", len(data)) + data
 
@@ -58,7 +58,7 @@ def pack_text_map(texts: Mapping[str, str]) -> bytes:
 
 
 def pack_record(opcode: int, body: bytes) -> bytes:
-    """Returns a record: its kind and its length before it."""
+    """Returns a record: the content after opcode and length."""
     return RECORD_HEAD.pack(opcode, len(body)) + body
 
 
@@ -66,14 +66,14 @@ class McapWriter:
     """One file, from its first byte to its end mark.
 
     Args:
-        stream: where the bytes go. It is flushed whenever a chunk is whole.
-        library: what made it.
+        stream: receives the bytes; it is flushed whenever a chunk is complete.
+        library: name of the program.
         profile: the MCAP profile.
         chunk_bytes: a chunk is closed when its records are longer than this.
 
     Attributes:
-        position: how many bytes were written.
-        messages: how many messages were added.
+        position: number of bytes written.
+        messages: number of messages added.
     """
 
     def __init__(self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = CHUNK_BYTES) -> None:
@@ -104,19 +104,14 @@ class McapWriter:
 
     @property
     def owed(self) -> int:
-        """How many bytes `finish` will still write, at most, the open chunk aside."""
-        kept = (
-            self._schemas,
-            self._channels,
-            self._chunk_index,
-            self._attachment_index,
-            self._metadata_index,
-        )
-        return sum(map(len, kept)) + 10 * len(self._counts) + _OWED_ALWAYS
+        """Most bytes that `finish` will write besides the open chunk."""
+        indexes = self._chunk_index, self._attachment_index, self._metadata_index
+        definitions = len(self._schemas) + len(self._channels)
+        return definitions + sum(map(len, indexes)) + 10 * len(self._counts) + _OWED_ALWAYS
 
     @property
     def pending(self) -> int:
-        """How many bytes the open chunk will take, at most."""
+        """Most bytes that the open chunk will take."""
         if not self._open:
             return 0
         index = 16 * (self.messages - self._closed) + 25 * len(self._entries) + 200
@@ -140,14 +135,7 @@ class McapWriter:
     def register_channel(
         self, topic: str, message_encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
     ) -> int:
-        """Writes a channel and returns its number. It stands before the open chunk, and in the index.
-
-        Args:
-            topic: its topic.
-            message_encoding: how its messages are encoded.
-            schema_id: number of their schema, 0 for none.
-            metadata: what else to say of it.
-        """
+        """Writes a channel and returns its number; it precedes the open chunk. Schema 0 stands for none."""
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id) + pack_text(topic) + pack_text(message_encoding)
         record = pack_record(Opcode.CHANNEL, body + pack_text_map(metadata or {}))
@@ -160,15 +148,7 @@ class McapWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Adds a message to the open chunk.
-
-        Args:
-            channel_id: number of its channel.
-            log_time: when it was logged, ns.
-            data: its bytes.
-            publish_time: when it was published, ns.
-            sequence: its number.
-        """
+        """Adds a message to the open chunk; times are in ns."""
         opened = self._open
         self._entries[channel_id] += (log_time, len(opened))
         opened += _MESSAGE.pack(OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time)
@@ -188,15 +168,7 @@ class McapWriter:
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Writes an attachment, before the open chunk.
-
-        Args:
-            create_time: when it was made, ns; 0 where that is unknown.
-            log_time: when it was attached, ns.
-            name: its name.
-            media_type: its media type.
-            data: its bytes.
-        """
+        """Writes an attachment, before the open chunk; times are in ns, 0 if unknown."""
         times = struct.pack("<QQ", log_time, create_time)
         names = pack_text(name) + pack_text(media_type)
         body = times + names + struct.pack("<Q", len(data)) + data
@@ -225,7 +197,8 @@ class McapWriter:
         offset = self._put(record)
         begin, places = self.position, b""
         for channel, entries in used.items():
-            place = self._put(_index_of(channel, entries))
+            body = struct.pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
+            place = self._put(pack_record(Opcode.MESSAGE_INDEX, body))
             places += struct.pack("<HQ", channel, place)
             self._entries[channel] = []
         times = struct.pack("<QQQQ", start_ns, end_ns, offset, len(record))
@@ -277,9 +250,3 @@ class McapWriter:
         crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
         self._put(footer + struct.pack("<I", crc) + MAGIC)
         self._stream.flush()
-
-
-def _index_of(channel: int, entries: list[int]) -> bytes:
-    """Returns the index of a channel's messages in a chunk."""
-    body = struct.pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
-    return pack_record(Opcode.MESSAGE_INDEX, body)
