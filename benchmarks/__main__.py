@@ -5,6 +5,7 @@ import sys
 from . import (
     analysis,
     clocks,
+    cluster,
     crashes,
     endurance,
     fused,
@@ -29,6 +30,7 @@ BENCHMARKS = {
 LONG = {
     "analysis": analysis.run,
     "clocks": clocks.run,
+    "cluster": cluster.run,
     "crashes": crashes.run,
     "presets": presets.run,
     "reading": reading.run,

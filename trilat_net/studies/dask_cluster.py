@@ -63,13 +63,7 @@ class WorkerRequirements(NamedTuple):
 
 
 def find_unfit(required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
-    """Returns why a worker is refused, or "".
-
-    Args:
-        required: what it must have.
-        identity: what it is.
-        lacks: the laws that it has not, as it says.
-    """
+    """Returns why a worker is refused, or ""."""
     here = required.identity
     different = [name for name in here if name != "commit" and identity.get(name) != here[name]]
     if different:

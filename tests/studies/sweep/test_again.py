@@ -38,8 +38,8 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResul
         assert done.code == (0 if outcome.diverged_s is None else 1), done
         log = open_log(tmp_path / words[-1])
         seen = classify_log_end(log)
-        assert seen.end.end_error_rad == outcome.end_error_rad
-        assert seen.end.end_speed_rad_s == outcome.end_speed_rad_s
+        assert seen.end_error_rad == outcome.end_error_rad
+        assert seen.end_speed_rad_s == outcome.end_speed_rad_s
         assert CLASS_OF_MOTION[seen.behaviour] is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad

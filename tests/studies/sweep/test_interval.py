@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from trilat_net.studies.sweep.sweep_results import wilson_interval
 
@@ -17,26 +15,6 @@ from trilat_net.studies.sweep.sweep_results import wilson_interval
 def test_intervals_are_those_of_a_published_table(successes: int, runs: int, low: float, high: float) -> None:
     """Newcombe, Statistics in Medicine 17 (1998), table I, the score method without continuity correction."""
     assert wilson_interval(successes, runs) == pytest.approx((low, high), abs=5.1e-5)
-
-
-@given(runs=st.integers(1, 5000), data=st.data())
-def test_the_ends_are_the_shares_at_which_what_was_seen_is_just_196_deviations_away(
-    runs: int, data: st.DataObject
-) -> None:
-    seen = data.draw(st.integers(0, runs))
-    for end in wilson_interval(seen, runs):
-        if 0.0 < end < 1.0:
-            away = abs(seen / runs - end) / math.sqrt(end * (1.0 - end) / runs)
-            assert away == pytest.approx(1.959964, rel=1e-6)
-
-
-@given(runs=st.integers(0, 5000), data=st.data())
-def test_an_interval_holds_what_was_seen_and_mirrors(runs: int, data: st.DataObject) -> None:
-    seen = data.draw(st.integers(0, runs))
-    low, high = wilson_interval(seen, runs)
-    assert 0.0 <= low <= (seen / runs if runs else 0.5) <= high <= 1.0
-    mirrored = wilson_interval(runs - seen, runs)
-    assert (1.0 - mirrored.high, 1.0 - mirrored.low) == pytest.approx((low, high), abs=1e-12)
 
 
 @pytest.mark.parametrize("runs", [10, 20, 100])
@@ -52,8 +30,5 @@ def test_the_truth_lies_inside_95_times_of_100_on_the_average_over_shares(runs: 
     assert held.min() > 0.83
 
 
-def test_without_runs_nothing_is_known_and_more_than_all_is_no_share() -> None:
+def test_without_runs_nothing_is_known() -> None:
     assert wilson_interval(0, 0) == (0.0, 1.0)
-    for successes, runs in ((2, 1), (-1, 3)):
-        with pytest.raises(ValueError, match="no share"):
-            wilson_interval(successes, runs)

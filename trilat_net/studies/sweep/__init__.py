@@ -10,8 +10,7 @@ From Python:
     [row["verdict"] for row in results.of_cell(17)]
 
 In a folder that holds the same sweep, `run_sweep` continues from its journal; `read_results` reads a finished
-one. Worker processes import the calling script first: put its own work under `if __name__ == "__main__":`,
-or pass `jobs=1`.
+one. `on="tcp://SCHEDULER:8786"` runs the cells on a Dask cluster.
 """
 
 from .sweep_folder import open_sweep_folder, prepare_sweep_folder

@@ -106,13 +106,7 @@ def choose_cells_near_edges(
 
 
 def confirm_cell(row: CellRow, run: SessionRunner, longest_s: float = MAX_SESSION_S) -> ConfirmedCell:
-    """Runs a cell over a network and compares verdicts.
-
-    Args:
-        row: the cell, with "scenario", its text.
-        run: runs a session.
-        longest_s: how long a session may be, s.
-    """
+    """Runs a cell over a network and compares verdicts."""
     virtual = CellClass(row["verdict"])
     extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
     scenario = parse_scenario(row["scenario"])

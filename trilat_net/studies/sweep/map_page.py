@@ -69,13 +69,7 @@ _STRIP_IN = 0.7
 
 
 def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], form: FigureSize) -> Figure:
-    """Returns the figure of a plane.
-
-    Args:
-        plane: what became of its places.
-        lines: per panel the lines to draw on it.
-        form: what it is drawn for.
-    """
+    """Returns the figure of a plane."""
     columns = _columns(len(plane.panels), form)
     rows = -(-len(plane.panels) // columns)
     each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
@@ -284,12 +278,6 @@ def write_map(
 ) -> list[Path]:
     """Writes a map into a folder that exists, and returns the paths.
 
-    Args:
-        chart: the map.
-        folder: where to.
-        width_in: 3.5 for one column, 7 for two, in.
-        name: of the files, before their suffix.
-
     Raises:
         UsageError: there is no such width.
     """
@@ -303,12 +291,7 @@ def write_map(
 
 
 def build_map_page(chart: StabilityMap, picture: str) -> str:
-    """Returns the page of a map, as Markdown.
-
-    Args:
-        chart: the map.
-        picture: name of the figure's file.
-    """
+    """Returns the page of a map, as Markdown."""
     parts = [f"# {chart.title}", "```sh\n" + "\n".join(chart.commands) + "\n```", f"![map]({picture})"]
     parts.append(tabulate_classes(chart.plane).markdown())
     if meanings := _meanings(chart):
@@ -366,12 +349,7 @@ def _meanings(chart: StabilityMap) -> list[str]:
 
 
 def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
-    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is.
-
-    Args:
-        found: the cells.
-        axes: the keys of the axes.
-    """
+    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is."""
     heads = ("cell", *map(label_axis, axes), "seed", "virtual", "live", "", "the log shows", "log")
     rows = []
     for one in found:

@@ -48,12 +48,7 @@ _GAINS = {
 
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
-    """Returns the label of an axis, as "delay (ms)" for link.delay_ms.
-
-    Args:
-        key: dotted, as an override names it.
-        scenario: whose key, for the words of what is told by a number, as a wall.
-    """
+    """Returns the label of an axis, as "delay (ms)" for link.delay_ms."""
     words, unit = describe_key(key, scenario)
     return f"{words} ({unit})" if unit else words
 

@@ -199,23 +199,23 @@ class GridPointMargin(NamedTuple):
     closed: float | None
 
 
-def parse_search_range(asked: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
+def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
     """Returns the range that a text such as "control.d=0.2:3" names.
 
     Raises:
         UsageError: it names none.
     """
-    key, _, text = asked.partition("=")
-    low, colon, high = text.partition(":")
+    key, _, ends = text.partition("=")
+    low, colon, high = ends.partition(":")
     try:
         found = SearchRange(key.strip(), float(low), float(high), tolerance)
     except ValueError:
-        raise UsageError(f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {asked!r}") from None
+        raise UsageError(f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {text!r}") from None
     if not 0.0 < tolerance < 1.0:
         raise UsageError(f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}")
     if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
         raise UsageError(
-            f"--margin reads KEY=FROM:TO with FROM below TO, as in control.d=0.2:3, not {asked!r}"
+            f"--margin reads KEY=FROM:TO with FROM below TO, as in control.d=0.2:3, not {text!r}"
         )
     return found
 
@@ -226,7 +226,7 @@ def format_range_axis(found: SearchRange) -> str:
 
 
 def search_margins(
-    asked: SweepPlan,
+    plan: SweepPlan,
     within: SearchRange,
     jobs: int | None = None,
     progress: Progress = ignore_progress,
@@ -234,21 +234,14 @@ def search_margins(
 ) -> list[GridPointMargin]:
     """Returns the edges of every place of a plan and every seed.
 
-    Args:
-        asked: the plan; its last axis is the two ends of the range.
-        within: the range.
-        jobs: in how many processes; None for one per core.
-        progress: told how many places are done, and how many there are.
-        on: what searches them instead: a Dask scheduler's address or an executor.
-
     Raises:
         ScenarioError: some value makes no scenario.
         RunFailed: a process was ended.
     """
-    cells = [asked.cell(first) for first in range(0, asked.cells, 2)]
-    places = [(cell, seed) for cell in cells for seed in _seeds(asked, cell)]
+    cells = [plan.cell(first) for first in range(0, plan.cells, 2)]
+    places = [(cell, seed) for cell in cells for seed in _seeds(plan, cell)]
     searches = [
-        MarginTask(asked.written, cell.overrides[:-1], seed, asked.longest_s, within) for cell, seed in places
+        MarginTask(plan.written, cell.overrides[:-1], seed, plan.longest_s, within) for cell, seed in places
     ]
     with open_worker_pool(jobs, on, most=len(searches)) as pool:
         findings = pool.map(search_margin_task, searches, progress)
@@ -258,9 +251,9 @@ def search_margins(
     ]
 
 
-def _seeds(asked: SweepPlan, cell: SweepCell) -> Sequence[int]:
+def _seeds(plan: SweepPlan, cell: SweepCell) -> Sequence[int]:
     """Returns the seeds of a place: one alone where nothing is random."""
-    return asked.seeds if asked.written.scenario(*cell.overrides).random else asked.seeds[:1]
+    return plan.seeds if plan.written.scenario(*cell.overrides).random else plan.seeds[:1]
 
 
 def search_margin_task(one: MarginTask) -> MarginFinding:
@@ -294,23 +287,17 @@ def _fractions(at: Callable[[float], Scenario], within: SearchRange) -> bool:
     return True
 
 
-def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> TextTable:
-    """Returns margins as a table, a row per edge, or per place that has none.
-
-    Args:
-        asked: the plan whose last axis is the range.
-        within: the range.
-        found: per place what was found.
-    """
-    axes = asked.axes[:-1]
+def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> TextTable:
+    """Returns margins as a table, a row per edge, or per place that has none."""
+    axes = plan.axes[:-1]
     seeds = len({one.seed for one in found}) > 1
     closed = any(one.closed is not None for one in found)
-    heads = [*(label_axis(axis.key, asked.base) for axis in axes), *(["law"] if asked.laws else [])]
-    heads += [*(["seed"] if seeds else []), f"edge of {label_axis(within.key, asked.base)}", "stable is"]
+    heads = [*(label_axis(axis.key, plan.base) for axis in axes), *(["law"] if plan.laws else [])]
+    heads += [*(["seed"] if seeds else []), f"edge of {label_axis(within.key, plan.base)}", "stable is"]
     heads += ["linear", "difference", *(["closed form", "difference"] if closed else []), "runs"]
     rows = []
     for one in found:
-        place = [_text(value) for value in one.cell.values] + ([one.cell.law] if asked.laws else [])
+        place = [_text(value) for value in one.cell.values] + ([one.cell.law] if plan.laws else [])
         place += [str(one.seed)] if seeds else []
         for span in one.margin.spans or (None,):
             cells = [
@@ -323,18 +310,12 @@ def tabulate_margins(asked: SweepPlan, within: SearchRange, found: Sequence[Grid
     return TextTable(tuple(heads), rows)
 
 
-def build_margin_page(asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:
-    """Returns margins as a page in Markdown.
-
-    Args:
-        asked: the plan whose last axis is the range.
-        within: the range.
-        found: per place what was found.
-    """
-    command = build_margin_command(asked, within)
+def build_margin_page(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:
+    """Returns margins as a page in Markdown."""
+    command = build_margin_command(plan, within)
     remarks = dict.fromkeys(one.remark for one in found if one.remark)
-    parts = [f"# {asked.base.title or asked.base.name}: margin", f"```sh\n{command}\n```"]
-    parts.append(tabulate_margins(asked, within, found).markdown())
+    parts = [f"# {plan.base.title or plan.base.name}: margin", f"```sh\n{command}\n```"]
+    parts.append(tabulate_margins(plan, within, found).markdown())
     parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
     islands = sum(len(one.margin.spans) > 1 for one in found)
     if islands:
@@ -344,20 +325,12 @@ def build_margin_page(asked: SweepPlan, within: SearchRange, found: Sequence[Gri
     return "\n\n".join(parts) + "\n"
 
 
-def margins_to_json(
-    asked: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]
-) -> dict[str, Any]:
-    """Returns margins as plain values, for JSON.
-
-    Args:
-        asked: the plan whose last axis is the range.
-        within: the range.
-        found: per place what was found.
-    """
-    keys = [axis.key for axis in asked.axes[:-1]]
+def margins_to_json(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> dict[str, Any]:
+    """Returns margins as plain values, for JSON."""
+    keys = [axis.key for axis in plan.axes[:-1]]
     return {
-        "command": build_margin_command(asked, within),
-        "scenario_sha256": asked.base.sha256,
+        "command": build_margin_command(plan, within),
+        "scenario_sha256": plan.base.sha256,
         "key": within.key,
         "low": within.low,
         "high": within.high,
@@ -365,7 +338,7 @@ def margins_to_json(
         "places": [
             {
                 **dict(zip(keys, one.cell.values, strict=True)),
-                **({"law": one.cell.law} if asked.laws else {}),
+                **({"law": one.cell.law} if plan.laws else {}),
                 "seed": one.seed,
                 "edges": [span._asdict() for span in one.margin.spans],
                 "stable_everywhere": one.margin.stable,
@@ -380,11 +353,11 @@ def margins_to_json(
     }
 
 
-def build_margin_command(asked: SweepPlan, within: SearchRange) -> str:
+def build_margin_command(plan: SweepPlan, within: SearchRange) -> str:
     """Returns the command that searches margins."""
     reach = f"{within.key}={format_override_value(within.low)}:{format_override_value(within.high)}"
     words = ["--margin", reach, "--tolerance", format_override_value(within.tolerance)]
-    return build_sweep_command(asked._replace(axes=asked.axes[:-1]), *words)
+    return build_sweep_command(plan._replace(axes=plan.axes[:-1]), *words)
 
 
 def _text(value: float | str) -> str:

@@ -68,24 +68,16 @@ def build_stability_map(
 ) -> StabilityMap:
     """Returns the map of results.
 
-    Args:
-        results: a sweep that was run.
-        commands: what makes them.
-        jobs: in how many processes the linear analysis works; None for one per core.
-        progress: told how many columns of it are done, and how many there are.
-        linearly: whether its line is wanted.
-        on: what does the linear analysis instead: a Dask scheduler's address or an executor.
-
     Raises:
         UsageError: there is nothing to draw, or too many panels.
     """
-    asked = results.plan
-    keys = [*([LAW_AXIS] if len(asked.laws) > 1 else []), *(one.key for one in asked.axes)]
-    drawn = build_plane(results.rows, keys, asked.base)
-    title = asked.base.title or asked.base.name
+    plan = results.plan
+    keys = [*([LAW_AXIS] if len(plan.laws) > 1 else []), *(one.key for one in plan.axes)]
+    drawn = build_plane(results.rows, keys, plan.base)
+    title = plan.base.title or plan.base.name
     if not drawn.y.key or len(drawn.y.values) < 2:
         return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
-    at = [panel_scenarios(asked, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
+    at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
     lines = [[trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
     remarks: dict[str, None] = {}
     if linearly:
@@ -116,40 +108,28 @@ def _column(task: tuple[PanelScenarios, float, tuple[float, ...]]) -> GrowthColu
     return compute_growth_rates([at.scenario(x, y) for y in values])
 
 
-def panel_scenarios(asked: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
-    """Returns what makes the scenario of any place of a panel.
-
-    Args:
-        asked: the sweep.
-        panel: one of its planes.
-        x: the key to the right.
-        y: the key upwards.
-    """
+def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
+    """Returns what makes the scenario of any place of a panel."""
     settings = dict(panel.settings)
-    law = settings.pop(LAW_AXIS, asked.laws[0] if asked.laws else None)
-    fixed = () if law is None else asked.law_overrides[asked.laws.index(law)]
+    law = settings.pop(LAW_AXIS, plan.laws[0] if plan.laws else None)
+    fixed = () if law is None else plan.law_overrides[plan.laws.index(law)]
     others = tuple(format_override(key, value) for key, value in settings.items())
-    return PanelScenarios(asked.written, (*fixed, *others), x, y)
+    return PanelScenarios(plan.written, (*fixed, *others), x, y)
 
 
-def build_sweep_command(asked: SweepPlan, *more: str) -> str:
-    """Returns the command that makes a sweep.
-
-    Args:
-        asked: the sweep.
-        *more: further words.
-    """
-    words = ["trilat", "sweep", asked.written.source]
-    words += [word for text in asked.written.overrides for word in ("--set", text)]
-    words += [word for one in asked.axes for word in ("--over", one.asked)]
-    own, count = asked.base.seed, len(asked.seeds)
-    if asked.seeds == tuple(range(own, own + count)):
+def build_sweep_command(plan: SweepPlan, *more: str) -> str:
+    """Returns the command that makes a sweep."""
+    words = ["trilat", "sweep", plan.written.source]
+    words += [word for text in plan.written.overrides for word in ("--set", text)]
+    words += [word for one in plan.axes for word in ("--over", one.asked)]
+    own, count = plan.base.seed, len(plan.seeds)
+    if plan.seeds == tuple(range(own, own + count)):
         words += ["--seeds", str(count)] if count > 1 else []
     else:
-        words += ["--seeds", ",".join(map(str, asked.seeds)) + ("," if count == 1 else "")]
-    words += ["--law", ",".join(asked.laws)] if asked.laws else []
-    if asked.longest_s != min(MAX_SCENARIO_S, MAX_EXTENSION * asked.base.duration_s):
-        words += ["--longest", format_override_value(asked.longest_s)]
+        words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
+    words += ["--law", ",".join(plan.laws)] if plan.laws else []
+    if plan.longest_s != min(MAX_SCENARIO_S, MAX_EXTENSION * plan.base.duration_s):
+        words += ["--longest", format_override_value(plan.longest_s)]
     return shlex.join([*words, *more])
 
 

@@ -23,12 +23,7 @@ LineDiff = tuple[str | tuple[int, int], ...]
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Returns a text as lines of another one and lines of its own.
-
-    Args:
-        text: the text.
-        base: one that is like it.
-    """
+    """Returns a text as lines of another one and lines of its own."""
     places: dict[str, int] = {}
     there = base.split("\n")
     for number, line in enumerate(there):
@@ -46,12 +41,7 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Returns the text again.
-
-    Args:
-        parts: what `delta` made of it.
-        base: the text that it was compared with.
-    """
+    """Returns the text again."""
     there = base.split("\n")
     lines: list[str] = []
     for part in parts:
@@ -199,15 +189,7 @@ def join_law_names(scenario: Scenario) -> str:
 def build_sim_command(
     written: SweepSource, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
-    """Returns the command that makes a log of a run.
-
-    Args:
-        written: the experiment.
-        overrides: of the cell.
-        seed: of the run.
-        duration_s: how long it runs, s.
-        log: the name of the file.
-    """
+    """Returns the command that makes a log of a run."""
     settings = [text for text in (*written.overrides, *overrides) if _key(text) not in ("seed", "duration_s")]
     words = [word for text in settings for word in ("--set", text)]
     lasts = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]

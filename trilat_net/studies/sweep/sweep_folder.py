@@ -147,22 +147,18 @@ class SweepFolder(NamedTuple):
         return SweepJournal(self.path / JOURNAL_FILE, hashlib.sha256(_text(self.facts).encode()).hexdigest())
 
 
-def prepare_sweep_folder(asked: SweepPlan, path: Path | None) -> SweepFolder:
+def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
     """Returns the folder of a sweep, made, or as it was left.
-
-    Args:
-        asked: the sweep.
-        path: where; None for the next free one below runs.
 
     Raises:
         UsageError: it holds something else, or another sweep, or cannot be made.
     """
-    facts = {**asked.facts(), **_made_with()}
+    facts = {**plan.facts(), **_made_with()}
     if path is not None and (path / PLAN_FILE).exists():
         return _resume_same(path, facts)
-    chosen = make_results_folder(path, f"sweep-{asked.base.name}", force=False)
+    chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=False)
     write_whole(chosen / PLAN_FILE, _text(facts), remedy=build_resume_hint(chosen))
-    return SweepFolder(chosen, asked, facts)
+    return SweepFolder(chosen, plan, facts)
 
 
 def open_sweep_folder(path: Path) -> SweepFolder:
@@ -173,10 +169,10 @@ def open_sweep_folder(path: Path) -> SweepFolder:
         ScenarioError: its scenario cannot run here.
     """
     facts = _read(path)
-    asked = plan_from_json(facts)
-    now = {**asked.facts(), **_made_with()}
+    plan = plan_from_json(facts)
+    now = {**plan.facts(), **_made_with()}
     _refuse_other(path, facts, now)
-    return SweepFolder(path, asked, facts)
+    return SweepFolder(path, plan, facts)
 
 
 def _resume_same(path: Path, facts: Mapping[str, Any]) -> SweepFolder:

@@ -375,40 +375,40 @@ def _law_overrides(written: SweepSource, base: Scenario, law: str) -> tuple[str,
     return (f"control.law={law}", *(f"sites.{name}.control.law={law}" for name in own))
 
 
-def _refuse_unfit(asked: SweepPlan, law: int) -> None:
+def _refuse_unfit(plan: SweepPlan, law: int) -> None:
     """Refuses an axis with a value that makes no scenario or no difference, and corners that cannot run."""
-    origin = [law] + [0] * len(asked.axes)
-    for n, one in enumerate(asked.axes, 1):
+    origin = [law] + [0] * len(plan.axes)
+    for n, one in enumerate(plan.axes, 1):
         seen: dict[str, str] = {}
         for place in _sample_indices(len(one.texts)):
-            scenario = _checked(asked, [*origin[:n], place, *origin[n + 1 :]])
+            scenario = _checked(plan, [*origin[:n], place, *origin[n + 1 :]])
             text = one.texts[place]
             if scenario.sha256 in seen:
                 raise ScenarioError(
                     f"{seen[scenario.sha256]} and {text} are the same experiment: nothing here follows this "
                     "key; a site or link may have one of its own, as in sites.NAME.control or links.A->B",
                     path=one.key,
-                    source=asked.written.source,
+                    source=plan.written.source,
                 )
             seen[scenario.sha256] = text
-    ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in asked.axes)]
+    ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in plan.axes)]
     for places in product(*ends):
-        _checked(asked, places)
+        _checked(plan, places)
 
 
-def _checked(asked: SweepPlan, places: Sequence[int]) -> Scenario:
+def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
     """Returns the scenario of a cell.
 
     Raises:
         ScenarioError: there is none, or it cannot run here; says with which law where several are swept.
     """
-    cell = asked.cell_at(places)
+    cell = plan.cell_at(places)
     try:
-        scenario = asked.written.scenario(*cell.overrides)
+        scenario = plan.written.scenario(*cell.overrides)
         cell_result.check_sweepable(scenario)
     except ScenarioError as error:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
-        raise ScenarioError(problem, path=error.path, source=asked.written.source) from None
+        raise ScenarioError(problem, path=error.path, source=plan.written.source) from None
     return scenario
 
 

@@ -24,24 +24,24 @@ _MAX_DOUBTFUL_SHOWN = 8
 """So many doubtful places are told; all stand in the file."""
 
 
-def describe_sweep_plan(asked: SweepPlan) -> list[str]:
+def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     """Returns what will be run, before it is."""
-    sizes = " x ".join(str(len(one.texts)) for one in asked.axes) or "1"
-    lines = [f"{asked.base.name}: {asked.cells} cells ({sizes}{_laws(asked)}), {_seeds(asked)}"]
-    lines += [f"  over {one.asked}: {_values(one.texts)}" for one in asked.axes]
-    first_s, longest_s = asked.base.duration_s, asked.longest_s
+    sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
+    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{_laws(plan)}), {_seeds(plan)}"]
+    lines += [f"  over {one.asked}: {_values(one.texts)}" for one in plan.axes]
+    first_s, longest_s = plan.base.duration_s, plan.longest_s
     extended = f", one that is not plain by then up to {longest_s:g} s" if longest_s > first_s else ""
     return [*lines, f"  {first_s:g} s each{extended}"]
 
 
-def _laws(asked: SweepPlan) -> str:
-    return f" x laws {', '.join(asked.laws)}" if asked.laws else ""
+def _laws(plan: SweepPlan) -> str:
+    return f" x laws {', '.join(plan.laws)}" if plan.laws else ""
 
 
-def _seeds(asked: SweepPlan) -> str:
-    if len(asked.seeds) == 1:
-        return f"seed {asked.seeds[0]}"
-    return f"{len(asked.seeds)} seeds each where anything is random"
+def _seeds(plan: SweepPlan) -> str:
+    if len(plan.seeds) == 1:
+        return f"seed {plan.seeds[0]}"
+    return f"{len(plan.seeds)} seeds each where anything is random"
 
 
 def _values(texts: Sequence[str]) -> str:
@@ -84,9 +84,9 @@ def _cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def _describe_grid_point(asked: SweepPlan, place: GridPoint) -> str:
-    where = [f"{one.key} {value}" for one, value in zip(asked.axes, place.values, strict=True)]
-    law = [place.law] if asked.laws else []
+def _describe_grid_point(plan: SweepPlan, place: GridPoint) -> str:
+    where = [f"{one.key} {value}" for one, value in zip(plan.axes, place.values, strict=True)]
+    law = [place.law] if plan.laws else []
     low, high = (100.0 * end for end in place.interval)
     return (
         f"cell {place.cell} ({', '.join([*law, *where])}): {place.stable} of {place.decided} stable, "
@@ -126,13 +126,7 @@ class ReproduceCommand(NamedTuple):
 
 
 def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> ReproduceCommand:
-    """Returns how to run a row again.
-
-    Args:
-        results: of the sweep.
-        row: one of its rows.
-        folder: where the row's scenario is written if it is needed.
-    """
+    """Returns how to run a row again."""
     if _source_unchanged(results.plan.written, results.plan.cell(row["cell"]).overrides, row):
         return ReproduceCommand(row["command"])
     name = f"cell-{row['cell']}-seed-{row['seed']}"

@@ -9,7 +9,6 @@ is taken over the decided runs and carries a 95 % Wilson interval within [0, 1].
 
 import io
 import json
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,9 +22,6 @@ from .cell_result import CellClass, CellResult
 from .sweep_cell import CellRun, apply_diff, build_sim_command
 from .sweep_plan import SweepPlan, plan_from_json
 
-_TWO_SIDED_95 = 1.959963984540054
-"""The 0.975 quantile of the normal distribution."""
-
 
 class ShareInterval(NamedTuple):
     """From where to where a share may lie."""
@@ -35,33 +31,18 @@ class ShareInterval(NamedTuple):
 
 
 def wilson_interval(successes: int, runs: int) -> ShareInterval:
-    """Returns the 95 % score interval of a share.
-
-    With n runs, p = successes / n and z the 0.975 quantile of the normal distribution it is
-    (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n). Unlike p -+ z sqrt(p (1 - p) / n)
-    it has a width where all runs agree.
-
-    Args:
-        successes: how many runs had it.
-        runs: how many there were.
-
-    Returns:
-        the interval, shares of 1.
+    """Returns the 95 % score interval of a share, which has a width even if all runs agree.
 
     Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
     Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta, "Interval estimation for a
     binomial proportion", Statistical Science 16 (2001).
     """
-    if not 0 <= successes <= runs:
-        raise ValueError(f"{successes} of {runs} runs is no share")
+    from scipy.stats import binomtest  # takes half a second, which most commands can do without
+
     if runs == 0:
         return ShareInterval(0.0, 1.0)
-    share, weight = successes / runs, _TWO_SIDED_95**2 / runs
-    middle = share + weight / 2.0
-    half = math.sqrt(weight * (share * (1.0 - share) + weight / 4.0))
-    low = (middle - half) / (1.0 + weight) if successes else 0.0
-    high = (middle + half) / (1.0 + weight) if successes < runs else 1.0
-    return ShareInterval(low, high)
+    low, high = binomtest(successes, runs).proportion_ci(method="wilson")
+    return ShareInterval(float(low), float(high))
 
 
 RESULTS_FILE = "results.parquet"
@@ -113,55 +94,45 @@ class SweepResults(NamedTuple):
         return msgspec.convert({field: row[field] for field in CellResult.__struct_fields__}, CellResult)
 
 
-def build_result_rows(asked: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Returns the rows that runs make, in their order.
-
-    Args:
-        asked: the sweep.
-        entries: its runs, in any order.
-    """
-    order = {seed: n for n, seed in enumerate(asked.seeds)}
+def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
+    """Returns the rows that runs make, in their order."""
+    order = {seed: n for n, seed in enumerate(plan.seeds)}
     seeds_of: dict[int, int] = {}
     for entry in entries:
         seeds_of[entry.cell] = seeds_of.get(entry.cell, 0) + 1
     return [
-        _row(asked, entry, alone=seeds_of[entry.cell] == 1)
+        _row(plan, entry, alone=seeds_of[entry.cell] == 1)
         for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed]))
     ]
 
 
-def _row(asked: SweepPlan, entry: CellRun, *, alone: bool) -> ResultRow:
-    cell = asked.cell(entry.cell)
-    text = apply_diff(entry.scenario, asked.base.text)
+def _row(plan: SweepPlan, entry: CellRun, *, alone: bool) -> ResultRow:
+    cell = plan.cell(entry.cell)
+    text = apply_diff(entry.scenario, plan.base.text)
     log = f"cell-{cell.number}.mcap" if alone else f"cell-{cell.number}-seed-{entry.seed}.mcap"
-    lasts_s = reproduction_duration_s(asked, entry.outcome)
+    lasts_s = reproduction_duration_s(plan, entry.outcome)
     return {
         "cell": cell.number,
-        **{one.key: value for one, value in zip(asked.axes, cell.values, strict=True)},
+        **{one.key: value for one, value in zip(plan.axes, cell.values, strict=True)},
         "law": entry.law,
         "seed": entry.seed,
         "random": entry.random,
         **msgspec.to_builtins(entry.outcome),
         "scenario_sha256": entry.sha256,
-        "command": build_sim_command(asked.written, cell.overrides, entry.seed, lasts_s, log),
+        "command": build_sim_command(plan.written, cell.overrides, entry.seed, lasts_s, log),
         "scenario": text,
     }
 
 
-def reproduction_duration_s(asked: SweepPlan, outcome: CellResult) -> float:
+def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     """Returns a duration that makes a run again: as long as it ran, or until it diverges by itself, s."""
     if outcome.diverged_s is None:
         return outcome.ran_s
-    return max(outcome.ran_s, min(asked.longest_s, asked.base.duration_s * 2.0**outcome.extended))
+    return max(outcome.ran_s, min(plan.longest_s, plan.base.duration_s * 2.0**outcome.extended))
 
 
-def encode_results(asked: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[str, Any]) -> bytes:
+def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[str, Any]) -> bytes:
     """Returns results as a Parquet file.
-
-    Args:
-        asked: the sweep.
-        rows: its runs, in their order.
-        facts: what names the sweep, for the file's metadata.
 
     Raises:
         UsageError: polars is not installed.
@@ -169,7 +140,7 @@ def encode_results(asked: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[s
     pl = require_polars()
     schema = {
         "cell": pl.Int64,
-        **{one.key: pl.Float64 if one.numeric else pl.String for one in asked.axes},
+        **{one.key: pl.Float64 if one.numeric else pl.String for one in plan.axes},
         "law": pl.String,
         "seed": pl.Int64,
         "random": pl.Boolean,
@@ -197,9 +168,6 @@ def _outcome_schema(pl: Any) -> dict[str, Any]:
 
 def read_results(path: Path) -> SweepResults:
     """Returns the results of a sweep.
-
-    Args:
-        path: its folder, or the Parquet file.
 
     Raises:
         UsageError: there are none, or the sweep has not come to its end; or polars is not installed.
@@ -276,7 +244,7 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     ]
 
 
-def encode_grid_points(asked: SweepPlan, found: Sequence[GridPoint]) -> bytes:
+def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
     """Returns places as a Parquet file: a row each, its counts, and the share of stable runs with its ends.
 
     Raises:
@@ -288,7 +256,7 @@ def encode_grid_points(asked: SweepPlan, found: Sequence[GridPoint]) -> bytes:
         "cell": ([one.cell for one in found], pl.Int64),
         **{
             axis.key: ([one.values[n] for one in found], pl.Float64 if axis.numeric else pl.String)
-            for n, axis in enumerate(asked.axes)
+            for n, axis in enumerate(plan.axes)
         },
         "law": ([one.law for one in found], pl.String),
         "runs": ([sum(one.counts) for one in found], pl.Int64),

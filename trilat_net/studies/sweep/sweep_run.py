@@ -86,23 +86,20 @@ class FinishedSweep(NamedTuple):
 
 
 def estimate_sweep(
-    asked: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
+    plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
     """Returns how long a sweep will take, by its first and last run and some between.
 
-    Args:
-        asked: the sweep.
-        done: cells and seeds that are done already.
-        jobs: in how many processes; None for one per core.
+    The runs of cells and seeds that are `done` already are left out.
     """
     known = set(done)
-    places = dict.fromkeys(n * (asked.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
-    probes = [asked.task(n, asked.seeds[0]) for n in places if (n, asked.seeds[0]) not in known]
+    places = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
+    probes = [plan.task(n, plan.seeds[0]) for n in places if (n, plan.seeds[0]) not in known]
     if not probes:
-        return DurationEstimate(asked.cells * len(asked.seeds) - len(known), 0.0, [])
+        return DurationEstimate(plan.cells * len(plan.seeds) - len(known), 0.0, [])
     first = probes[0]
-    brief_s = min(1.0, asked.base.duration_s)
-    warm = asked.written.scenario(*first.overrides, f"duration_s={brief_s!r}")
+    brief_s = min(1.0, plan.base.duration_s)
+    warm = plan.written.scenario(*first.overrides, f"duration_s={brief_s!r}")
     cell_result.classify_cell(warm.text, brief_s)  # compiles, once for all processes
     clock = SystemClock()
     began_ns = clock.monotonic_ns()
@@ -112,12 +109,12 @@ def estimate_sweep(
         if took_s < _PROBING_S:
             entries.append(run_cell(task))
             took_s = (clock.monotonic_ns() - began_ns) * 1e-9
-    seeds = len(asked.seeds) if any(entry.random for entry in entries) else 1
-    left = max(len(entries), asked.cells * seeds - len(known))
+    seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
+    left = max(len(entries), plan.cells * seeds - len(known))
     return DurationEstimate(left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries)
 
 
-def refuse_oversized_sweep(asked: SweepPlan, expected: DurationEstimate, jobs: int | None = None) -> None:
+def refuse_oversized_sweep(plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None) -> None:
     """Refuses a sweep of very many runs, or of more than a day.
 
     Raises:
@@ -125,10 +122,10 @@ def refuse_oversized_sweep(asked: SweepPlan, expected: DurationEstimate, jobs: i
     """
     if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
         return
-    sizes = " x ".join(str(count) for count in asked.shape if count > 1)
-    seeds = f", {len(asked.seeds)} seeds each" if len(asked.seeds) > 1 else ""
+    sizes = " x ".join(str(count) for count in plan.shape if count > 1)
+    seeds = f", {len(plan.seeds)} seeds each" if len(plan.seeds) > 1 else ""
     raise UsageError(
-        f"{asked.cells} cells ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} on "
+        f"{plan.cells} cells ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} on "
         f"{jobs or count_cores()} cores; larger steps make it fewer, --yes runs it all the same"
     )
 
@@ -163,44 +160,44 @@ def run_sweep(
         UsageError: polars is not installed.
     """
     require_polars()
-    asked = folder.plan
+    plan = folder.plan
     clock = SystemClock()
     with folder.journal() as journal:
         for entry in known:
             journal.add(entry)
         before, began_ns = set(journal.done), clock.monotonic_ns()
-        left = asked.cells * len(asked.seeds) - len(before)
+        left = plan.cells * len(plan.seeds) - len(before)
         with open_worker_pool(jobs, on if left else None, most=left, hint=_RESUME_HINT) as pool:
             count = pool.workers
-            _run_cells(asked, journal, pool, progress)
+            _run_cells(plan, journal, pool, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         made = [entry for key, entry in journal.done.items() if key not in before]
-        rows = build_result_rows(asked, list(journal.done.values()))
-    results = SweepResults(asked, rows)
-    if len(asked.seeds) > 1:
-        points = encode_grid_points(asked, collect_grid_points(results))
+        rows = build_result_rows(plan, list(journal.done.values()))
+    results = SweepResults(plan, rows)
+    if len(plan.seeds) > 1:
+        points = encode_grid_points(plan, collect_grid_points(results))
         write_whole(folder.path / GRID_POINTS_FILE, points, remedy=build_resume_hint(folder.path))
-    table = encode_results(asked, rows, folder.facts)
+    table = encode_results(plan, rows, folder.facts)
     write_whole(folder.results, table, remedy=build_resume_hint(folder.path))
     speed = SweepSpeed(len(made), sum(entry.outcome.ran_s for entry in made), wall_s, count)
     return FinishedSweep(results, folder, speed)
 
 
-def _run_cells(asked: SweepPlan, journal: SweepJournal, pool: WorkerPool, progress: Progress) -> None:
+def _run_cells(plan: SweepPlan, journal: SweepJournal, pool: WorkerPool, progress: Progress) -> None:
     """Runs the first seed of every cell, then the others of those in which anything is random."""
-    first, *others = asked.seeds
+    first, *others = plan.seeds
 
     def total() -> int:
         random = sum(entry.random for (_, seed), entry in journal.done.items() if seed == first)
-        return asked.cells + random * len(others)
+        return plan.cells + random * len(others)
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
         before = len(journal.done)
-        tasks = (asked.task(*key) for key in runs if key not in journal.done)
+        tasks = (plan.task(*key) for key in runs if key not in journal.done)
         for _, entry in pool.each(run_cell, tasks, count=count - before):
             journal.add(entry)
             progress(len(journal.done), count)
 
-    make(((number, first) for number in range(asked.cells)), asked.cells)
-    again = [number for number in range(asked.cells) if others and journal.done[number, first].random]
+    make(((number, first) for number in range(plan.cells)), plan.cells)
+    again = [number for number in range(plan.cells) if others and journal.done[number, first].random]
     make(((number, seed) for number in again for seed in others), total())

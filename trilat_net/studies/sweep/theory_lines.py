@@ -47,11 +47,7 @@ class StabilityCriterion(NamedTuple):
 
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Returns the condition in closed form that covers a scenario, or None.
-
-    Args:
-        scenario: the experiment; its start, its hands and its walls do not enter.
-    """
+    """Returns the condition in closed form that covers a scenario, or None."""
     if scenario.timeline or any(spec.on_stale.action != "use" for spec in scenario.sites.values()):
         return None
     return _damped(scenario) or _sampled(scenario)
@@ -234,13 +230,7 @@ class TheoryLine(NamedTuple):
 
 
 def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> TheoryLine | None:
-    """Returns the line of the condition in closed form; None where there is none, or not within the map.
-
-    Args:
-        at: makes the scenario of a place.
-        x: the axis to the right.
-        y: the axis upwards.
-    """
+    """Returns the line of the condition in closed form; None where there is none, or not within the map."""
     told = [[evaluate_criterion(at(right, up)) for right in x.values] for up in y.values]
     first = next((one for row in told for one in row if one is not None), None)
     if first is None:

@@ -210,10 +210,6 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     """Returns the figures of a log.
 
-    Args:
-        log: the log.
-        expect: what will be asked of it; by default what its own scenario expects.
-
     Raises:
         LogError: a record cannot be read.
     """

@@ -201,14 +201,7 @@ def _one_line(value: Any) -> str:
 
 
 def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float) -> TrialResult:
-    """Returns the result of a live trial.
-
-    Args:
-        trial: what ran.
-        log_file: its log.
-        problems: what went wrong in the session.
-        wall_s: how long it took.
-    """
+    """Returns the result of a live trial."""
     kept = log_file if log_file.exists() else None
     try:
         log = open_log(log_file)

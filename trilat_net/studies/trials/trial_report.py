@@ -158,13 +158,7 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Returns the results as an XML document.
-
-    Args:
-        report: the results.
-        began_unix_ns: when the first run began, ns since 1970.
-        host: name of the machine.
-    """
+    """Returns the results as an XML document."""
     root = Xml.Element("testsuites", _counts(report.results), name="trilat test")
     began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
     for name, results in report.scenarios.items():

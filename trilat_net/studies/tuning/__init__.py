@@ -1,6 +1,6 @@
 """Fair comparison of control laws.
 
-Each tuned by one written procedure, shown as a front of error against effort.
+Each law is tuned by one written procedure, and shown as a front of error against effort.
 
 Invariant: every law gets the same number of candidates, torque clamp, horizon, seeds, gravity information
 and classification. e alone ranks no law: arms that hang together have e = 0.
@@ -9,8 +9,7 @@ docs/fair-comparison.md holds the procedure, the formulas and the table of searc
 
     from trilat_net.studies.tuning import plan_tuning
 
-    if __name__ == "__main__":  # the candidates run in processes of their own
-        result = plan_tuning("free", budget=16).run()
+    result = plan_tuning("free", budget=16).run()
 """
 
 from .tuning_plan import TuningPlan, TuningResult, plan_tuning

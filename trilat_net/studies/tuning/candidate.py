@@ -56,12 +56,7 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
 
 def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
-    """Runs a candidate and its twin, and returns its score.
-
-    Args:
-        text: the canonical text of its scenario.
-        twin_text: of the twin on which its pose is judged; None where it is its own.
-    """
+    """Runs a candidate and its twin, and returns its score."""
     run = _run(parse_scenario(text))
     alone = run if twin_text is None else _run(parse_scenario(twin_text))
     diverged_s = run.diverged_s if run.diverged_s is not None else alone.diverged_s

@@ -68,9 +68,6 @@ def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
 
     After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic algorithm: NSGA-II",
     IEEE Trans. Evolutionary Computation 6 (2002).
-
-    Args:
-        points: a front, by rising effort.
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
@@ -132,9 +129,9 @@ class CandidateSearch:
         self.scores += scores
 
     def _hypercube(self, count: int) -> Array:
-        """Returns one point in every row and column of a grid, shape (count, knobs), from 0 to 1."""
-        columns = [self._rng.permutation(count) for _ in self.space.knobs]
-        points: Array = (np.stack(columns, axis=1) + self._rng.random((count, len(columns)))) / count
+        from scipy.stats import qmc  # takes half a second, which most commands can do without
+
+        points: Array = qmc.LatinHypercube(len(self.space.knobs), rng=self._rng).random(count)
         return points
 
     def _refined(self, count: int, step: float) -> Array:

@@ -65,9 +65,6 @@ class ModelInformation(NamedTuple):
 def build_model_information(gravity_percent: float) -> ModelInformation:
     """Returns what a person says all laws are to be told.
 
-    Args:
-        gravity_percent: of the true gravity.
-
     Raises:
         UsageError: it is none that an arm could be built with.
     """
@@ -206,10 +203,6 @@ PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
 
 def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
     """Returns where the named laws are searched, once each, in their order.
-
-    Args:
-        laws: names; none means `USUAL`.
-        scenario: for which.
 
     Raises:
         UsageError: there is no such law to tune.

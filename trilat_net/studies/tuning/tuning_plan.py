@@ -140,11 +140,6 @@ class TuningPlan(NamedTuple):
     ) -> "TuningResult":
         """Searches every law and returns what was found.
 
-        Args:
-            jobs: in how many processes; None for one per core.
-            progress: told how many candidates are done, and how many there are.
-            on: what runs the candidates instead: a Dask scheduler's address or an executor.
-
         Raises:
             RunFailed: a process was ended by somebody.
         """

@@ -64,13 +64,7 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
 
 
 def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUDGET) -> TextTable:
-    """Returns a law's front by rising effort; * marks what no law's candidate dominates.
-
-    Args:
-        tuned: the comparison.
-        found: the law's part of it.
-        most: so many points at most, both ends among them.
-    """
+    """Returns a law's front by rising effort; * marks what no law's candidate dominates."""
     count = len(found.front)
     kept = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
     shared = tuned.shared(found)
