@@ -35,14 +35,6 @@ def test_a_range_is_its_first_value_and_whole_steps_up_to_its_end(
     assert [Decimal(text) for text in downwards.texts] == values[::-1]
 
 
-def test_a_tenth_is_a_tenth() -> None:
-    found = parse_axis("control.d=0.2:3:0.1")
-    assert len(found.texts) == 29
-    assert list(found.texts[:3]) == ["0.2", "0.3", "0.4"]
-    assert [found.override(n) for n in (1, -1)] == ["control.d=0.3", "control.d=3.0"]
-    assert found.value(8) == 1.0
-
-
 def test_an_end_on_the_grid_within_rounding_counts() -> None:
     assert list(parse_axis("a=0:1:0.3333333333").texts)[-1] == "0.9999999999"
     assert list(parse_axis("a=0:0.9999999999:0.25").texts)[-1] == "1.00"

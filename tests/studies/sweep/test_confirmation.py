@@ -64,10 +64,6 @@ def test_a_log_of_the_same_run_has_the_same_verdict(scenario: Scenario, tmp_path
     assert found.log == tmp_path / "cell-3.mcap"
 
 
-def test_the_cells_of_this_test_are_on_both_sides() -> None:
-    assert [cell(one)["verdict"] for one in (CALM, WILD)] == ["converged", "diverged"]
-
-
 def test_another_run_differs(tmp_path: Path) -> None:
     found = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
     assert not found.same
@@ -128,11 +124,6 @@ def test_cells_are_spread_over_the_edge() -> None:
     assert max(delays) - min(delays) >= 300
 
 
-def test_few_cells_are_all_there_are() -> None:
-    found = choose_cells_near_edges(list(rows()), KEYS, 100)
-    assert len({row["cell"] for row in found}) == len(found) < 25
-
-
 def test_undecided_cells_are_not_run_and_the_edge_is_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> CellClass:
         return CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
@@ -185,7 +176,7 @@ def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> N
 
 
 @pytest.mark.live
-@pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
+@pytest.mark.parametrize("scenario", [CALM, pytest.param(WILD, marks=pytest.mark.long)], ids=["calm", "wild"])
 def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(scenario: Scenario, tmp_path: Path) -> None:
     from rich.console import Console
 

@@ -86,17 +86,6 @@ def test_a_byte_that_is_wrong_loses_its_line_alone(
     assert all(one in FIVE for one in kept)
 
 
-def test_a_run_is_written_down_once(path: Path) -> None:
-    one = written(path, [FIVE[0]])
-    assert written(path, [FIVE[0], FIVE[0]]) == one
-
-
-def test_seeds_of_a_cell_are_runs_of_their_own(path: Path) -> None:
-    both = [entry(3, seed) for seed in (1, 2)]
-    written(path, both)
-    assert read(path) == both
-
-
 def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
     written(path, FIVE, "another sweep")
     assert read(path) == []

@@ -38,13 +38,6 @@ def test_what_a_number_means_is_told_by_the_scenario() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "key", ["sites.s.environment.7.stiffness_n_m", "sites.x.environment.0.stiffness_n_m"]
-)
-def test_what_the_scenario_does_not_have_is_told_by_its_group(key: str) -> None:
-    assert "environment of" in label_axis(key, load_scenario("contact"))
-
-
 def test_every_suffix_of_a_shipped_arm_and_its_limits_is_a_unit() -> None:
     """No label shows a piece of a unit as if it were a word."""
     spec = next(iter(load_scenario(list_shipped()[0]).sites.values()))

@@ -101,11 +101,3 @@ def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> N
     assert line is None
     assert remarks == why
     assert trace_linear_analysis([([-1.0, -2.0], []), ([-1.0, -3.0], [])]) == (None, [])
-
-
-def test_a_condition_that_speaks_of_one_row_only_has_no_line() -> None:
-    lossy = PlaneAxis("link.loss", (0.0, 0.1, 0.2), "loss")
-    assert (
-        trace_closed_form(lambda x, y: load_scenario(P_D, {"link.delay_ms": x, "link.loss": y}), DELAY, lossy)
-        is None
-    )

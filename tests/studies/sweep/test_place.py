@@ -45,9 +45,3 @@ def test_they_stand_in_a_file_where_there_are_seeds(found: list[GridPoint], tmp_
             assert row["stable_share_low"] <= row["stable_share"] <= row["stable_share_high"]
         else:
             assert row["stable_share"] is None
-
-
-def test_without_seeds_there_is_no_such_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cell_result, "classify_cell", Judge())
-    folder = run_sweep(prepare_sweep_folder(asked(tmp_path), tmp_path / "o"), 1).folder
-    assert not (folder.path / GRID_POINTS_FILE).exists()

@@ -8,11 +8,8 @@ from trilat_net.studies.sweep import cell_result, prepare_sweep_folder, run_swee
 from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.sweep_report import (
     describe_sweep_plan,
-    describe_sweep_speed,
-    list_next_commands,
     summarize_sweep,
 )
-from trilat_net.studies.sweep.sweep_run import SweepSpeed
 
 from .quick import DELAYS, Judge, asked
 
@@ -44,14 +41,3 @@ def test_a_summary_counts_every_run_once(tmp_path: Path, monkeypatch: pytest.Mon
     assert "stable with some seeds and not with others" in text
     assert "95 % interval" in text
     assert "all in places.parquet" in text
-
-
-def test_speed_is_per_process() -> None:
-    assert describe_sweep_speed(SweepSpeed(10, 2000.0, 5.0, 2)) == (
-        "10 runs, 2000 s simulated, in 5 s by 2 processes: 200 times real time per process"
-    )
-    assert "by 1 process:" in describe_sweep_speed(SweepSpeed(1, 1.0, 1.0, 1))
-
-
-def test_a_folder_with_a_space_is_quoted() -> None:
-    assert all("'my runs/x'" in line for line in list_next_commands(Path("my runs/x")))

@@ -16,7 +16,6 @@ from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_run import (
     DurationEstimate,
     estimate_sweep,
-    format_wall_time,
     refuse_oversized_sweep,
 )
 
@@ -123,16 +122,3 @@ def test_a_cell_that_cannot_run_is_named_and_what_is_done_is_kept(tmp_path: Path
     with folder.journal() as journal:
         assert sorted(journal.done) == [(n, 1) for n in range(4)]
     assert judge.texts
-
-
-def test_times_are_said_as_people_say_them() -> None:
-    assert [format_wall_time(s) for s in (0.2, 45.0, 89.0, 90.0, 5399.0, 5400.0, 172_799.0, 1e6)] == [
-        "1 s",
-        "45 s",
-        "89 s",
-        "1.5 min",
-        "90 min",
-        "1.5 h",
-        "48 h",
-        "11.6 days",
-    ]

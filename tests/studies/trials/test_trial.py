@@ -32,10 +32,6 @@ def test_where_nothing_is_random_one_run_tells_all_unless_a_network_has_a_say() 
     assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
 
 
-def test_without_seeds_the_scenarios_own_counts() -> None:
-    assert [trial.scenario.seed for trial in trilat_net.trials(quick(seed=42))] == [42]
-
-
 @pytest.mark.parametrize("seed", [-1, 2**63])
 def test_a_seed_out_of_range_is_refused(seed: int) -> None:
     with pytest.raises(ScenarioError, match="seed"):

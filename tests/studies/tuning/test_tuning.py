@@ -109,12 +109,6 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
         assert learns.scores[place].outcome is CandidateClass.SETTLED
 
 
-def test_progress_is_told_to_the_end(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    asked(tmp_path, "duration_s=0.1", laws=["p_d"], budget=3).run(1, lambda *one: told.append(one))
-    assert told == [(n, 5) for n in range(1, 6)]
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

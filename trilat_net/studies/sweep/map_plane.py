@@ -220,7 +220,9 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
     drawn = [key for key in axes if all(is_number(row[key]) for row in rows)][:2]
     if not drawn:
         raise UsageError(f"a map needs an axis of numbers, and {', '.join(axes)} has words only")
-    sides = [_plane_axis(rows, key, scenario) for key in drawn]
+    sides = [  # whole numbers stay whole
+        PlaneAxis(key, tuple(sorted({row[key] for row in rows})), label_axis(key, scenario)) for key in drawn
+    ]
     if len(sides) == 1:
         sides.append(PlaneAxis("", (0.0,), ""))
     others = [key for key in axes if key not in drawn and len({row[key] for row in rows}) > 1]
@@ -230,7 +232,8 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
             f"a map has at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}: "
             "sweep fewer values of what is not drawn"
         )
-    panels = [MapPanel(_title(one, scenario), one, _empty(sides)) for one in settings]
+    shape = len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)
+    panels = [MapPanel(_title(one, scenario), one, np.zeros(shape, dtype=np.int64)) for one in settings]
     of = dict(zip(settings, panels, strict=True))
     place = [{value: n for n, value in enumerate(side.values)} for side in sides]
     verdicts = {verdict.value: n for n, verdict in enumerate(CELL_CLASSES)}
@@ -239,15 +242,6 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
         panel = of[tuple((key, row[key]) for key in others)]
         panel.counts[i, j, verdicts[row["verdict"]]] += 1
     return MapPlane(scenario.name, sides[0], sides[1], tuple(panels))
-
-
-def _plane_axis(rows: Sequence[Mapping[str, Any]], key: str, scenario: Scenario) -> PlaneAxis:
-    values = tuple(sorted({row[key] for row in rows}))  # whole numbers stay whole
-    return PlaneAxis(key, values, label_axis(key, scenario))
-
-
-def _empty(sides: Sequence[PlaneAxis]) -> RunCounts:
-    return np.zeros((len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)), dtype=np.int64)
 
 
 def _title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:

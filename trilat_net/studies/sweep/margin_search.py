@@ -239,7 +239,11 @@ def search_margins(
         RunFailed: a process was ended.
     """
     cells = [plan.cell(first) for first in range(0, plan.cells, 2)]
-    places = [(cell, seed) for cell in cells for seed in _seeds(plan, cell)]
+    places = [
+        (cell, seed)
+        for cell in cells
+        for seed in (plan.seeds if plan.written.scenario(*cell.overrides).random else plan.seeds[:1])
+    ]
     searches = [
         MarginTask(plan.written, cell.overrides[:-1], seed, plan.longest_s, within) for cell, seed in places
     ]
@@ -249,11 +253,6 @@ def search_margins(
         GridPointMargin(cell._replace(values=cell.values[:-1]), seed, *finding)
         for (cell, seed), finding in zip(places, findings, strict=True)
     ]
-
-
-def _seeds(plan: SweepPlan, cell: SweepCell) -> Sequence[int]:
-    """Returns the seeds of a place: one alone where nothing is random."""
-    return plan.seeds if plan.written.scenario(*cell.overrides).random else plan.seeds[:1]
 
 
 def search_margin_task(one: MarginTask) -> MarginFinding:
@@ -297,7 +296,9 @@ def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridP
     heads += ["linear", "difference", *(["closed form", "difference"] if closed else []), "runs"]
     rows = []
     for one in found:
-        place = [_text(value) for value in one.cell.values] + ([one.cell.law] if plan.laws else [])
+        place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values] + (
+            [one.cell.law] if plan.laws else []
+        )
         place += [str(one.seed)] if seeds else []
         for span in one.margin.spans or (None,):
             cells = [
@@ -358,10 +359,6 @@ def build_margin_command(plan: SweepPlan, within: SearchRange) -> str:
     reach = f"{within.key}={format_override_value(within.low)}:{format_override_value(within.high)}"
     words = ["--margin", reach, "--tolerance", format_override_value(within.tolerance)]
     return build_sweep_command(plan._replace(axes=plan.axes[:-1]), *words)
-
-
-def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:

@@ -190,11 +190,11 @@ def build_sim_command(
     written: SweepSource, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
     """Returns the command that makes a log of a run."""
-    settings = [text for text in (*written.overrides, *overrides) if _key(text) not in ("seed", "duration_s")]
-    words = [word for text in settings for word in ("--set", text)]
+    words = [
+        word
+        for text in (*written.overrides, *overrides)
+        if text.partition("=")[0].strip() not in ("seed", "duration_s")
+        for word in ("--set", text)
+    ]
     lasts = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
     return shlex.join(["trilat", "sim", written.source, *words, *lasts])
-
-
-def _key(text: str) -> str:
-    return text.partition("=")[0].strip()

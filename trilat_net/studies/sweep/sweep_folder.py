@@ -101,11 +101,7 @@ def _entries(data: bytes, sweep: str) -> Iterator[CellRun]:
     for one in data.split(b"\n"):
         text, tab, digits = one.rpartition(b"\t")
         if tab and digits == b"%08x" % _checksum(text, sweep):
-            yield msgspec.convert(_plain(text), CellRun)
-
-
-def _plain(text: bytes) -> Any:
-    return json.loads(text)  # unlike msgspec it knows infinity
+            yield msgspec.convert(json.loads(text), CellRun)  # unlike msgspec, json knows infinity
 
 
 PLAN_FILE = "plan.json"
@@ -155,7 +151,9 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
     """
     facts = {**plan.facts(), **_made_with()}
     if path is not None and (path / PLAN_FILE).exists():
-        return _resume_same(path, facts)
+        before = _read(path)
+        _refuse_other(path, before, facts)
+        return SweepFolder(path, plan_from_json(before), before)
     chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=False)
     write_whole(chosen / PLAN_FILE, _text(facts), remedy=build_resume_hint(chosen))
     return SweepFolder(chosen, plan, facts)
@@ -173,13 +171,6 @@ def open_sweep_folder(path: Path) -> SweepFolder:
     now = {**plan.facts(), **_made_with()}
     _refuse_other(path, facts, now)
     return SweepFolder(path, plan, facts)
-
-
-def _resume_same(path: Path, facts: Mapping[str, Any]) -> SweepFolder:
-    """Returns a folder that holds this very sweep."""
-    before = _read(path)
-    _refuse_other(path, before, facts)
-    return SweepFolder(path, plan_from_json(before), before)
 
 
 def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

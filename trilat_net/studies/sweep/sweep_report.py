@@ -27,21 +27,14 @@ _MAX_DOUBTFUL_SHOWN = 8
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     """Returns what will be run, before it is."""
     sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
-    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{_laws(plan)}), {_seeds(plan)}"]
+    laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
+    count = len(plan.seeds)
+    seeds = f"seed {plan.seeds[0]}" if count == 1 else f"{count} seeds each where anything is random"
+    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{laws}), {seeds}"]
     lines += [f"  over {one.asked}: {_values(one.texts)}" for one in plan.axes]
     first_s, longest_s = plan.base.duration_s, plan.longest_s
     extended = f", one that is not plain by then up to {longest_s:g} s" if longest_s > first_s else ""
     return [*lines, f"  {first_s:g} s each{extended}"]
-
-
-def _laws(plan: SweepPlan) -> str:
-    return f" x laws {', '.join(plan.laws)}" if plan.laws else ""
-
-
-def _seeds(plan: SweepPlan) -> str:
-    if len(plan.seeds) == 1:
-        return f"seed {plan.seeds[0]}"
-    return f"{len(plan.seeds)} seeds each where anything is random"
 
 
 def _values(texts: Sequence[str]) -> str:

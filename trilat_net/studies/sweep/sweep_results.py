@@ -138,13 +138,14 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
         UsageError: polars is not installed.
     """
     pl = require_polars()
+    kinds = {"verdict": pl.String, "motion": pl.String, "extended": pl.Int64}
     schema = {
         "cell": pl.Int64,
         **{one.key: pl.Float64 if one.numeric else pl.String for one in plan.axes},
         "law": pl.String,
         "seed": pl.Int64,
         "random": pl.Boolean,
-        **_outcome_schema(pl),
+        **{name: kinds.get(name, pl.Float64) for name in CellResult.__struct_fields__},
         "scenario_sha256": pl.String,
         "command": pl.String,
         "scenario": pl.String,
@@ -159,11 +160,6 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
         metadata={_PLAN_KEY: json.dumps(facts, ensure_ascii=False, sort_keys=True)},
     )
     return made.getvalue()
-
-
-def _outcome_schema(pl: Any) -> dict[str, Any]:
-    kinds = {"verdict": pl.String, "motion": pl.String, "extended": pl.Int64}
-    return {name: kinds.get(name, pl.Float64) for name in CellResult.__struct_fields__}
 
 
 def read_results(path: Path) -> SweepResults:

@@ -132,7 +132,9 @@ def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], li
     for scenario in scenarios:
         try:
             rest, remark = _equilibrium(scenario, rest)
-            found.append(_growth(scenario, rest))
+            conditions = derive_operating_conditions(scenario)
+            root = find_rightmost_root(conditions, rest, sampled=is_digital(scenario))
+            found.append(-np.inf if root is None else root.s.real)  # -inf: nothing moves
         except ScenarioError as error:
             remark = f"no linear analysis: {error.problem}"
             found.append(float("nan"))
@@ -154,12 +156,6 @@ def _equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple[Equili
     if before is not None:
         return follow_equilibrium(scenario, before), ""
     return (predict_equilibrium(scenario) if holds_any_shared_pose(now) else find_equilibrium(scenario)), ""
-
-
-def _growth(scenario: Scenario, rest: Equilibrium) -> float:
-    """Returns the real part of the rightmost root about a rest, 1/s; -infinity where nothing moves."""
-    found = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=is_digital(scenario))
-    return -np.inf if found is None else found.s.real
 
 
 def find_root_crossings(

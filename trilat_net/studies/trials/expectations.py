@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from ...scenario import Expect
-from ...scenario.expect import ExpectWindow
 from .measure_run import RunMetrics
 from .site_stats import Range
 
@@ -38,19 +37,21 @@ def evaluate_expectations(expect: Expect, figures: RunMetrics) -> list[Expectati
 
     A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
     """
+    missing = f"{figures.missing} missing"
+    gaps = ExpectationResult("no_gaps", figures.missing == 0, missing, "0 missing")
     return [
         *_stability(expect, figures),
         *_limits(expect, figures),
         *_poses(expect, figures),
-        *_gaps(expect, figures),
+        *([gaps] if expect.no_gaps else []),
         *_windows(expect, figures),
     ]
 
 
 def _stability(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
-    wanted = expect.stable
+    wanted = expect.stable is not False
     diverged = figures.diverged_at_s is not None
-    if wanted is None and not diverged:
+    if expect.stable is None and not diverged:
         return
     if diverged:
         found: bool | None = False
@@ -59,14 +60,11 @@ def _stability(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResul
         found = None if figures.trend.grows is None else not figures.trend.grows
         rate = figures.rate_per_s
         text = figures.trend.value + ("" if rate is None or found is None else f", {rate:+.3g}/s")
-    yield ExpectationResult(
-        "stable", found is not None and found is (wanted is not False), text, _word(wanted is not False)
-    )
+    yield ExpectationResult("stable", found is wanted, text, "true" if wanted else "false")
 
 
-def _word(flag: bool) -> str:
-    return "true" if flag else "false"
-
+_UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}
+"""Per ending of a key its unit, for people."""
 
 _Reading = Callable[[RunMetrics], float | None]
 
@@ -130,27 +128,13 @@ def _poses(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
         )
 
 
-def _gaps(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
-    if expect.no_gaps:
-        yield ExpectationResult("no_gaps", figures.missing == 0, f"{figures.missing} missing", "0 missing")
-
-
 def _windows(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
     for window, spans in zip(expect.windows, figures.windows, strict=True):
         for key, (least, most) in window.asked:
-            yield _within(_called(key, window), spans.get(key), least, most, _unit(key))
-
-
-def _unit(key: str) -> str:
-    """Returns the unit that a quantity of a window ends in, for people."""
-    units = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}
-    return next((word for ending, word in units.items() if key.endswith(ending)), "")
-
-
-def _called(key: str, window: ExpectWindow) -> str:
-    """Returns how a quantity of a window is called, as in `wall_mean_n s 9-15 s`."""
-    site = f" {window.site}" if window.site else ""
-    return f"{key}{site} {window.from_s:g}-{window.to_s:g} s"
+            site = f" {window.site}" if window.site else ""
+            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
+            unit = next((word for ending, word in _UNITS.items() if key.endswith(ending)), "")
+            yield _within(name, spans.get(key), least, most, unit)
 
 
 def _within(key: str, span: Range | None, least: float, most: float, unit: str) -> ExpectationResult:

@@ -124,8 +124,12 @@ def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
     for result in results:
         for outcome in result.outcomes:
             by_key.setdefault(outcome.key, []).append(outcome)
+
+    def order(outcome: ExpectationResult) -> tuple[bool, float]:
+        return outcome.held, outcome.margin or 0.0  # the failed first, then by margin
+
     rows = [
-        ExpectationRow(name, key, min(outcomes, key=_order), sum(o.held for o in outcomes), len(outcomes))
+        ExpectationRow(name, key, min(outcomes, key=order), sum(o.held for o in outcomes), len(outcomes))
         for key, outcomes in by_key.items()
     ]
     broken = [result.error for result in results if result.error]
@@ -133,11 +137,6 @@ def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
         outcome = ExpectationResult("a result", False, broken[0], "")
         rows.append(ExpectationRow(name, outcome.key, outcome, len(results) - len(broken), len(results)))
     return rows
-
-
-def _order(outcome: ExpectationResult) -> tuple[bool, float]:
-    """Sorts failed outcomes before others, then by margin."""
-    return outcome.held, outcome.margin if outcome.margin is not None else 0.0
 
 
 def _failure_lines(results: Sequence[TrialResult]) -> list[str]:

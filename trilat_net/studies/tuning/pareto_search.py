@@ -100,6 +100,7 @@ class CandidateSearch:
         space: where.
         tried: what was tried, in order.
         scores: what came of it, in the same order.
+        rounds: how many candidates each round has.
     """
 
     def __init__(self, space: SearchSpace, budget: int, seed: int, objective: Objective) -> None:
@@ -109,17 +110,13 @@ class CandidateSearch:
         self._objective = objective
         self._rng = np.random.default_rng(seed)  # the same for every law
         self._logs = np.log([[knob.low, knob.high] for knob in space.knobs])
-        first = (budget + 1) // 2
-        self._rounds = [first, *_parts(budget - first, len(REFINEMENT_STEPS))]
-
-    @property
-    def rounds(self) -> list[int]:
-        """How many candidates each round has."""
-        return list(self._rounds)
+        first, count = (budget + 1) // 2, len(REFINEMENT_STEPS)
+        share, more = divmod(budget - first, count)
+        self.rounds = [first, *(share + (n < more) for n in range(count))]
 
     def ask(self, number: int) -> list[CandidateGains]:
         """Returns the candidates of a round, all earlier ones of which were told."""
-        count = self._rounds[number]
+        count = self.rounds[number]
         places = self._hypercube(count) if number == 0 else self._refined(count, REFINEMENT_STEPS[number - 1])
         return [self._gains(place) for place in places]
 
@@ -152,7 +149,8 @@ class CandidateSearch:
             by_space = [n for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])]
             best = places[-1]
         else:
-            by_space = sorted(range(len(self.scores)), key=lambda n: _unsettled_rank(self.scores[n]))
+            errors = [(s.outcome is CandidateClass.DIVERGED, s.error_rad or 0.0) for s in self.scores]
+            by_space = sorted(range(len(errors)), key=errors.__getitem__)
             by_space, best = by_space[: max(1, count // 4)], by_space[0]
         chosen = [best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)]
         parents: Array = np.array([self._place(self.tried[n]) for n in chosen])
@@ -169,13 +167,3 @@ class CandidateSearch:
         logs = np.log([gains[knob.name] for knob in self.space.knobs])
         place: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
         return place
-
-
-def _parts(total: int, count: int) -> list[int]:
-    """Returns a total in parts that differ by one at most."""
-    return [total // count + (n < total % count) for n in range(count)]
-
-
-def _unsettled_rank(score: CandidateScore) -> tuple[bool, float]:
-    """Sorts runs that did not settle: diverged ones last, else by error."""
-    return score.outcome is CandidateClass.DIVERGED, score.error_rad or 0.0
