@@ -1,4 +1,4 @@
-"""Batches of messages in play order: arrays of numbers over a few large byte buffers.
+"""Batches of messages in play order: an array of numbers over a few large byte buffers.
 
 Invariant: messages play by time and never out of order within a channel, whose order is that of its numbers.
 A message that stands later in the file than its number says (a backfilled one) plays in its place: at the
@@ -10,26 +10,30 @@ A minute of 9000 messages/s takes some 100 MiB in this form, a third of the size
 import struct
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
+Bytes = bytes | bytearray | memoryview
+
+_COLUMNS = 5
+"""Numbers of a message: time in ns since the epoch, channel, number in the channel, bounds of its payload."""
+_HEAD = struct.Struct("<Q")
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
-    """Returns the places of messages in the order of play, and when each is due.
+    """Returns the places of messages in play order, and their deadlines.
 
     Args:
-        times_ns: when each was sent or came, ns, shape (K,), in file order.
-        channels: its channel, shape (K,).
-        numbers: its number in its channel, shape (K,); equal ones stay in file order.
+        times_ns: time of sending or arrival, ns, shape (K,), in file order.
+        channels: channel of each, shape (K,).
+        numbers: number in its channel, shape (K,); equal ones stay in file order.
 
     Returns:
-        The places, shape (K,), and the times in that order, ns, shape (K,): no time is less than the one
-        before, and none is more than the given one.
+        The places, shape (K,), and the deadlines in that order, ns, shape (K,): ascending, and none later
+        than the message's time.
     """
     places = np.arange(len(times_ns), dtype=np.int64)
     due_ns, file_places = times_ns.copy(), places.copy()
@@ -37,66 +41,60 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
         own = np.flatnonzero(channels == channel)
         own = own[np.argsort(numbers[own], kind="stable")]
         # no message after the next one of its channel, in time or, within an instant, in place
-        due_ns[own] = _no_later_than_the_next(times_ns[own])
-        file_places[own] = _no_later_than_the_next(places[own])
+        due_ns[own] = np.minimum.accumulate(times_ns[own][::-1])[::-1]
+        file_places[own] = np.minimum.accumulate(places[own][::-1])[::-1]
     order = np.lexsort((numbers, file_places, due_ns)).astype(np.int64)
     return order, due_ns[order]
 
 
-def _no_later_than_the_next(values: Ints) -> Ints:
-    return np.minimum.accumulate(values[::-1])[::-1]
-
-
-Bytes = bytes | bytearray | memoryview
-
-_HEAD = struct.Struct("<QQ")
-_FIELDS = 5
-
-
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Some messages.
+    """Messages: a row of numbers each (see `_COLUMNS`), shape (K, 5), over the bytes of their payloads."""
 
-    Attributes:
-        times_ns: when each is due, ns since the epoch of its log, shape (K,).
-        channels: which channel it is of, shape (K,).
-        numbers: its number there, shape (K,).
-        starts: where its payload begins in `data`, shape (K,).
-        ends: where it ends, shape (K,).
-        data: the payloads.
-    """
-
-    times_ns: Ints
-    channels: Ints
-    numbers: Ints
-    starts: Ints
-    ends: Ints
+    rows: Ints
     data: Bytes
 
     def __len__(self) -> int:
-        return len(self.times_ns)
+        return len(self.rows)
+
+    @property
+    def times_ns(self) -> Ints:
+        """Deadline of each, ns since the epoch of its log, shape (K,)."""
+        return self.rows[:, 0]
+
+    @property
+    def channels(self) -> Ints:
+        """Channel of each, shape (K,)."""
+        return self.rows[:, 1]
+
+    @property
+    def numbers(self) -> Ints:
+        """Number of each in its channel, shape (K,)."""
+        return self.rows[:, 2]
+
+    @property
+    def sizes(self) -> Ints:
+        """Bytes of each payload, shape (K,)."""
+        return self.rows[:, 4] - self.rows[:, 3]
 
     def payload(self, index: int) -> bytes:
         """Returns a payload."""
-        return bytes(self.data[self.starts[index] : self.ends[index]])
+        start, end = self.rows[index, 3:]
+        return bytes(self.data[start:end])
+
+    def payloads(self) -> bytes:
+        """Returns all payloads, one behind the other."""
+        return b"".join(map(self.payload, range(len(self))))
 
     def messages(self) -> Iterator[tuple[int, int, int, bytes]]:
         """Yields (time in ns, channel, number, payload) of every message."""
         view = memoryview(self.data)
-        columns = (self.times_ns, self.channels, self.numbers, self.starts, self.ends)
-        for t_ns, channel, number, start, end in zip(*(c.tolist() for c in columns), strict=True):
+        for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, places: slice | Ints | NDArray[np.bool_]) -> "MessageBatch":
         """Returns some of the messages, over the same bytes."""
-        return MessageBatch(
-            self.times_ns[places],
-            self.channels[places],
-            self.numbers[places],
-            self.starts[places],
-            self.ends[places],
-            self.data,
-        )
+        return MessageBatch(self.rows[places], self.data)
 
     def pieces(self, count: int) -> Iterator["MessageBatch"]:
         """Yields the messages in pieces of at most `count`, over the same bytes."""
@@ -104,89 +102,73 @@ class MessageBatch:
             yield self.part(slice(first, first + count))
 
     def once(self) -> "MessageBatch":
-        """Returns the messages without those that are there before: as in two parts of one session."""
+        """Returns the messages without repetitions of number and payload, as in two parts of one session."""
         order = np.lexsort((self.numbers, self.channels))
-        channels, numbers = self.channels[order], self.numbers[order]
-        again = np.flatnonzero((channels[1:] == channels[:-1]) & (numbers[1:] == numbers[:-1])) + 1
-        if not len(again):
-            return self
+        keys = self.rows[order, 1:3]
+        repeated = np.flatnonzero((keys[1:] == keys[:-1]).all(axis=1)) + 1
         kept = np.ones(len(self), dtype=np.bool_)
         payloads: set[bytes] = set()
         before = -1
-        for n in again.tolist():
+        for n in repeated.tolist():
             if n != before + 1:  # another run of messages that have one number
                 payloads = {self.payload(order[n - 1])}
             payload, before = self.payload(order[n]), n
             kept[order[n]] = payload not in payloads
             payloads.add(payload)
-        return self.part(kept)
+        return self.part(kept) if len(repeated) else self
 
     def packed(self) -> bytes:
-        """Returns the messages as bytes of their own, for another process."""
-        payloads = b"".join(self.payload(index) for index in range(len(self)))
-        ends = np.cumsum(self.ends - self.starts)
-        fields = (self.times_ns, self.channels, self.numbers, ends - (self.ends - self.starts), ends)
-        return b"".join([_HEAD.pack(len(self), len(payloads)), *(f.tobytes() for f in fields), payloads])
+        """Returns the messages as bytes for another process, see `unpack_batch`."""
+        rows = self.rows.copy()
+        rows[:, 4] = np.cumsum(self.sizes)
+        rows[:, 3] = rows[:, 4] - self.sizes
+        return _HEAD.pack(len(self)) + rows.tobytes() + self.payloads()
 
 
 def unpack_batch(packed: Bytes) -> MessageBatch:
-    """Returns the messages that `Block.packed` made bytes of."""
-    count, _ = _HEAD.unpack_from(packed)
-    edges = [_HEAD.size + n * count * 8 for n in range(_FIELDS + 1)]
+    """Returns the messages that `MessageBatch.packed` encoded."""
+    (count,) = _HEAD.unpack_from(packed)
+    end = _HEAD.size + 8 * _COLUMNS * count
     view = memoryview(packed)
-    fields = [np.frombuffer(view[begin:end], dtype=np.int64) for begin, end in pairwise(edges)]
-    times_ns, channels, numbers, starts, ends = fields
-    return MessageBatch(times_ns, channels, numbers, starts, ends, view[edges[-1] :])
+    rows = np.frombuffer(view[_HEAD.size : end], dtype=np.int64)
+    return MessageBatch(rows.reshape(-1, _COLUMNS), view[end:])
 
 
 class BatchBuilder:
-    """Messages as they come out of a file, until they are put in order.
-
-    Attributes:
-        size: bytes of their payloads.
-    """
+    """Messages as they are read from a file, until they are put in order."""
 
     def __init__(self) -> None:
-        self.size = 0
         self._payloads = bytearray()
-        self._times_ns, self._channels, self._numbers = array("q"), array("q"), array("q")
-        self._ends = array("q")
+        self._rows = array("q")
 
     def __len__(self) -> int:
-        return len(self._ends)
+        return len(self._rows) // _COLUMNS
 
     @property
     def memory(self) -> int:
-        """Bytes that all of it takes."""
-        return self.size + 5 * 8 * len(self)
+        """Bytes that all messages take."""
+        return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
         """Adds a message."""
+        start = len(self._payloads)
         self._payloads += payload
-        self.size += len(payload)
-        self._times_ns.append(t_ns)
-        self._channels.append(channel)
-        self._numbers.append(number)
-        self._ends.append(self.size)
+        self._rows.extend((t_ns, channel, number, start, len(self._payloads)))
 
-    def keep(self, block: MessageBatch) -> None:
+    def keep(self, batch: MessageBatch) -> None:
         """Adds messages that were put in order before, in the order of their file."""
-        kept = block.part(np.argsort(block.starts, kind="stable"))
-        ends = self.size + np.cumsum(kept.ends - kept.starts)
-        self._payloads += b"".join(map(kept.payload, range(len(kept))))
-        self.size = len(self._payloads)
-        self._times_ns.frombytes(kept.times_ns.tobytes())
-        self._channels.frombytes(kept.channels.tobytes())
-        self._numbers.frombytes(kept.numbers.tobytes())
-        self._ends.frombytes(ends.tobytes())
+        kept = batch.part(np.argsort(batch.rows[:, 3], kind="stable"))
+        rows = kept.rows.copy()
+        rows[:, 4] = len(self._payloads) + np.cumsum(kept.sizes)
+        rows[:, 3] = rows[:, 4] - kept.sizes
+        self._payloads += kept.payloads()
+        self._rows.frombytes(rows.tobytes())
 
     def ordered(self) -> MessageBatch:
-        """Returns the messages in the order of play, each once; the payloads stay where they are."""
-        times_ns, channels, numbers, ends = (
-            np.array(column, dtype=np.int64)
-            for column in (self._times_ns, self._channels, self._numbers, self._ends)
-        )
-        starts = np.concatenate(([0], ends[:-1])) if len(ends) else ends
-        once = MessageBatch(times_ns, channels, numbers, starts, ends, self._payloads).once()
+        """Returns the messages in play order, each once; the payloads stay in place."""
+        rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
+        once = MessageBatch(rows, self._payloads).once()
         order, due_ns = order_for_play(once.times_ns, once.channels, once.numbers)
-        return replace(once.part(order), times_ns=due_ns)
+        ordered = once.rows[order]
+        ordered[:, 0] = due_ns
+        return MessageBatch(ordered, self._payloads)

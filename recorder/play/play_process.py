@@ -21,17 +21,17 @@ from trilat_net.net.discovery import open_playback_bus, refuse_running_session
 from .batch import MessageBatch
 from .pace import LatenessSummary, Pace
 from .player import Player, PlayProgress
-from .reader_process import MemorySource, MessageSource, ProcessSource
+from .reader_process import MessageSource, ProcessSource
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
 POLL_NS = 5_000_000
 AHEAD_NS = 500_000_000
-"""How long before its first message a replay says when that is."""
+"""Time before its first message at which a playback announces it."""
 LISTEN_NS = 5_000_000_000
-"""How long to wait for a recorder that has announced itself to listen."""
+"""Longest wait for an announced recorder to listen."""
 LINGER_NS = 5_000_000_000
-"""How long to stay afterwards for recorders, from their last question on."""
+"""How long to stay for recorders at the end, after their last query."""
 LAST_EVENT_NS = 100_000_000
 NICE = -10
 PROGRESS_EVERY_NS = 500_000_000
@@ -42,11 +42,11 @@ class PlayOptions:
     """How a log is played.
 
     Attributes:
-        session: the name of the session that others see.
-        rate: seconds of the log in a second; `math.inf`: as fast as everybody takes it.
-        loop: round after round.
-        low_cpu: sleep to the deadlines.
-        needs_recorder: do not begin without a recorder.
+        session: name of the session that others see.
+        rate: seconds of the log per second; `math.inf`: as fast as all receivers take it.
+        loop: whether to play it round after round.
+        low_cpu: whether to sleep to the deadlines.
+        needs_recorder: whether to wait for a recorder.
     """
 
     session: str
@@ -58,19 +58,19 @@ class PlayOptions:
 
 @dataclass(frozen=True, slots=True)
 class PlaybackSummary:
-    """What came of a replay.
+    """The result of a playback.
 
     Attributes:
         counts: messages published, by topic of the file.
         rounds: rounds begun.
-        lateness: how late they were; None where nothing was due at a time.
-        took_s: how long it took, from the first message to the last, s.
-        held_s: for how long others were waited for that did not keep up, s.
-        cut: how often somebody took nothing for 5 s and was cut off.
+        lateness: their lateness; None if they had no deadline.
+        took_s: time from the first message to the last, s.
+        held_s: time spent waiting for receivers that did not keep up, s.
+        cut: how often a receiver took nothing for 5 s and was cut off.
         strays: messages that stood so far from their turn in the file that they were not played in it.
-        recorders: recorders that were there after the last message.
-        stored: whether all of them said that they have everything.
-        told: messages given once more to recorders that had missed them.
+        recorders: recorders that were present after the last message.
+        stored: whether all of them reported that they have everything.
+        refilled: messages given again to recorders that had missed them.
         torn: files that are not whole, and why.
     """
 
@@ -83,61 +83,59 @@ class PlaybackSummary:
     strays: int
     recorders: int
     stored: bool
-    told: int
+    refilled: int
     torn: dict[Path, str]
 
 
 class Playback:
-    """One replay in a session of its own.
+    """One playback in a session of its own.
 
     Args:
         bus: the connection.
         clock: the time.
-        facts: what the log says of its session.
+        header: the session in the log.
         source: its messages.
         options: how it is played.
-        stopped: True once it was asked to end.
-        say: tells a person what happens.
-        show: tells a person now and then where the play is.
+        stopped: True once it should end.
+        say: prints a line for the user.
+        show: shows the progress now and then.
     """
 
     def __init__(
         self,
         bus: Bus,
         clock: Clock,
-        facts: SessionHeader,
+        header: SessionHeader,
         source: MessageSource,
         options: PlayOptions,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
         show: Callable[[PlayProgress], None],
     ) -> None:
-        self._bus, self._clock, self._facts, self._source = bus, clock, facts, source
+        self._bus, self._clock, self._header, self._source = bus, clock, header, source
         self._options, self._stopped, self._say, self._show = options, stopped, say, show
-        memory = PlayedHistory(None if source.whole else HORIZON_NS)
-        self._cast = SiteStandIns(bus, clock, options.session, facts, memory)
+        history = PlayedHistory(None if source.whole else HORIZON_NS)
+        self._stand_ins = SiteStandIns(bus, clock, options.session, header, history)
         self._shown_ns = clock.monotonic_ns()
         self._player = Player(
-            source, memory, clock, self._publisher, self._attend, stopped, low_cpu=options.low_cpu
+            source, history, clock, self._publisher, self._attend, stopped, low_cpu=options.low_cpu
         )
 
     def _publisher(self, channel: int) -> Callable[[bytes], None]:
-        key = map_key_to_session(self._facts.topics[channel], self._facts.session, self._options.session)
+        key = map_key_to_session(self._header.topics[channel], self._header.session, self._options.session)
         return self._bus.publisher(key, patient=True)
 
     def _attend(self, progress: PlayProgress) -> None:
-        """Does a little of all that is not playing."""
-        self._cast.attend()
+        self._stand_ins.attend()
         now_ns = self._clock.monotonic_ns()
         if now_ns - self._shown_ns >= PROGRESS_EVERY_NS:
             self._shown_ns = now_ns
             self._show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Plays, and stays until those who record it have everything.
+        """Plays from `start_ns` since the epoch of the log (None: from the first message) to the end.
 
-        Args:
-            start_ns: where the play begins, ns since the epoch of the log; None: with the first message.
+        It stays until all recorders have everything.
         """
         clock, options = self._clock, self._options
         first_ns = self._player.prepare()
@@ -145,14 +143,14 @@ class Playback:
         begun_ns = clock.monotonic_ns() + AHEAD_NS
         if first_ns is not None:
             pace = Pace(begun_ns, first_ns if start_ns is None else start_ns, options.rate)
-            self._cast.run(pace)
+            self._stand_ins.begin(pace)
             self._player.play(pace, loop=options.loop)
         took_ns = max(0, clock.monotonic_ns() - begun_ns)
-        self._cast.attend()
-        recorders = set(self._cast.recorders)
-        self._stay()
+        self._stand_ins.attend()
+        recorders = set(self._stand_ins.recorders)
+        self._linger()
         return PlaybackSummary(
-            counts=dict(zip(self._facts.topics, self._player.counts, strict=False)),
+            counts=dict(zip(self._header.topics, self._player.counts, strict=False)),
             rounds=self._player.rounds,
             lateness=self._player.lateness if math.isfinite(options.rate) else None,
             took_s=took_ns / NS_PER_S,
@@ -160,36 +158,36 @@ class Playback:
             cut=self._player.stalls,
             strays=self._source.strays,
             recorders=len(recorders),
-            stored=self._cast.stored(recorders),
-            told=self._cast.told,
-            torn=self._facts.torn,
+            stored=self._stand_ins.stored(recorders),
+            refilled=self._stand_ins.refilled,
+            torn=self._header.torn,
         )
 
     def _await_recorders(self) -> None:
-        """Waits for recorders that have announced themselves, for one at least if that is asked for."""
-        clock, cast = self._clock, self._cast
+        """Waits for announced recorders, and for at least one if the options ask for it."""
+        clock, stand_ins = self._clock, self._stand_ins
         if self._options.needs_recorder:
             self._say("waiting for a recorder")
-        patience_ns = clock.monotonic_ns() + LISTEN_NS
+        give_up_ns = clock.monotonic_ns() + LISTEN_NS
         while not self._stopped():
-            cast.attend()
-            missing = self._options.needs_recorder and not cast.recorders
-            listening = cast.recorders_listen()
-            if not missing and (listening or clock.monotonic_ns() > patience_ns):
-                return
+            stand_ins.attend()
+            missing = self._options.needs_recorder and not stand_ins.recorders
+            listening = stand_ins.recorders_listen()
             if missing:
-                patience_ns = clock.monotonic_ns() + LISTEN_NS
+                give_up_ns = clock.monotonic_ns() + LISTEN_NS
+            elif listening or clock.monotonic_ns() > give_up_ns:
+                return
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
-    def _stay(self) -> None:
-        """Answers recorders until they have said that they have everything, or ask nothing for a while."""
-        clock, cast = self._clock, self._cast
+    def _linger(self) -> None:
+        """Answers recorders until they have everything, or have asked nothing for a while."""
+        clock, stand_ins = self._clock, self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
         while clock.monotonic_ns() < give_up_ns and not self._stopped():
-            if cast.attend():
+            if stand_ins.attend():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue
-            if not cast.recorders or cast.stored(cast.recorders):  # the last messages may still be under way
+            if stand_ins.stored(stand_ins.recorders):  # the last messages may still be under way
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
@@ -205,29 +203,26 @@ def play_log(
     say: Callable[[str], None],
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
-    """Plays a log over Zenoh.
+    """Plays a log over Zenoh; None if it was stopped before it began.
 
     Args:
-        loaded: what `loading.load` made of the files.
+        loaded: result of `preload_messages`.
         paths: the files.
-        selection: what is played of them.
-        options: how.
-        connection: how to take part in the network.
+        selection: the messages to play.
+        options: how to play them.
+        connection: the network.
         clock: the time.
-        stopped: True once it was asked to end.
-        say: tells a person what happens.
-        show: tells a person now and then where the play is.
-
-    Returns:
-        What came of it; None where it was asked to end before it had begun.
+        stopped: True once the playback should end.
+        say: prints a line for the user.
+        show: shows the progress now and then.
 
     Raises:
         SessionError: there is a session of that name.
         UsageError: an endpoint cannot be used.
         LogError: a file cannot be read any more.
     """
-    facts, block = loaded
-    # not SCHED_FIFO, as sites: who looks at the clock until it is time would keep Zenoh's own threads waiting
+    header, batch = loaded
+    # not SCHED_FIFO, as sites: polling the clock would starve Zenoh's own threads
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
     with ExitStack() as stack:
@@ -237,21 +232,21 @@ def play_log(
             return None
         stack.enter_context(closing(bus))
         refuse_running_session(bus, clock, options.session, stopped)
-        source: MessageSource = (
-            MemorySource(block) if block else ProcessSource(paths, selection, facts, loop=options.loop)
-        )
+        if batch is None:
+            source: MessageSource = ProcessSource(paths, selection, header, loop=options.loop)
+        else:
+            source = MessageSource(batch)
         stack.enter_context(closing(source))
-        replay = Playback(bus, clock, facts, source, options, stopped, say, show)
-        return replay.play(selection.start_ns)
+        playback = Playback(bus, clock, header, source, options, stopped, say, show)
+        return playback.play(selection.start_ns)
 
 
-def map_key_to_session(topic: str, was: str, session: str) -> str:
-    """Returns the key that a channel is played under.
+def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
+    """Returns the key of a channel in the playback's session.
 
-    Args:
-        topic: its topic in the file.
-        was: the session's name there; what is of that session is played as of the new one.
-        session: its name here; what is of none is played below it all the same, so that it meets nobody else.
+    A topic of the recorded session becomes one of the new session; any other topic is played below the new
+    session, so that it meets no other.
     """
     chunks = topic.strip("/").split("/")
-    return "/".join([topics.ROOT, session, *(chunks[2:] if chunks[:2] == [topics.ROOT, was] else chunks)])
+    own = chunks[:2] == [topics.ROOT, recorded_session]
+    return "/".join([topics.ROOT, session, *(chunks[2:] if own else chunks)])

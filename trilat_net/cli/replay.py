@@ -201,7 +201,7 @@ def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
         "strays": outcome.strays,
         "recorders": outcome.recorders,
         "stored": outcome.stored if outcome.recorders else None,
-        "told": outcome.told,
+        "told": outcome.refilled,
         "torn": {str(path): text for path, text in outcome.torn.items()},
     }
 
@@ -221,7 +221,7 @@ def _show(outcome: "PlaybackSummary") -> None:
     out.print(f"{total}{rounds}{how}{held}{dropped}", soft_wrap=True)
     if outcome.recorders:
         has = "has everything" if outcome.stored else "has not said that it has everything"
-        given = f"; it was given {outcome.told} messages that it had missed" if outcome.told else ""
+        given = f"; it was given {outcome.refilled} messages that it had missed" if outcome.refilled else ""
         out.print(f"the recorder {has}{given}", soft_wrap=True)
 
 

@@ -1,9 +1,9 @@
 """A log that is read while it plays is the same log."""
 
 import io
-import json
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +17,8 @@ from recorder.play.reader_process import (
     TOPIC_FRAME,
     MessageSorter,
     ProcessSource,
+    ReaderOrder,
+    RoundEnd,
     feed_player,
     split_batch,
 )
@@ -27,13 +29,12 @@ from trilat_net.errors import LogError
 from .logs import write
 
 LARGE = 1 << 28
-ORDER = {"include": [], "exclude": [], "start_ns": None, "stop_ns": None, "time": "publish"}
 
 
 class Given:
     """A reading whose messages are given."""
 
-    facts = None
+    header = None
 
     def __init__(self, messages: list[PlayedMessage]) -> None:
         self._messages = messages
@@ -69,7 +70,7 @@ def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
         made[channel] += 1
     messages = [message for _, message in sorted(sent, key=lambda entry: entry[0])]
     sorting = sorter(messages, 30, step_ns)
-    blocks = list(sorting.blocks())
+    blocks = list(sorting.batches())
     assert [message for block in blocks for message in block.messages()] == whole(messages)
     assert sorting.strays == 0
 
@@ -77,7 +78,7 @@ def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
 def test_what_stands_further_away_is_played_all_the_same_and_counted() -> None:
     rising = [PlayedMessage(t, 0, t, b"") for t in range(1, 100)]
     sorting = sorter([*rising, PlayedMessage(0, 0, 0, b"stray")], 30, 10)
-    played = [message for block in sorting.blocks() for message in block.messages()]
+    played = [message for block in sorting.batches() for message in block.messages()]
     assert len(played) == 100
     assert sorting.strays == 1
 
@@ -87,7 +88,7 @@ def test_what_would_be_too_much_to_hold_is_given_before_its_time() -> None:
     sorting = MessageSorter(
         Given([PlayedMessage(0, 0, n, bytes(100)) for n in range(1000)]), limit_bytes=20_000
     )  # type: ignore[arg-type]
-    blocks = list(sorting.blocks())
+    blocks = list(sorting.batches())
     assert [n for block in blocks for _, _, n, _ in block.messages()] == list(range(1000))
     assert max(map(len, blocks)) <= 20_000 // 100
     assert sorting.strays == 0
@@ -118,7 +119,7 @@ def joined(blocks: list[MessageBatch]) -> list[tuple[int, int, int, bytes]]:
 
 def test_it_writes_what_would_have_been_loaded(log_file: Path) -> None:
     sink = io.BytesIO()
-    feed_player({"paths": [str(log_file)], "loop": False, **ORDER}, sink)
+    feed_player(ReaderOrder([str(log_file)], PlaySelection(), loop=False), sink)
     found = frames(sink.getvalue())
     facts, block = preload_messages([log_file], PlaySelection(), LARGE)
     assert block is not None
@@ -126,12 +127,12 @@ def test_it_writes_what_would_have_been_loaded(log_file: Path) -> None:
     assert joined([unpack_batch(body) for kind, body in found if kind == BATCH_FRAME]) == list(
         block.messages()
     )
-    assert found[-1] == (END_FRAME, json.dumps({"strays": 0, "torn": {}}).encode())
+    assert found[-1] == (END_FRAME, msgspec.json.encode(RoundEnd(0, {})))
 
 
 def test_what_it_cannot_read_it_says(tmp_path: Path) -> None:
     sink = io.BytesIO()
-    feed_player({"paths": [str(tmp_path / "missing.mcap")], "loop": False, **ORDER}, sink)
+    feed_player(ReaderOrder([str(tmp_path / "missing.mcap")], PlaySelection(), loop=False), sink)
     ((kind, body),) = frames(sink.getvalue())
     assert kind == ERROR_FRAME
     assert "missing.mcap: cannot be read" in body.decode()
@@ -159,7 +160,7 @@ def test_a_process_of_its_own_gives_round_after_round(log_file: Path) -> None:
     try:
         for _ in range(3):
             assert joined(taken(source)) == list(block.messages())
-            source.again()
+            source.restart()
             assert not source.ended
         assert facts.topics == topics
     finally:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recorder.play.batch import BatchBuilder, MessageBatch
 from recorder.play.pace import Pace
 from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Player, PlayProgress
-from recorder.play.reader_process import MemorySource
+from recorder.play.reader_process import MessageSource
 from recorder.play.site_stand_ins import PlayedHistory
 
 from .clocks import LookedAt
@@ -48,7 +48,7 @@ class Trickle:
     def fill(self) -> bool:
         return False
 
-    def again(self) -> None:
+    def restart(self) -> None:
         self._left, self.ended = iter(self._blocks), False
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class Stage:
     """What a player needs, and what came of it: (when, on which channel, what)."""
 
     def __init__(
-        self, source: MemorySource | Trickle, *, low_cpu: bool = False, stop_at: int = 10**9
+        self, source: MessageSource | Trickle, *, low_cpu: bool = False, stop_at: int = 10**9
     ) -> None:
         self.clock = LookedAt()
         self.memory = PlayedHistory()
@@ -91,7 +91,7 @@ def test_every_message_is_published_once_in_order_at_its_deadline(
     pieces: list[MessageBatch | None] = []
     for begin, end in pairwise(edges):
         pieces += [whole.part(slice(begin, end)), None]
-    for source in (MemorySource(whole), Trickle(pieces)):
+    for source in (MessageSource(whole), Trickle(pieces)):
         stage = Stage(source, low_cpu=low_cpu)
         first_ns = stage.player.prepare()
         assert first_ns == whole.times_ns[0]
@@ -111,7 +111,7 @@ def test_every_message_is_published_once_in_order_at_its_deadline(
 
 def test_a_late_message_makes_no_later_one_late() -> None:
     """A publisher that waits for 30 ms: what was due meanwhile follows at once, the rest is in time."""
-    stage = Stage(MemorySource(block((t, 0) for t in range(60))))
+    stage = Stage(MessageSource(block((t, 0) for t in range(60))))
     stage.stall_ns[10] = 30 * MS
     pace = Pace(stage.clock.now_ns, 0)
     stage.player.prepare()
@@ -125,7 +125,7 @@ def test_a_late_message_makes_no_later_one_late() -> None:
 
 
 def test_who_makes_a_publisher_wait_for_seconds_is_counted() -> None:
-    stage = Stage(MemorySource(block([(0, 0), (1, 0)])))
+    stage = Stage(MessageSource(block([(0, 0), (1, 0)])))
     stage.stall_ns[1] = CUT_NS
     stage.player.prepare()
     stage.player.play(Pace(stage.clock.now_ns, 0))
@@ -133,7 +133,7 @@ def test_who_makes_a_publisher_wait_for_seconds_is_counted() -> None:
 
 
 def test_rounds_follow_each_other_with_the_same_messages() -> None:
-    stage = Stage(MemorySource(block([(0, 0), (5, 1), (7, 0)])), stop_at=7)
+    stage = Stage(MessageSource(block([(0, 0), (5, 1), (7, 0)])), stop_at=7)
     stage.player.prepare()
     pace = Pace(stage.clock.now_ns + MS, 0)
     stage.player.play(pace, loop=True)
@@ -150,7 +150,7 @@ def test_rounds_follow_each_other_with_the_same_messages() -> None:
 @pytest.mark.parametrize("count", [1, 5, 300])
 def test_it_stops_when_asked(count: int) -> None:
     """Between two messages, and no later than it looks at anything else."""
-    stage = Stage(MemorySource(block((t % 60, 0) for t in range(250))), stop_at=count)
+    stage = Stage(MessageSource(block((t % 60, 0) for t in range(250))), stop_at=count)
     stage.player.prepare()
     stage.player.play(Pace(stage.clock.now_ns, 0))
     assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
@@ -158,7 +158,7 @@ def test_it_stops_when_asked(count: int) -> None:
 
 def test_everything_else_has_its_turn_even_where_no_time_is_left() -> None:
     """As fast as can be: a hundred times a second; and while nothing is due: a thousand times."""
-    stage = Stage(MemorySource(block((0, 0) for _ in range(200))))
+    stage = Stage(MessageSource(block((0, 0) for _ in range(200))))
     for n in range(200):
         stage.stall_ns[n] = MS
     stage.player.prepare()
@@ -166,7 +166,7 @@ def test_everything_else_has_its_turn_even_where_no_time_is_left() -> None:
     looked = [ns for ns, _ in stage.looks]
     assert len(looked) >= 10
     assert max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
-    quiet = Stage(MemorySource(block([(0, 0), (60, 0)])))
+    quiet = Stage(MessageSource(block([(0, 0), (60, 0)])))
     quiet.player.prepare()
     quiet.player.play(Pace(quiet.clock.now_ns, 0))
     assert len(quiet.looks) >= 40

@@ -11,7 +11,7 @@ import pytest
 
 from recorder.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions, map_key_to_session
 from recorder.play.player import PlayProgress
-from recorder.play.reader_process import MemorySource
+from recorder.play.reader_process import MessageSource
 from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.net.waiting import drained
 from trilat_net.errors import SessionError
@@ -73,7 +73,7 @@ class Hall:
             bus,
             self.clock,
             facts,
-            MemorySource(block),
+            MessageSource(block),
             self.options,
             lambda: self.count >= self.stop_at,
             lambda _: None,
@@ -182,7 +182,7 @@ def test_the_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
     assert (unplayed.first, unplayed.payloads) == (290, [])
     assert links.payloads == published["s/link"][: links.made]
     assert drained(rings[4]) == []
-    assert outcome.told == sum(len(past.payloads) for past in (early, later, unplayed, links))
+    assert outcome.refilled == sum(len(past.payloads) for past in (early, later, unplayed, links))
 
 
 def test_a_recorder_that_comes_in_the_middle_learns_when_tick_0_was(log_file: Path) -> None:
