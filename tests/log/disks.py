@@ -1,4 +1,4 @@
-"""Disks that have little room, or take little at a time: stand-ins for `FileIO` and `Ballast`."""
+"""Disks that have little room, or take little at a time: stand-ins for `FileIO` and `DiskReserve`."""
 
 import errno
 import io

@@ -18,7 +18,7 @@ from trilat_net.analysis.file_overview import describe_files
 from trilat_net.errors import TrilatError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.mcap_records import RecordScanner, unpack_chunk
+from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
 from trilat_net.log.recover import recover_log
 from trilat_net.log.session_check import check_log
 
@@ -27,6 +27,9 @@ NUMBERS = (
     0,
     -1,
     1,
+    3,
+    119,
+    120,
     255,
     1 << 31,
     1 << 40,
@@ -34,9 +37,6 @@ NUMBERS = (
     (1 << 63) - 1,
     -(1 << 63),
     (1 << 64) - 1,
-    3,
-    119,
-    120,
 )
 VALUES: tuple[Any, ...] = (
     *NUMBERS,
@@ -70,19 +70,8 @@ VALUES: tuple[Any, ...] = (
 """What a field of a message may be turned into."""
 TEXTS = ("", "0", "-1", "9" * 400, "x" * 3000, "\x1b[31m", "live", "virtual", "m1 m2 s", "1e999", "²")
 SCENARIO_VALUES = (
-    "0x" + "f" * 300,
-    "-1",
-    "1e308",
-    "5e-324",
-    "nan",
-    "''",
-    "[]",
-    "{}",
-    "[[]]",
-    "true",
-    "86400",
-    "20000",
-    "1",
+    *("0x" + "f" * 300, "-1", "1e308", "5e-324", "nan", "''", "[]", "{}", "[[]]"),
+    *("true", "86400", "20000", "1"),
     "[1e308, 1e308]",
     "'/dev/zero'",
     "'0 0, 1 lost'",
@@ -183,13 +172,8 @@ def message_changed(data: bytes, draws: Draws) -> bytes:
     """A message of the log says something else, in one field or two."""
 
     def change(inside: bytes, draws: Draws) -> bytes:
-        places = []
-        at = 0
-        while at + 9 <= len(inside):
-            opcode, length = struct.unpack_from("<BQ", inside, at)
-            if opcode == 5:
-                places.append((at, length))
-            at += 9 + length
+        records = iterate_records(inside)
+        places = [(begin - 9, end - begin) for opcode, begin, end in records if opcode == 5]
         if not places:
             return inside
         for _ in range(draws.randrange(1, 4)):
@@ -212,27 +196,8 @@ def message_changed(data: bytes, draws: Draws) -> bytes:
 
 def field_changed(data: bytes, draws: Draws) -> bytes:
     """A field is another from some record of a site on."""
-    name = one_of(
-        draws,
-        (
-            "tick",
-            "t_ns",
-            "used",
-            "rx",
-            "cmd",
-            "mem",
-            "mode",
-            "late_us",
-            "boot",
-            "site",
-            "echo",
-            "v",
-            "sent_ns",
-            "rx_crc",
-            "busy_us",
-            "q",
-        ),
-    )
+    names = "tick t_ns used rx cmd mem mode late_us boot site echo v sent_ns rx_crc busy_us q"
+    name = one_of(draws, names.split())
     kinds = {"used": {}, "rx": [], "cmd": [], "mem": [], "echo": [], "q": [], "mode": "", "site": ""}
     value = another(kinds.get(name, 0), draws)
     since, site = draws.randrange(0, 30), one_of(draws, ("m1", "m2", "s"))
@@ -249,7 +214,7 @@ def field_changed(data: bytes, draws: Draws) -> bytes:
 
 def told_otherwise(data: bytes, draws: Draws) -> bytes:
     """The session's metadata say something else."""
-    keys = (
+    keys = [
         "session",
         "driver",
         "scenario_sha256",
@@ -258,8 +223,8 @@ def told_otherwise(data: bytes, draws: Draws) -> bytes:
         "sites",
         "fingerprint",
         "seed",
-        "rerun_executed",
-    )
+    ]
+    keys.append("rerun_executed")
     try:
         return edited(data, session={one_of(draws, keys): one_of(draws, TEXTS)})
     except Exception:

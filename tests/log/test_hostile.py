@@ -25,7 +25,7 @@ from tests.log_editing import edited, opened, recorded
 from trilat_net.analysis.file_overview import describe_files
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.verify import verify
-from trilat_net.log.mcap_records import RecordScanner, unpack_chunk
+from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
 from trilat_net.scenario import load_scenario, parse_embedded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
@@ -63,16 +63,12 @@ def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> byte
     framing = RecordScanner(io.BytesIO(log))
     first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
     inside, names = unpack_chunk(framing.content(first)), b""
-    channel, at = 0, 0
-    while at < len(inside):
-        opcode, length = struct.unpack_from("<BQ", inside, at)
-        record = inside[at : at + 9 + length]
-        if opcode == Opcode.MESSAGE:
-            if not channel and b"/m1/state" in names:
-                channel = struct.unpack_from("<H", record, 9)[0]
-        else:
-            names += record
-        at += len(record)
+    channel = 0
+    for opcode, begin, end in iterate_records(inside):
+        if opcode != Opcode.MESSAGE:
+            names += inside[begin - 9 : end]
+        elif not channel and b"/m1/state" in names:
+            channel = struct.unpack_from("<H", inside, begin)[0]
     padding = os.urandom(1_000_000)
     content = struct.pack("<QQIIQ", 0, 0, 0, 0, len(padding)) + padding + bytes(4)
     records = [

@@ -39,7 +39,7 @@ from .log_layout import (
 )
 from .mcap_writer import McapWriter, Sink
 from .ros2 import cdr
-from .ros2.viz_channels import MAX_PENDING_BYTES, TakeMessage, VizChannels
+from .ros2.viz_channels import TakeMessage, VizChannels
 
 
 class LogWriter:
@@ -145,7 +145,7 @@ class LogWriter:
     @property
     def most_bytes(self) -> int:
         """Largest length of the file without its accounts, if it were finished now."""
-        views = MAX_PENDING_BYTES * len(self._views.lanes) if self._views is not None else 0
+        views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.pending + self._file.owed + views
 
     def add(

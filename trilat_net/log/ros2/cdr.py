@@ -25,7 +25,7 @@ _LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
 
 
 def _schema(text: str, parts: dict[str, str] = {}) -> bytes:  # noqa: B006
-    """Returns a type with those that it stands on, as recorders of ROS 2 write it."""
+    """Returns a type with those that it uses, as recorders of ROS 2 write it."""
     rule = "=" * 80
     return "".join([text, *(f"{rule}\nMSG: {name}\n{part}" for name, part in parts.items())]).encode()
 
@@ -52,40 +52,40 @@ ROS2_SCHEMAS: dict[str, bytes] = {
         {"builtin_interfaces/Time": _TIME},
     ),
 }
-"""The text of every type that is packed here, complete, by its name."""
+"""Complete definitions of the types that are packed here, by name."""
 
 
 class _Fields:
-    """Fields of a message as bytes, from an offset on."""
+    """Packed fields of a message, from an offset on."""
 
     def __init__(self, offset: int = 0) -> None:
         self._offset = offset
         self.data = b""
 
-    def number(self, value: int) -> None:
+    def add_number(self, value: int) -> None:
         """Adds an unsigned number of 32 bits."""
         self.data += b"\0" * (-self.end % 4) + struct.pack("<I", value)
 
-    def text(self, text: str) -> None:
+    def add_text(self, text: str) -> None:
         """Adds a string."""
         data = text.encode()
-        self.number(len(data) + 1)
+        self.add_number(len(data) + 1)
         self.data += data + b"\0"
 
     @property
     def end(self) -> int:
-        """The offset behind them."""
+        """The offset after them."""
         return self._offset + len(self.data)
 
 
-def _time(stamp_ns: int) -> tuple[int, int]:
-    """Returns a stamp as ROS 2 has it, seconds and nanoseconds."""
+def _split_stamp(stamp_ns: int) -> tuple[int, int]:
+    """Returns a stamp as seconds and nanoseconds."""
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     return min(seconds, _LAST_S), rest_ns
 
 
-def _floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns the format of a list of numbers, its length first, and the offset behind it."""
+def _format_floats(offset: int, count: int) -> tuple[str, int]:
+    """Returns the format of a list of numbers, its length first, and the offset after it."""
     before = -offset % 4
     start = offset + before + 4
     gap = -start % 8 if count else 0  # an empty list has nothing to align
@@ -93,27 +93,20 @@ def _floats(offset: int, count: int) -> tuple[str, int]:
 
 
 class JointStatePacker:
-    """Packs `sensor_msgs/msg/JointState` of some joints.
-
-    Args:
-        names: the joints.
-        frame_id: what the header calls the frame.
-        velocity: whether messages have velocities.
-        effort: whether they have efforts.
-    """
+    """Packer of `sensor_msgs/msg/JointState` with these joints, with or without velocities and efforts."""
 
     def __init__(
         self, names: Sequence[str], frame_id: str = "", *, velocity: bool = True, effort: bool = True
     ) -> None:
-        fields = _Fields(8)  # behind the stamp
-        fields.text(frame_id)
-        fields.number(len(names))
+        fields = _Fields(8)  # after the stamp
+        fields.add_text(frame_id)
+        fields.add_number(len(names))
         for name in names:
-            fields.text(name)
+            fields.add_text(name)
         self._counts = [len(names) * present for present in (True, velocity, effort)]
         form, offset = f"<4siI{len(fields.data)}s", fields.end
         for count in self._counts:
-            part, offset = _floats(offset, count)
+            part, offset = _format_floats(offset, count)
             form += part
         self._names = fields.data
         self._pack = struct.Struct(form).pack
@@ -125,36 +118,29 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Returns one message.
-
-        Args:
-            stamp_ns: when, Unix ns, not below 0.
-            position: a number per joint, rad.
-            velocity: likewise, rad/s; none where messages have none.
-            effort: likewise, N m.
-        """
+        """Returns one message of a time (Unix ns, not below 0): rad, rad/s and N m per joint."""
         p, v, e = self._counts
-        return self._pack(_HEAD, *_time(stamp_ns), self._names, p, *position, v, *velocity, e, *effort)
+        return self._pack(_HEAD, *_split_stamp(stamp_ns), self._names, p, *position, v, *velocity, e, *effort)
 
 
 class ArrayDimension(NamedTuple):
-    """One dimension of an array: what it counts, and how many there are."""
+    """One dimension of an array: its label and its size."""
 
     label: str
     size: int
 
 
 def make_float_array_packer(*dimensions: ArrayDimension) -> Callable[..., bytes]:
-    """Returns what packs `std_msgs/msg/Float64MultiArray` of one shape, given its numbers, row by row."""
+    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers row by row."""
     fields = _Fields()
-    fields.number(len(dimensions))
+    fields.add_number(len(dimensions))
     sizes = [dimension.size for dimension in dimensions]
     for n, (label, size) in enumerate(dimensions):
-        fields.text(label)
-        fields.number(size)
-        fields.number(math.prod(sizes[n:]))
-    fields.number(0)  # data_offset
-    form, _ = _floats(fields.end, count := math.prod(sizes))
+        fields.add_text(label)
+        fields.add_number(size)
+        fields.add_number(math.prod(sizes[n:]))
+    fields.add_number(0)  # data_offset
+    form, _ = _format_floats(fields.end, count := math.prod(sizes))
     pack, shape = struct.Struct(f"<4s{len(fields.data)}s{form}").pack, fields.data
     return lambda *numbers: pack(_HEAD, shape, count, *numbers)
 
@@ -162,12 +148,12 @@ def make_float_array_packer(*dimensions: ArrayDimension) -> Callable[..., bytes]
 def pack_string(text: str) -> bytes:
     """Returns a `std_msgs/msg/String`."""
     fields = _Fields()
-    fields.text(text)
+    fields.add_text(text)
     return _HEAD + fields.data
 
 
 class RosLogLevel(IntEnum):
-    """How much a line of a log matters, by the numbers of ROS 2."""
+    """Severity of a line of a log, by the numbers of ROS 2."""
 
     INFO = 20
     WARN = 30
@@ -175,16 +161,9 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Returns an `rcl_interfaces/msg/Log`.
-
-    Args:
-        stamp_ns: when, Unix ns, not below 0.
-        level: how much it matters.
-        name: who says it.
-        text: what.
-    """
-    fields = _Fields(9)  # behind stamp and level
+    """Returns an `rcl_interfaces/msg/Log` of a member at a time (Unix ns, not below 0)."""
+    fields = _Fields(9)  # after stamp and level
     for part in (name, text, "", ""):  # no file, no function
-        fields.text(part)
-    fields.number(0)  # of no line
-    return _HEAD + struct.pack("<iIB", *_time(stamp_ns), level) + fields.data
+        fields.add_text(part)
+    fields.add_number(0)  # of no line
+    return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields.data

@@ -32,15 +32,13 @@ from .cdr import (
 )
 
 EVENTS, LINES = "events", "log"
-"""Channels of a whole session: what happened, as plain text, and as lines with a time and a level."""
-
-
+"""Channels of a whole session: events as plain text, and as lines with a time and a level."""
 SLOW_ARRAYS = {"tau_x": JOINTS, "theta_hat": PARAMETERS, "mode": 1}
-"""What a record has besides its joints and their error: arrays, in order, and how many numbers each has."""
+"""Arrays of a record besides its joints and their error, in order, and how many numbers each has."""
 
 
 class Ros2Channel(NamedTuple):
-    """A standard channel: the type of its messages, and what to say of it in the file."""
+    """A standard channel: the type of its messages, and its metadata."""
 
     kind: str
     about: dict[str, str]
@@ -61,29 +59,18 @@ _MODES = {mode.name.lower(): float(mode) for mode in Mode}
 
 
 def mode_number(mode: str | Mode) -> float:
-    """Returns the number of a mode, see `core.tick.Mode`; 0 for none of them."""
+    """Returns the number of a mode of `core.ticks.Mode`; 0 for none of them."""
     return float(mode) if isinstance(mode, Mode) else _MODES.get(mode, 0.0)
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Yields what an event is in the channels of the session.
-
-    Args:
-        event: the event.
-        stamp_ns: when it happened, Unix ns, not below 0.
-    """
+    """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below 0."""
     yield EVENTS, pack_string(f"{event.member}: {event.text}")
     yield LINES, pack_log(stamp_ns, _LEVELS.get(event.kind, RosLogLevel.INFO), event.member, event.text)
 
 
 class ArrayChannel:
-    """A channel of `std_msgs/msg/Float64MultiArray`.
-
-    Args:
-        content: what the numbers are.
-        unit: their unit.
-        axes: names along each dimension.
-    """
+    """A channel of `std_msgs/msg/Float64MultiArray`: content and unit of its numbers, names on its axes."""
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
         self.channel = Ros2Channel(
@@ -99,11 +86,7 @@ class ArrayChannel:
 
 
 class Ros2SiteChannels:
-    """The standard channels of one site.
-
-    Args:
-        site: its name.
-        peers: its peers in scenario order.
+    """The standard channels of one site with its peers in scenario order.
 
     Attributes:
         joints: names of its joints.
@@ -135,14 +118,14 @@ class Ros2SiteChannels:
         return Ros2Channel(JOINT_STATE, {"unit": "rad, rad/s" + ", N m" * effort, "names": " ".join(names)})
 
     def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one record, from all their numbers in the order of `SLOW`."""
+        """Yields the arrays of one record, from all their numbers in the order of `SLOW_ARRAYS`."""
         start = 0
         for name, size in SLOW_ARRAYS.items():
             yield name, self.arrays[name].pack(*row[start : start + size])
             start += size
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one statistics; clocks and networks only where there are any."""
+        """Yields the arrays of one statistics; those of clocks and networks only in a live session."""
         arrays, peers = self.arrays, self._peers
         if not peers:
             return
@@ -157,12 +140,12 @@ class Ros2SiteChannels:
 
 
 def _ms(us: int) -> float:
-    """Returns milliseconds; NaN where nothing was measured."""
+    """Returns milliseconds; NaN if nothing was measured."""
     return us / 1e3 if us != -1 else math.nan
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Returns the standard channels of a finished file, by topic; none of one that cannot be read so.
+    """Returns the standard channels of a finished file by topic, {} if it has no readable index.
 
     Raises:
         LogError: the file cannot be opened.

@@ -36,63 +36,52 @@ from .ros2_messages import (
 VIZ_HZ = 100.0
 """Messages a second by default, of the joints and their error."""
 SLOW_VIZ_HZ = 10.0
-"""Of exogenous torque, estimate and mode; but all of them where the joints are full."""
+"""Of exogenous torque, estimate and mode; but all of them if the joints are at full rate."""
 FULL_RATE_HZ = math.inf
 """A message per record."""
 
 MAX_PENDING_BYTES = 1 << 13
-"""What the views of a site have still to write, at most."""
+"""Most bytes that the channels of a site have still to write."""
 
 PutMessage = Callable[[str, bytes, int, int], None]
 """Writes one message: topic, bytes, publish time and log time, Unix ns."""
 TakeMessage = Callable[[Any, int], None]
 """Takes one message of the log's own, and its log time, Unix ns."""
 StampedRow = tuple[int, SignalRow]
-"""A stamp, Unix ns, and what bears it."""
+"""A stamp, Unix ns, and its signals."""
 
 _tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Lets a bucket out: its first moment at once, its second when it is asked for, or another comes.
+    """Output of buckets: the first row at once, the second by `flush` or before the next bucket.
 
-    Args:
-        write: writes what bears a stamp: stamp and log time, Unix ns.
+    `write` takes stamp, signals and log time.
     """
 
     def __init__(self, write: Callable[[int, SignalRow, int], None]) -> None:
         self._write = write
         self._waiting: Sequence[StampedRow] = ()
 
-    def add(self, moments: Sequence[StampedRow], log_ns: int) -> None:
-        """Takes a bucket that is over: two moments, or one."""
-        self.rest(log_ns)
-        self._write(*moments[0], log_ns)
-        self._waiting = moments[1:]
+    def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
+        """Takes a closed bucket: two rows, or one."""
+        self.flush(log_ns)
+        self._write(*rows[0], log_ns)
+        self._waiting = rows[1:]
 
-    def rest(self, log_ns: int) -> None:
-        """Lets out what waits."""
-        for moment in self._waiting:
-            self._write(*moment, log_ns)
+    def flush(self, log_ns: int) -> None:
+        """Writes the row that waits."""
+        self.add_late(self._waiting, log_ns)
         self._waiting = ()
 
-    def beside(self, moments: Sequence[StampedRow], log_ns: int) -> None:
-        """Lets out a bucket at once."""
-        for moment in moments:
-            self._write(*moment, log_ns)
+    def add_late(self, rows: Sequence[StampedRow], log_ns: int) -> None:
+        """Writes a bucket at once."""
+        for row in rows:
+            self._write(*row, log_ns)
 
 
 class _SiteVizWriter:
-    """Writes the messages of one site.
-
-    Args:
-        site: its name.
-        peers: its peers in scenario order.
-        put: writes a message.
-
-    Attributes:
-        channels: its channels, by topic.
-    """
+    """Writer of the messages of one site with its peers in scenario order; has its channels by topic."""
 
     def __init__(self, site: str, peers: Sequence[str], put: PutMessage) -> None:
         self._put = put
@@ -101,7 +90,9 @@ class _SiteVizWriter:
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{root}joint_states", JointStatePacker(names)
         self._error_topic, self._error = f"{root}error", shapes.arrays["error"].pack
-        self._none = [math.nan] * len(shapes.joints)  # what is not shown of a reference: size is dear
+        self._none = [math.nan] * len(
+            shapes.joints
+        )  # velocity and effort of a reference are left out: size is dear
         self._topics = {name: f"{root}{name}" for name in shapes.arrays}
         self.channels: dict[str, Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
@@ -128,21 +119,14 @@ class _SiteVizWriter:
 
 
 class _SiteBuckets:
-    """The buckets of one site.
+    """Buckets of one site at `views_hz` messages a second of the joints."""
 
-    Args:
-        writing: writes its messages.
-        rate_hz: its tick rate.
-        views_hz: messages a second of the joints.
-        epoch_unix_ns: Unix time of tick 0.
-    """
-
-    def __init__(self, writing: _SiteVizWriter, rate_hz: int, views_hz: float, epoch_unix_ns: int) -> None:
-        self._writing, self._rate_hz, self._epoch_unix_ns = writing, rate_hz, epoch_unix_ns
+    def __init__(self, writer: _SiteVizWriter, rate_hz: int, views_hz: float, epoch_unix_ns: int) -> None:
+        self._writer, self._rate_hz, self._epoch_unix_ns = writer, rate_hz, epoch_unix_ns
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
         self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
-        self._fast, self._slow = _BucketOutput(writing.fast), _BucketOutput(writing.slow)
-        self._bucket = self._first = self._turn = 0  # the open bucket, its first tick, the end of a half
+        self._fast, self._slow = _BucketOutput(writer.fast), _BucketOutput(writer.slow)
+        self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
         self._open: list[Record] = []
         self._slow_open: list[StampedRow] = []
         self._late: list[Record] = []
@@ -153,41 +137,41 @@ class _SiteBuckets:
         if tick < self._first:
             self._take_late(message, log_ns)
             return
-        if tick >= self._turn:
+        if tick >= self._half_end:
             self._advance(tick // self._half, log_ns)
         self._open.append(message)
 
     def statistics(self, stats: LinkStats, log_ns: int) -> None:
         """Takes the statistics of the site's loop."""
-        self._writing.statistics(max(0, self._epoch_unix_ns + stats.t_ns), stats, log_ns)
+        self._writer.statistics(max(0, self._epoch_unix_ns + stats.t_ns), stats, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Lets out what there is."""
+        """Writes all that is open."""
         self._close(self._bucket + 2 * self._ratio, log_ns)
-        self._fast.rest(log_ns)
-        self._slow.rest(log_ns)
+        self._fast.flush(log_ns)
+        self._slow.flush(log_ns)
 
     def _advance(self, half: int, log_ns: int) -> None:
-        """Goes on to another half of a bucket."""
-        self._fast.rest(log_ns)
+        """Begins another half of a bucket."""
+        self._fast.flush(log_ns)
         if half // 2 != self._bucket:
             self._close(half // 2, log_ns)
-        self._turn = (half + 1) * self._half
+        self._half_end = (half + 1) * self._half
 
     def _close(self, bucket: int, log_ns: int) -> None:
         """Closes the open bucket, and begins another."""
         self._flush_late(log_ns)
         if self._open:
-            moments = self._moments(self._open)
-            self._fast.add([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in moments], log_ns)
-            self._slow_open += [(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in moments]
+            rows = self._decimate(self._open)
+            self._fast.add([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in rows], log_ns)
+            self._slow_open += [(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows]
             self._open = []
         half, was = 2 * bucket // self._ratio, 2 * self._bucket // self._ratio
         if half != was:
-            self._slow.rest(log_ns)
+            self._slow.flush(log_ns)
         if half // 2 != was // 2 and self._slow_open:
-            stamps_ns, rows = zip(*self._slow_open, strict=True)
-            self._slow.add(_two(stamps_ns, zip(*rows, strict=True)), log_ns)
+            stamps_ns, signals = zip(*self._slow_open, strict=True)
+            self._slow.add(_stamp_extremes(stamps_ns, zip(*signals, strict=True)), log_ns)
             self._slow_open = []
         self._bucket, self._first = bucket, 2 * self._half * bucket
 
@@ -200,23 +184,23 @@ class _SiteBuckets:
 
     def _flush_late(self, log_ns: int) -> None:
         if self._late:
-            moments = self._moments(self._late)
-            self._fast.beside([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in moments], log_ns)
-            self._slow.beside([(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in moments], log_ns)
+            rows = self._decimate(self._late)
+            self._fast.add_late([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in rows], log_ns)
+            self._slow.add_late([(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows], log_ns)
             self._late = []
 
-    def _moments(self, records: list[Record]) -> list[StampedRow]:
-        """Returns a bucket's envelope: two moments, or one of a single record."""
+    def _decimate(self, records: list[Record]) -> list[StampedRow]:
+        """Returns the extremes of a bucket: two rows, or one of a single record."""
         records.sort(key=_tick)  # they nearly always are
         stamps_ns = [
             max(0, self._epoch_unix_ns + record.tick * NS_PER_S // self._rate_hz)
             for record in (records[0], records[len(records) // 2])
         ]
-        return _two(stamps_ns[: len(records)], stack_signals(records))
+        return _stamp_extremes(stamps_ns[: len(records)], stack_signals(records))
 
 
 def parse_viz_rate(text: str) -> float:
-    """Returns the messages a second that a person asks for: a number from 1 on, or "off" or "full".
+    """Returns the messages a second of the option `--views`: a number from 1 on, or "off" or "full".
 
     Raises:
         UsageError: it is none of them.
@@ -231,8 +215,8 @@ def parse_viz_rate(text: str) -> float:
     return rate_hz
 
 
-def _two(stamps_ns: Sequence[int], columns: Iterable[SignalRow]) -> list[StampedRow]:
-    """Returns the envelope of columns at the first and the middle of their stamps; of one row only that."""
+def _stamp_extremes(stamps_ns: Sequence[int], columns: Iterable[SignalRow]) -> list[StampedRow]:
+    """Returns the extremes of columns at the first and the middle of their stamps; a single row as it is."""
     chosen = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])[: len(stamps_ns)]
     return list(zip(chosen, decimate_min_max(columns)))  # noqa: B905 - of a single row both are the same
 
@@ -241,16 +225,15 @@ class VizChannels:
     """The standard channels of a log while it is written.
 
     Args:
-        scenario: what runs.
+        scenario: the scenario that runs.
         session: the session's name.
         epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
-        views_hz: messages a second of the joints; `FULL` for one per record.
+        views_hz: messages a second of the joints; `FULL_RATE_HZ` for one per record.
         put: writes a message.
 
     Attributes:
-        channels: every channel there may be, by topic.
-        takers: what takes the log's own messages, by their key.
-        lanes: the buckets of every site.
+        channels: all channels that may occur, by topic.
+        takers: functions that take the log's own messages, by their key.
     """
 
     def __init__(
@@ -263,38 +246,38 @@ class VizChannels:
         self.takers: dict[str, TakeMessage] = {
             topics.key(session, topics.RECORDER, topics.EVENT): self._event
         }
-        self.lanes = []
+        self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
             rate_hz = scenario.sites[site].rate_hz
-            writing = _SiteVizWriter(site, scenario.peers(site), put)
-            lane = _SiteBuckets(writing, rate_hz, views_hz, epoch_unix_ns)
-            self.lanes.append(lane)
-            self.channels |= writing.channels
-            self.takers[topics.key(session, site, topics.STATE)] = lane.record
-            self.takers[topics.key(session, site, topics.LINK)] = lane.statistics
+            writer = _SiteVizWriter(site, scenario.peers(site), put)
+            buckets = _SiteBuckets(writer, rate_hz, views_hz, epoch_unix_ns)
+            self._buckets.append(buckets)
+            self.channels |= writer.channels
+            self.takers[topics.key(session, site, topics.STATE)] = buckets.record
+            self.takers[topics.key(session, site, topics.LINK)] = buckets.statistics
             self.takers[topics.key(session, site, topics.EVENT)] = self._event
 
     def _event(self, event: Event, log_ns: int) -> None:
-        """Writes an event as of when it came: members that send at once need not arrive in that order."""
+        """Writes an event with its time of arrival: events sent at once may arrive in another order."""
         stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
         for name, data in pack_event(event, stamp_ns):
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Lets out what has not been written yet.
+        """Writes all that is open; `log_ns` is the log time of the last message, Unix ns."""
+        for buckets in self._buckets:
+            buckets.finish(log_ns)
 
-        Args:
-            log_ns: log time of the last message, Unix ns.
-        """
-        for lane in self.lanes:
-            lane.finish(log_ns)
+    @property
+    def most_bytes(self) -> int:
+        """Most bytes that are still to be written."""
+        return MAX_PENDING_BYTES * len(self._buckets)
 
 
 def decimate_min_max(columns: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
     """Returns the smallest and the largest number of each column, the one that came first in the first list.
 
-    Args:
-        columns: finite numbers in the order in which they came; one at least in each.
+    Each column has one finite number at least, in the order in which they came.
     """
     first, second = [], []
     for column in columns:

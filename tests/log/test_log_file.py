@@ -266,7 +266,7 @@ def test_room_is_kept_for_what_is_pending_and_for_the_end(tmp_path: Path) -> Non
     assert disk.kept == 0
 
 
-def test_a_real_ballast_takes_room_that_nobody_sees_and_gives_it_back(
+def test_a_real_reserve_takes_room_that_nobody_sees_and_gives_it_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for allocate in (os.posix_fallocate, None):
@@ -276,26 +276,26 @@ def test_a_real_ballast_takes_room_that_nobody_sees_and_gives_it_back(
                 raise OSError(errno.EOPNOTSUPP, "not here")
 
             monkeypatch.setattr(os, "posix_fallocate", refuse)
-        ballast = DiskReserve(tmp_path)
-        ballast.grow(1)
-        ballast.grow(RESERVE_STEP_BYTES + 1)
-        assert ballast.size == 2 * RESERVE_STEP_BYTES
-        assert ballast._file is not None
-        assert os.fstat(ballast._file.fileno()).st_blocks * 512 >= ballast.size
+        reserve = DiskReserve(tmp_path)
+        reserve.grow(1)
+        reserve.grow(RESERVE_STEP_BYTES + 1)
+        assert reserve.size == 2 * RESERVE_STEP_BYTES
+        assert reserve._file is not None
+        assert os.fstat(reserve._file.fileno()).st_blocks * 512 >= reserve.size
         assert list(tmp_path.iterdir()) == []
-        ballast.release()
-        ballast.grow(10)
-        assert ballast.size == 0
+        reserve.release()
+        reserve.grow(10)
+        assert reserve.size == 0
 
 
-def test_a_folder_that_takes_no_ballast_does_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_takes_no_reserve_does_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: int) -> None:
         raise OSError(errno.EACCES, "not here")
 
     monkeypatch.setattr(os, "posix_fallocate", refuse)
-    ballast = DiskReserve(tmp_path)
-    ballast.grow(1)
-    assert ballast.size == 0
+    reserve = DiskReserve(tmp_path)
+    reserve.grow(1)
+    assert reserve.size == 0
 
 
 LIMITED = """

@@ -305,6 +305,7 @@ def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
         check_log([tmp_path / "none.mcap"])
 
 
+@pytest.mark.long
 def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
     """Another program, run beside: on how files are built it and we agree."""
     kinds = ["a byte of a chunk", "cut off", "the length of a chunk", "the checksum of the index"]

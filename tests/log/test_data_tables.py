@@ -1,20 +1,22 @@
-"""A table has every number of its records, under a name that ends in its unit."""
+"""Tables and data frames have every number of their records, under names that end in their units."""
 
 import re
+import sys
 from functools import cache
 
 import msgspec
 import numpy as np
+import polars as pl
 import pytest
 
 from tests.analysis import logs
 from tests.log.dealt import a_file, changed, messages
 from tests.log_editing import edited, opened, recorded
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import LogError
-from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, add_unit_suffix
+from trilat_net.errors import LogError, UsageError
+from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, read_field_docs
 from trilat_net.log.log_reader import Log
-from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats
+from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats, RecorderStats, State
 
 
 @cache
@@ -169,14 +171,6 @@ def test_times_are_the_files() -> None:
     assert (table["publish_time_ns"].values == t_ns + 3).all()
 
 
-def test_a_name_has_its_unit_once() -> None:
-    assert add_unit_suffix("q1", "rad") == "q1_rad"
-    assert add_unit_suffix("late_us", "us") == "late_us"
-    assert add_unit_suffix("tick", "tick") == "tick"
-    assert add_unit_suffix("slew_ppb", "ns/s") == "slew_ppb"
-    assert add_unit_suffix("kind", "") == "kind"
-
-
 def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
     known = np.array([True, False])
     column = Column("x_us", np.array([3, 4]), known=known)
@@ -185,3 +179,63 @@ def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
     assert numbers[0] == 3
     assert np.isnan(numbers[1])
     assert Column("x_us", np.array([3, 4]), known=~known | known).numbers().dtype == np.int64
+
+
+@pytest.mark.parametrize(("name", "kind"), [("a", ""), ("a", "link"), ("b", "arrivals"), ("events", "")])
+def test_a_frame_is_its_table(name: str, kind: str) -> None:
+    log = logs.busy().log
+    table, frame = log.table(name, kind), log.frame(name, kind)
+    assert frame.columns == [column.name for column in table.columns]
+    assert frame.height == len(table)
+    for column in table.columns:
+        assert frame[column.name].to_list() == column.rows(0, len(table))
+
+
+def test_columns_are_of_their_kinds() -> None:
+    schema = opened(recorded("paper")).frame("m1").schema
+    assert schema["mode"] == pl.String
+    assert (schema["tick"], schema["log_time_ns"], schema["used_s_tick"]) == (pl.Int64,) * 3
+    assert (schema["t_s"], schema["q1_rad"], schema["age_s_ms"]) == (pl.Float64,) * 3
+
+
+def test_one_figures_worth_of_a_frame() -> None:
+    """As a person would use it: how old were the samples of the slave, once there was one?"""
+    frame = opened(recorded("paper")).frame("m1")
+    ages = frame.select(pl.col("age_s_ms").drop_nulls())
+    assert ages.height == 100
+    assert ages["age_s_ms"].unique().to_list() == pytest.approx([20.0])
+
+
+def test_without_polars_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(UsageError, match=r"data frames need polars: pip install 'trilat-net\[frames\]'"):
+        opened(recorded("paper")).frame("m1")
+
+
+KINDS = (State, LinkStats, Event, RecorderStats)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_field_has_a_meaning(kind: type[msgspec.Struct]) -> None:
+    said = read_field_docs(kind)
+    assert list(said) == list(kind.__struct_fields__)
+    for field, (_, text, json_type) in said.items():
+        assert len(text) > 5, field
+        assert "  " not in text
+        assert json_type in ("integer", "string", "array", "object")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_name_that_ends_in_a_unit_has_that_unit(kind: type[msgspec.Struct]) -> None:
+    units = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
+    for field, (unit, _, _) in read_field_docs(kind).items():
+        if ending := units.get(field.rpartition("_")[2]):
+            assert unit == ending, field
+
+
+def test_units_are_the_schemas() -> None:
+    said = read_field_docs(State)
+    assert [said[field].unit for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x")] == [
+        "rad", "rad/s", "rad", "rad/s", "N m", "N m",
+    ]  # fmt: skip
+    assert said["q_des"].text == "reference, Eq. (6)"
