@@ -80,7 +80,7 @@ def _print_group(
 
 def _print_statics(found: "LogMetrics") -> None:
     """Prints who felt what in the windows at rest, and the stiffness between them."""
-    if found.shared:
+    if found.sharing_ratios:
         _print(
             ["at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off"],
             (
@@ -94,11 +94,11 @@ def _print_statics(found: "LogMetrics") -> None:
                     _cell(pair.expected_nm),
                     _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %",
                 ]
-                for pair in found.shared
+                for pair in found.sharing_ratios
             ),
             words=1,
         )
-        for why in dict.fromkeys(pair.expected_nm.why for pair in found.shared):
+        for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
             if why:
                 out.print(f"[bold]{_NO_NUMBER}[/bold] nothing is expected: {escape(sanitize(why))}")
     if found.stiffness:
@@ -121,10 +121,10 @@ def _print_statics(found: "LogMetrics") -> None:
 
 def _print_impedance(found: "LogMetrics") -> None:
     """Prints what hands feel over frequency, decided or not."""
-    if not found.felt:
+    if not found.responses:
         return
     rows = []
-    for one in found.felt:
+    for one in found.responses:
         told = one.ratio
         what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, joint {one.joint}"
         if told.gain is None:

@@ -105,7 +105,9 @@ def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
     log = simulated("two_sites", shaken())
     (found,) = (
-        one for one in compute_log_metrics(log).felt if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+        one
+        for one in compute_log_metrics(log).responses
+        if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
     )
     assert found.ratio.frequency_hz == 1.0
     s = 2j * math.pi
@@ -121,7 +123,7 @@ def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
 
 def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).felt
+    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
     for one in found:
         if one.kind == "impedance":
             assert one.ratio.gain is None

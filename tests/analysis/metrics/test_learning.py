@@ -22,7 +22,7 @@ def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
     measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
-    found, learnt = measured.sites["s"], measured.learnt["s"]
+    found, learnt = measured.sites["s"], measured.estimates["s"]
     assert found["theta_error_first"].value == pytest.approx(13.0)
     assert found["theta_energy_first_j"].value == pytest.approx(0.5 * (9.0 + 16.0 + 144.0 / 2.0))
     end_s = 6.0 - 1.0 / 200
@@ -45,8 +45,8 @@ def test_without_a_truth_estimates_are_given_and_not_judged() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     changes = {"sites.s.plant": "external", "sites.s.arm.known": False, "sites.s.control.theta_hat0": THETA}
     measured = compute_log_metrics(under(log, changes))
-    assert measured.learnt["s"].theta is None
-    assert measured.learnt["s"].last == log["s"].theta_hat[-1].tolist()
+    assert measured.estimates["s"].theta is None
+    assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()
     assert measured.sites["s"]["theta_error_last"].why == "theta of the arm is not known"
     assert measured.sites["s"]["theta_slope_per_s"].value > 0.0
     assert measured.sites["m1"]["theta_error_last"].value > 0.0

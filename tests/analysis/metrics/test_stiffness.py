@@ -31,5 +31,5 @@ def test_learning_gravity_is_a_spring_that_ties_the_arms_to_a_pose() -> None:
 def test_where_something_else_moves_the_arm_the_ratio_would_be_the_hands_own() -> None:
     """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
     found = compute_log_metrics(simulated("training", {"rate_hz": 200}))
-    assert found.rest.value == 2.0
+    assert found.static_windows.value == 2.0
     assert found.stiffness == []

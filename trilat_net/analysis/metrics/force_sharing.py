@@ -32,18 +32,18 @@ MIN_LOAD_SHARE = 0.02
 
 
 class SharingRatio(NamedTuple):
-    """Two loaded sites in a window at rest.
+    """Two loaded sites in a static window.
 
     Attributes:
         from_s: the window's first tick, s.
         to_s: its last, s.
-        joint: which joint, from 1.
+        joint: from 1.
         pushed: the site of the torque.
         pushed_nm: that torque, ON its arm, N m.
-        by_wall: whether a wall makes most of it.
-        holds: the site whose hand feels it.
-        felt_nm: what that hand feels: the negative of what it does to its arm, N m.
-        expected_nm: what the shares say that it feels, N m; or why they say nothing.
+        by_wall: True if the environment makes most of it.
+        holds: the site of the operator that feels it.
+        felt_nm: the torque that this operator feels: the negative of its own ON its arm, N m.
+        expected_nm: the torque by the dominance factors, N m.
     """
 
     from_s: float
@@ -58,21 +58,21 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """How far what is felt is from what is expected, as a share of that; None where nothing is."""
+        """Relative deviation of the felt torque from the expected one; None without one."""
         expected = self.expected_nm.value
         return None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
 
 
 class JointLoad(NamedTuple):
-    """The torques of a joint in a window at rest, of all loaded sites.
+    """The torques of a joint in a static window, of all loaded sites.
 
     Attributes:
         from_s: the window's first tick, s.
         to_s: its last, s.
-        joint: which joint, from 1.
+        joint: from 1.
         torque_nm: per loaded site, ON its arm, N m.
-        weight: per loaded site pi_i / K_i, the largest of all sites 1; or why there are none.
-        imbalance: |sum of weight times torque| / largest |weight times torque|; or why it is not known.
+        weight: per loaded site pi_i / K_i, the largest of all sites 1.
+        imbalance: |sum of weight times torque| / largest |weight times torque|.
     """
 
     from_s: float
@@ -84,8 +84,8 @@ class JointLoad(NamedTuple):
 
 
 def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[JointLoad]:
-    """Returns the loaded joints of every window at rest."""
-    found = []
+    """Returns the loaded joints of every static window."""
+    loads = []
     for window in windows:
         weights = _torque_weights(scenario, window.alpha)
         for joint in range(JOINTS):
@@ -93,12 +93,12 @@ def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[Jo
             least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
             loaded = {site: value for site, value in torque.items() if abs(value) >= least}
             if loaded:
-                found.append(_joint_load(window, joint, loaded, weights))
-    return found
+                loads.append(_weigh_load(window, joint, loaded, weights))
+    return loads
 
 
 def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metric:
-    """Returns how many windows at rest there are, or why there are none."""
+    """Returns the number of static windows."""
     if absent:
         return Metric(None, f"no records of {', '.join(absent)}")
     return metric(len(windows) or None, NO_STATIC_WINDOW_TEXT)
@@ -107,7 +107,7 @@ def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metr
 def measure_force_sharing(
     absent: list[str], windows: list[StaticWindow], pairs: list[SharingRatio]
 ) -> MetricValues:
-    """Returns how far force sharing is from the shares, in the pair where it is furthest."""
+    """Returns the largest deviation of force sharing from the dominance factors."""
     offs = [pair.off for pair in pairs if pair.off is not None]
     if offs:
         return {"sharing_off": metric(max(offs))}
@@ -120,7 +120,7 @@ def measure_force_sharing(
 NO_STATIC_WINDOW_TEXT = "no second in which all sites rest under torques that stand"
 
 
-def _joint_load(
+def _weigh_load(
     window: StaticWindow, joint: int, torque: dict[str, float], weights: Array | str
 ) -> JointLoad:
     if isinstance(weights, str):
@@ -138,48 +138,36 @@ def _joint_load(
 
 
 def find_sharing_ratios(
-    scenario: Scenario, windows: list[StaticWindow], found: list[JointLoad]
+    scenario: Scenario, windows: list[StaticWindow], loads: list[JointLoad]
 ) -> list[SharingRatio]:
-    """Returns who felt what, of every joint in a window at rest at which two sites are loaded.
+    """Returns the force sharing of every joint in a static window at which two sites are loaded.
 
-    The hand that feels is one that is a spring; where both are or none, the slave is the one that is pushed.
+    The operator that feels is a spring; if both are or none, the slave is the site of the torque.
     """
     at = {window.from_s: window for window in windows}
     pairs = []
-    for lever in found:
-        if len(lever.torque_nm) == 2:
-            pushed, holds = sorted(
-                lever.torque_nm, key=lambda site: _holding_rank(scenario, site, lever.to_s)
-            )
-            wall = float(at[lever.from_s].walls[pushed][lever.joint - 1])
-            torque = lever.torque_nm[pushed]
-            pairs.append(
-                SharingRatio(
-                    lever.from_s,
-                    lever.to_s,
-                    lever.joint,
-                    pushed,
-                    torque,
-                    abs(wall) > 0.5 * abs(torque),
-                    holds,
-                    -lever.torque_nm[holds],
-                    _expected_torque(lever, pushed, holds),
-                )
-            )
+    for load in loads:
+        if len(load.torque_nm) == 2:
+            pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
+            torque = load.torque_nm[pushed]
+            by_wall = abs(float(at[load.from_s].environment[pushed][load.joint - 1])) > 0.5 * abs(torque)
+            expected = _expected_torque(load, pushed, holds)
+            felt = -load.torque_nm[holds]
+            pairs.append(SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected))
     return pairs
 
 
-def _expected_torque(lever: JointLoad, pushed: str, holds: str) -> Metric:
-    one, other = lever.weight[pushed], lever.weight[holds]
+def _expected_torque(load: JointLoad, pushed: str, holds: str) -> Metric:
+    one, other = load.weight[pushed], load.weight[holds]
     if one.value is None or other.value is None:
         return Metric(None, one.why)
     if other.value == 0.0:
         return Metric(None, f"nobody ends up following {holds}")
-    return metric(lever.torque_nm[pushed] * one.value / other.value)
+    return metric(load.torque_nm[pushed] * one.value / other.value)
 
 
 def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
-    """Returns how much a site is one that holds: a spring's hand is there, and no wall; it is a master."""
+    """Returns a sort key of the site that feels: a spring is active there and no wall; it is a master."""
     spec = scenario.sites[site]
     springs = any(
         hand.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND)
@@ -190,7 +178,7 @@ def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, boo
 
 
 def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns pi_i / K_i per joint, shape (N, 2); or why that says nothing of torques."""
+    """Returns pi_i / K_i per joint, shape (N, 2); or the reason why that does not weigh torques."""
     if len(find_closed_groups(alpha)) > 1:
         return "two groups of sites follow nobody else: who feels whom is not unique"
     stiffness = []
@@ -203,7 +191,7 @@ def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _holding_stiffness(spec: SiteSpec) -> tuple[Array, str]:
-    """Returns what holds e at rest, shape (2,), N m/rad, and why that is not all that acts."""
+    """Returns the stiffness that holds e at rest, shape (2,), N m/rad, and the reason why more acts."""
     gains = spec.control.gains(spec.arm.theta)
     if gains.law is Law.OWN:
         return np.zeros(JOINTS), "a law of somebody's own"

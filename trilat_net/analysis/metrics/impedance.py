@@ -1,6 +1,4 @@
-"""Rendered impedance and reflected wall force over frequency.
-
-From a run's joint input-output frequency response.
+"""Rendered impedance and reflected wall force over frequency, by a run's frequency response.
 
 Invariant: a response without sufficient excitation is undecided, with a reason. It is given at the one
 spectral line with the strongest drive, if at least `MIN_SEGMENTS` independent segments excite it and both
@@ -31,28 +29,33 @@ from ..torque_split import TorqueSplit
 Complex = NDArray[np.complex128]
 
 SEGMENT_S = 4.0
-"""Length of a stretch, s: lines are a quarter of a hertz apart."""
+"""Length of a segment, s: lines are a quarter of a hertz apart."""
 _LOWEST_LINE = 2
 """The first line that a Hann window keeps free of the mean."""
 HIGHEST_HZ = 20.0
-"""Lines above this are not looked at: hands and arms are slower."""
+"""Highest line, Hz: operators and arms are slower."""
 MIN_COHERENCE = 0.9
 MIN_SEGMENTS = 4.0
 _OVERLAP_FACTOR = 1.06
-"""So many stretches under a Hann window count as one, where they overlap by half."""
+"""So many segments under a Hann window count as one if they overlap by half."""
+MIN_DRIVE_TORQUE_NM = 0.05
+"""Least amplitude of a torque that drives, N m."""
+STILL_SCRIPT_NM_S = 1e-6
+"""A script that changes by less stands still, N m/s."""
+NO_SCRIPT_TEXT = "what the hand was to do is not in the scenario: nobody knows who drives"
 
 
 class FrequencyResponse(NamedTuple):
-    """Output over input at one frequency; what is not decided is None.
+    """Output over input at one frequency; undecided values are None.
 
     Attributes:
-        frequency_hz: the line that was driven most, Hz.
+        frequency_hz: the line with the strongest drive, Hz.
         gain: amplitude of the ratio, in the unit of output over input.
         phase_rad: its phase.
-        coherence: share of the power at that line that goes with the drive, of the signal with less of it.
-        segments: how many stretches of equal power would drive the line as much as all of them do.
+        coherence: the smaller of both signals' coherences with the drive.
+        segments: number of segments of equal power that would drive the line as much as all of them do.
         error: random error of the gain, one standard deviation as a share of it.
-        why: why the ratio is undecided; "" where it is decided.
+        why: the reason why the ratio is undecided; "" if it is decided.
     """
 
     frequency_hz: float | None = None
@@ -65,13 +68,13 @@ class FrequencyResponse(NamedTuple):
 
 
 class ResponseSignals(NamedTuple):
-    """What a ratio is taken of, shape (K,) each.
+    """Signals of a ratio, shape (K,) each.
 
     Attributes:
-        drive: what follows nothing else.
+        drive: a signal that depends on no other.
         put_in: the ratio's input.
         came_out: its output.
-        usable: rows that are recorded, and of a time in which nobody else drives.
+        usable: True for rows that are recorded while no other drive is active.
     """
 
     drive: Array
@@ -81,12 +84,14 @@ class ResponseSignals(NamedTuple):
 
 
 def estimate_response(signals: ResponseSignals, rate_hz: int, least: float) -> FrequencyResponse:
-    """Returns the ratio of two signals at the line that was driven most.
+    """Returns the ratio of two signals at the line with the strongest drive.
+
+    Own code in place of `scipy.signal.csd`, which cannot leave out segments with unusable rows.
 
     Args:
         signals: the signals.
-        rate_hz: how many rows a second has.
-        least: a drive of a smaller amplitude is none.
+        rate_hz: rows per second.
+        least: amplitude below which nothing drives.
     """
     length = round(SEGMENT_S * rate_hz)
     starts = _segment_starts(signals.usable, length)
@@ -100,20 +105,19 @@ def estimate_response(signals: ResponseSignals, rate_hz: int, least: float) -> F
     if math.sqrt(2.0 * power[line]) < least:
         return FrequencyResponse(why="nothing drives it")
     X, Y = (_spectra(one, starts, length)[:, line] for one in (signals.put_in, signals.came_out))
-    return _at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X, Y)
+    return _estimate_at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X, Y)
 
 
-def _at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -> FrequencyResponse:
-    each = np.abs(D) ** 2
-    segments = float(each.sum() ** 2 / (each**2).sum()) / _OVERLAP_FACTOR
+def _estimate_at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -> FrequencyResponse:
+    power = np.abs(D) ** 2
+    segments = float(power.sum() ** 2 / (power**2).sum()) / _OVERLAP_FACTOR
     if segments < MIN_SEGMENTS:
         why = f"undecided: {segments:.1f} stretches of {SEGMENT_S:g} s drive {frequency_hz:g} Hz, "
         return FrequencyResponse(frequency_hz, segments=segments, why=f"{why}{MIN_SEGMENTS:g} are needed")
     coherence = min(_coherence(D, X), _coherence(D, Y))
     if coherence < MIN_COHERENCE:
-        why = (
-            f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, {MIN_COHERENCE:g} is needed"
-        )
+        measured = f"the coherence at {frequency_hz:g} Hz is {coherence:.2f}"
+        why = f"undecided: {measured}, {MIN_COHERENCE:g} is needed"
         return FrequencyResponse(frequency_hz, coherence=coherence, segments=segments, why=why)
     H = np.vdot(D, Y) / np.vdot(D, X)
     noise = sum(1.0 / _coherence(D, one) - 1.0 for one in (X, Y))
@@ -127,47 +131,40 @@ def _coherence(D: Complex, X: Complex) -> float:
 
 
 def _segment_starts(usable: Bools, length: int) -> list[int]:
-    """Returns where stretches begin, each half a length after the one before, whose rows are all usable."""
+    """Returns the first rows of segments, each half a length after the one before, with all rows usable."""
     if length < 4 * _LOWEST_LINE:
         return []
-    bad = np.concatenate([[0], np.cumsum(~usable)])
+    unusable = np.concatenate([[0], np.cumsum(~usable)])
     starts = np.arange(0, len(usable) - length + 1, length // 2)
-    whole: list[int] = starts[bad[starts + length] == bad[starts]].tolist()
+    whole: list[int] = starts[unusable[starts + length] == unusable[starts]].tolist()
     return whole
 
 
 def _spectra(signal: Array, starts: list[int], length: int) -> Complex:
-    """Returns the lines of every stretch, shape (S, L), from the first without the mean on: Hann.
+    """Returns the lines of every segment above the mean, shape (S, L), under a Hann window.
 
     Scaled so that the square of a line is the mean square of its sinusoid. No slope is taken out: that would
     bend slow sinusoids too.
     """
-    stretches = np.stack([signal[n : n + length] for n in starts])
+    segments = np.stack([signal[n : n + length] for n in starts])
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(length) + 0.5) / length)
     highest = min(int(HIGHEST_HZ * SEGMENT_S), length // 2 - 1)
     scale = math.sqrt(2.0) / window.sum()
-    lines: Complex = np.fft.rfft(stretches * window, axis=1)[:, _LOWEST_LINE : highest + 1] * scale
+    lines: Complex = np.fft.rfft(segments * window, axis=1)[:, _LOWEST_LINE : highest + 1] * scale
     return lines
 
 
-MIN_DRIVE_TORQUE_NM = 0.05
-"""Least amplitude of a torque that drives, N m."""
-STILL_SCRIPT_NM_S = 1e-6
-"""A script that changes by less stands still, N m/s."""
-NO_SCRIPT_TEXT = "what the hand was to do is not in the scenario: nobody knows who drives"
-
-
 class ImpedanceEstimate(NamedTuple):
-    """A ratio over frequency.
+    """An impedance or a reflection over frequency.
 
     Attributes:
-        kind: "impedance": torque of a hand ON its arm over the velocity of the joint: what it feels of its
-            site and of all behind it, N m s/rad. "reflection": torque that a hand feels over the one that
-            walls do ON another arm.
-        at: the site whose hand feels it.
-        of: of a reflection the site of the walls, else "".
-        joint: which joint, from 1.
-        ratio: the ratio.
+        kind: "impedance": torque of an operator ON its arm over the velocity of the joint: of its site and of
+            all behind it, N m s/rad. "reflection": torque that an operator feels over the one of the
+            environment ON another arm.
+        at: the site of the operator.
+        of: of a reflection the site of the environment, else "".
+        joint: from 1.
+        ratio: the response.
     """
 
     kind: str
@@ -183,75 +180,57 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit]
+    aligned: Mapping[str, AlignedRecords], torques: Mapping[str, TorqueSplit]
 ) -> list[ImpedanceEstimate]:
-    """Returns what every hand feels over frequency of its site, and of every wall elsewhere.
+    """Returns the impedance at every operator, and its reflection of every environment elsewhere.
 
     Args:
-        found: the sites' records.
-        by: who pushed them.
+        aligned: the sites' records.
+        torques: ON their arms.
     """
-    hands = [site for site in found if by[site].operator.any()]
-    walls = [site for site in found if by[site].environment.any()]
-    return [
-        *(one for site in hands for one in _impedance(found, by, site)),
-        *(
-            one
-            for wall in walls
-            for hand in hands
-            if hand != wall
-            for one in _reflection(found, by, wall, hand)
-        ),
-    ]
+    operators = [site for site in aligned if torques[site].operator.any()]
+    walls = [site for site in aligned if torques[site].environment.any()]
+    pairs = [(site, "") for site in operators]
+    pairs += [(site, wall) for wall in walls for site in operators if site != wall]
+    return [one for site, wall in pairs for one in _estimate_joints(aligned, torques, site, wall)]
 
 
-def _impedance(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit], site: str
+def _estimate_joints(
+    aligned: Mapping[str, AlignedRecords], torques: Mapping[str, TorqueSplit], site: str, wall: str
 ) -> Iterator[ImpedanceEstimate]:
-    track, script = found[site], by[site].script
-    others = _still(found, by, track, [name for name in found if name != site])
+    """Yields the impedance at a site's operator, or, with a site of a wall, the reflection from there."""
+    records, script = aligned[site], torques[site].script
+    others = [name for name in aligned if wall or name != site]
+    usable = _find_still_rows(aligned, torques, records, others)
+    rows, recorded = find_latest_rows(aligned[wall or site], records.t_s)
     for joint in range(JOINTS):
-        told = FrequencyResponse(why=NO_SCRIPT_TEXT)
-        if script is not None and others is not None:
-            torque = by[site].operator[:, joint]
-            signals = ResponseSignals(script[:, joint], track.qd[:, joint], torque, track.known & others)
-            told = estimate_response(signals, track.rate_hz, MIN_DRIVE_TORQUE_NM)
-        yield ImpedanceEstimate("impedance", site, "", joint + 1, told)
+        response = FrequencyResponse(why=NO_SCRIPT_TEXT)
+        if script is not None and usable is not None:
+            operator = torques[site].operator[:, joint]
+            if wall:
+                torque = torques[wall].environment[rows, joint]
+                signals = ResponseSignals(torque, torque, -operator, records.known & recorded & usable)
+            else:
+                velocity = records.qd[:, joint]
+                signals = ResponseSignals(script[:, joint], velocity, operator, records.known & usable)
+            response = estimate_response(signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
+        yield ImpedanceEstimate("reflection" if wall else "impedance", site, wall, joint + 1, response)
 
 
-def _reflection(
-    found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit], wall: str, hand: str
-) -> Iterator[ImpedanceEstimate]:
-    track = found[hand]
-    row, there = find_latest_rows(found[wall], track.t_s)
-    nobody = _still(found, by, track, list(found))
-    for joint in range(JOINTS):
-        told = FrequencyResponse(why=NO_SCRIPT_TEXT)
-        if nobody is not None:
-            torque = by[wall].environment[row, joint]
-            signals = ResponseSignals(
-                torque, torque, -by[hand].operator[:, joint], track.known & there & nobody
-            )
-            told = estimate_response(signals, track.rate_hz, MIN_DRIVE_TORQUE_NM)
-        yield ImpedanceEstimate("reflection", hand, wall, joint + 1, told)
-
-
-def _still(
-    found: Mapping[str, AlignedRecords],
-    by: Mapping[str, TorqueSplit],
+def _find_still_rows(
+    aligned: Mapping[str, AlignedRecords],
+    torques: Mapping[str, TorqueSplit],
     at: AlignedRecords,
     sites: list[str],
 ) -> Bools | None:
-    """Returns at which ticks of a site no hand of some sites moves, shape (K,); None where nobody knows."""
+    """Returns at which ticks of a site no operator of given sites moves; None if one has no script."""
     still = np.ones(len(at.known), dtype=np.bool_)
     for site in sites:
-        script = by[site].script
+        script = torques[site].script
         if script is None:
             return None
-        rows, _ = find_latest_rows(found[site], at.t_s)
-        rate = (
-            np.abs(np.gradient(script, axis=0)).max(axis=1) * found[site].rate_hz if len(script) > 1 else None
-        )
-        if rate is not None:
+        if len(script) > 1:
+            rows, _ = find_latest_rows(aligned[site], at.t_s)
+            rate = np.abs(np.gradient(script, axis=0)).max(axis=1) * aligned[site].rate_hz
             still &= rate[rows] < STILL_SCRIPT_NM_S
     return still

@@ -7,7 +7,7 @@ of the whole run.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,36 +15,39 @@ import numpy as np
 
 from ...log.log_reader import Log
 from ..aligned import AlignedRecords, align_records
-from ..dominance_history import DominanceHistory, trace_dominance
+from ..dominance_history import trace_dominance
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
 from ..torque_split import TorqueSplit, attribute_torque
-from . import force_sharing, parameter_error, port_energy, tracking_metrics, wall_contact
-from .force_sharing import JointLoad, SharingRatio
+from .force_sharing import (
+    JointLoad,
+    SharingRatio,
+    count_static_windows,
+    find_joint_loads,
+    find_sharing_ratios,
+    measure_force_sharing,
+)
 from .impedance import ImpedanceEstimate, estimate_impedances
-from .metric_catalogue import QUANTITIES, Metric, MetricValues, Quantity, metric, unavailable
-from .static_windows import StaticWindow, StiffnessEstimate, estimate_stiffness, find_static_windows
-
-LINK_METRIC_KEYS = ("age_mean_ms", "age_p99_ms", "age_max_ms", "silence_ms", "loss", "burst", "late_samples")
-NO_CLOCK = "no clock was read"
-LOOP_METRIC_KEYS = ("late_p99_us", "late_max_us", "busy_p99_us", "overruns", "missing")
+from .metric_catalogue import ENERGY, LOOP, QUANTITIES, Metric, MetricValues, Quantity, metric, unavailable
+from .parameter_error import ParameterEstimates, measure_parameter_error, read_parameter_estimates
+from .port_energy import measure_delay_energy, measure_port_energy
+from .static_windows import StiffnessEstimate, estimate_stiffness, find_static_windows
+from .tracking_metrics import measure_effort, measure_following, measure_spread, measure_tracking
+from .wall_contact import list_walls, measure_wall_contact
 
 
 def measure_link(use: LinkSummary) -> MetricValues:
     """Returns effective delay, loss and bursts of a link."""
     age, never = use.age_ms, "no sample ever came into use"
-    ages = {
+    unknown = "of no sample it is known whether it came"
+    lossless = Metric(None, "nothing was lost", applies=False)
+    return {
         "age_mean_ms": metric(age.mean if age else None, never),
         "age_p99_ms": metric(age.p99 if age else None, never),
         "age_max_ms": metric(age.max if age else None, never),
         "silence_ms": metric(use.silence_ms, never),
-    }
-    unknown = "of no sample it is known whether it came"
-    lost = Metric(None, "nothing was lost", applies=False) if use.loss == 0.0 else metric(use.burst, unknown)
-    return {
-        **ages,
         "loss": metric(use.loss, unknown),
-        "burst": lost,
+        "burst": lossless if use.loss == 0.0 else metric(use.burst, unknown),
         "late_samples": metric(use.counts.late if use.counts else None, f"no records of {use.site}"),
     }
 
@@ -53,63 +56,62 @@ def measure_loop(log: Log, site: str) -> MetricValues:
     """Returns lateness, computing time and overruns of a site's loop, and its missing records."""
     missing = {"missing": metric(log.missing(site))}
     if log.driver != "live":
-        return {**unavailable(LOOP_METRIC_KEYS[:-1], NO_CLOCK, applies=False), **missing}
+        return unavailable(LOOP, "no clock was read", applies=False) | missing
     if not len(log[site]):
-        return {**unavailable(LOOP_METRIC_KEYS[:-1], f"no records of {site}"), **missing}
-    facts = describe_site_health(log, site)
-    busy = facts["busy_us"]
+        return unavailable(LOOP, f"no records of {site}") | missing
+    health = describe_site_health(log, site)
+    busy = health["busy_us"]
     return {
-        "late_p99_us": metric(facts["late_us"]["p99"]),
-        "late_max_us": metric(facts["late_us"]["max"]),
-        "busy_p99_us": metric(busy["p99"]) if busy else Metric(None, "no second record"),
-        "overruns": metric(facts["overruns"]),
+        "late_p99_us": metric(health["late_us"]["p99"]),
+        "late_max_us": metric(health["late_us"]["max"]),
+        "busy_p99_us": metric(busy["p99"] if busy else None, "no second record"),
+        "overruns": metric(health["overruns"]),
         **missing,
     }
 
 
 class LogMetrics(NamedTuple):
-    """A log in numbers.
+    """All metrics of a log.
 
     Attributes:
         run: of the whole, by key.
         sites: per site.
         links: per link "j->i".
-        walls: per wall "s/1": a site, and which of its walls.
-        learnt: per site with records, its estimates one by one.
-        rest: how many windows at rest there are, in which statics can be read off; or why there is none.
-        levers: their loaded joints, with the torques of all loaded sites.
-        shared: who felt what of them, where two sites are loaded.
-        stiffness: what hands felt from one of them to the next.
-        felt: impedances and reflections over frequency.
+        walls: per wall "s/1": a site, and the number of its wall.
+        estimates: per site with records, its parameter estimates.
+        static_windows: their number.
+        joint_loads: the loaded joints in them, with the torques of all loaded sites.
+        sharing_ratios: the force sharing of those at which two sites are loaded.
+        stiffness: the stiffness from one of them to the next.
+        responses: impedances and reflections over frequency.
     """
 
     run: MetricValues
     sites: dict[str, MetricValues]
     links: dict[str, MetricValues]
     walls: dict[str, MetricValues]
-    learnt: dict[str, parameter_error.ParameterEstimates]
-    rest: Metric
-    levers: list[force_sharing.JointLoad]
-    shared: list[force_sharing.SharingRatio]
+    estimates: dict[str, ParameterEstimates]
+    static_windows: Metric
+    joint_loads: list[JointLoad]
+    sharing_ratios: list[SharingRatio]
     stiffness: list[StiffnessEstimate]
-    felt: list[ImpedanceEstimate]
+    responses: list[ImpedanceEstimate]
 
     def places(self, quantity: Quantity) -> dict[str, Metric]:
         """Returns a quantity of every place that has it; of the run by the name ""."""
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
         found: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
-        return {name: facts[quantity.key] for name, facts in found.items()}
+        return {name: metrics[quantity.key] for name, metrics in found.items()}
 
     def whole(self, quantity: Quantity) -> Metric:
         """Returns a quantity of the run: the largest of its places, or their sum.
 
-        A place that can have none does not count; where one has none that could, there is none of the run.
+        A place that can have none does not count; if one lacks a number that it could have, so does the run.
         """
         places = {name: one for name, one in self.places(quantity).items() if one.applies}
-        lacking = {name: one for name, one in places.items() if one.value is None}
-        if lacking:
-            whys = [f"{name}: {one.why}" if name else one.why for name, one in lacking.items()]
+        whys = [f"{name}: {one.why}" if name else one.why for name, one in places.items() if one.why]
+        if whys:
             return Metric(None, "; ".join(whys))
         values = [one.value for one in places.values() if one.value is not None]
         if not values:
@@ -125,119 +127,113 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         LogError: a record cannot be read, or names a change that is none.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is no number
-        return _measure_aligned(log, align_records(log))
+        return _measure(log, align_records(log))
 
 
-def _measure_aligned(log: Log, found: dict[str, AlignedRecords]) -> LogMetrics:
-    specs = log.scenario.sites
-    by = {site: attribute_torque(track, specs[site]) for site, track in found.items()}
-    owned = {site: trace_dominance(log, site, track.t_s) for site, track in found.items()}
-    absent = [site for site in log.sites if site not in found]
-    windows: list[StaticWindow] = [] if absent else find_static_windows(found, by, owned)
-    levers = force_sharing.find_joint_loads(log.scenario, windows)
-    pairs = force_sharing.find_sharing_ratios(log.scenario, windows, levers)
+def _measure(log: Log, aligned: dict[str, AlignedRecords]) -> LogMetrics:
+    scenario, specs = log.scenario, log.scenario.sites
+    torques = {site: attribute_torque(records, specs[site]) for site, records in aligned.items()}
+    dominance = {site: trace_dominance(log, site, records.t_s) for site, records in aligned.items()}
+    absent = [site for site in log.sites if site not in aligned]
+    windows = [] if absent else find_static_windows(aligned, torques, dominance)
+    loads = find_joint_loads(scenario, windows)
+    ratios = find_sharing_ratios(scenario, windows, loads)
     return LogMetrics(
+        {**measure_spread(log, aligned), **measure_force_sharing(absent, windows, ratios)},
+        {site: _measure_site(log, site, aligned.get(site), torques.get(site)) for site in log.sites},
         {
-            **tracking_metrics.measure_spread(log, found),
-            **force_sharing.measure_force_sharing(absent, windows, pairs),
+            use.name: {
+                **measure_following(log, aligned, use.peer, use.site),
+                **measure_delay_energy(log, aligned, dominance, use.peer, use.site),
+                **measure_link(use),
+            }
+            for use in summarise_links(log)
         },
-        {site: _measure_site(log, site, found.get(site), by.get(site)) for site in log.sites},
-        _measure_links(log, found, owned),
-        _measure_walls(log, found, by),
-        {site: parameter_error.read_parameter_estimates(specs[site], track) for site, track in found.items()},
-        force_sharing.count_static_windows(absent, windows),
-        levers,
-        pairs,
+        {
+            f"{site}/{n}": measure_wall_contact(
+                wall, aligned.get(site), torques[site].end_effector if site in torques else None
+            )
+            for site in log.sites
+            for n, wall in enumerate(list_walls(specs[site]), 1)
+        },
+        {site: read_parameter_estimates(specs[site], records) for site, records in aligned.items()},
+        count_static_windows(absent, windows),
+        loads,
+        ratios,
         estimate_stiffness(windows),
-        estimate_impedances(found, by),
+        estimate_impedances(aligned, torques),
     )
 
 
-def _measure_site(log: Log, site: str, track: AlignedRecords | None, by: TorqueSplit | None) -> MetricValues:
-    ports = unavailable(port_energy.PORT_ENERGY_KEYS, f"no records of {site}")
-    if track is not None and by is not None:
-        ports = port_energy.measure_port_energy(log.scenario, track, by)
+def _measure_site(
+    log: Log, site: str, records: AlignedRecords | None, torque: TorqueSplit | None
+) -> MetricValues:
+    ports = unavailable(ENERGY, f"no records of {site}", of="site")
+    if records is not None and torque is not None:
+        ports = measure_port_energy(log.scenario, records, torque)
     return {
-        **tracking_metrics.measure_tracking(log, site),
-        **tracking_metrics.measure_effort(log, site),
+        **measure_tracking(log, site),
+        **measure_effort(log, site),
         **ports,
-        **parameter_error.measure_parameter_error(log.scenario.sites[site], track),
+        **measure_parameter_error(log.scenario.sites[site], records),
         **measure_loop(log, site),
     }
-
-
-def _measure_links(
-    log: Log, found: Mapping[str, AlignedRecords], owned: Mapping[str, DominanceHistory]
-) -> dict[str, MetricValues]:
-    return {
-        use.name: {
-            **tracking_metrics.measure_following(log, found, use.peer, use.site),
-            **port_energy.measure_delay_energy(log, found, owned, use.peer, use.site),
-            **measure_link(use),
-        }
-        for use in summarise_links(log)
-    }
-
-
-def _measure_walls(
-    log: Log, found: Mapping[str, AlignedRecords], by: Mapping[str, TorqueSplit]
-) -> dict[str, MetricValues]:
-    facts = {}
-    for site in log.sites:
-        for n, wall in enumerate(wall_contact.list_walls(log.scenario.sites[site]), 1):
-            tip = by[site].end_effector if site in by else None
-            facts[f"{site}/{n}"] = wall_contact.measure_wall_contact(wall, found.get(site), tip)
-    return facts
 
 
 METRICS_JSON_VERSION = 1
 """Of this layout: keys may be added under it, none is taken away or changes its meaning."""
 
 
-def metrics_to_json(log: Log, measured: LogMetrics) -> dict[str, Any]:
-    """Returns the quantities of a log, ready for JSON.
-
-    Args:
-        log: the log.
-        measured: what was measured of it.
-    """
-    places: dict[str, Mapping[str, MetricValues]] = {
-        "sites": measured.sites,
-        "links": measured.links,
-        "walls": measured.walls,
-    }
-    found: dict[str, Any] = {
+def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
+    """Returns the metrics of a log, ready for JSON."""
+    places = {"sites": metrics.sites, "links": metrics.links, "walls": metrics.walls}
+    windows = metrics.static_windows.value
+    named = {f"{kind}.{name}.": one for kind, found in places.items() for name, one in found.items()}
+    metrics_by_path = {"run.": metrics.run, **named, "": {"windows_at_rest": metrics.static_windows}}
+    content: dict[str, Any] = {
         "version": METRICS_JSON_VERSION,
         "log": Path(log.source).name,
         "scenario": log.scenario.name,
         "driver": log.driver,
         "complete": log.complete,
-        "run": _values(measured.run),
+        "run": _values(metrics.run),
         **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
-        "parameters": {site: learnt._asdict() for site, learnt in measured.learnt.items()},
-        "windows_at_rest": None if measured.rest.value is None else int(measured.rest.value),
-        "levers": [_joint_load(lever) for lever in measured.levers],
-        "force_sharing": [_sharing_ratio(pair) for pair in measured.shared],
-        "stiffness": [one._asdict() for one in measured.stiffness],
+        "parameters": {site: estimates._asdict() for site, estimates in metrics.estimates.items()},
+        "windows_at_rest": None if windows is None else int(windows),
+        "levers": [
+            {
+                **load._asdict(),
+                "weight": _values(load.weight),
+                "imbalance": load.imbalance.value,
+                "why": load.imbalance.why or None,
+            }
+            for load in metrics.joint_loads
+        ],
+        "force_sharing": [
+            {
+                **pair._asdict(),
+                "expected_nm": pair.expected_nm.value,
+                "off": pair.off,
+                "why": pair.expected_nm.why or None,
+            }
+            for pair in metrics.sharing_ratios
+        ],
+        "stiffness": [one._asdict() for one in metrics.stiffness],
         "felt": [
             {
                 **one._asdict(),
                 "ratio": {**one.ratio._asdict(), "why": one.ratio.why or None, "unit": one.unit},
             }
-            for one in measured.felt
+            for one in metrics.responses
         ],
         "unknown": {
-            **_whys("run", measured.run),
-            **{
-                path: why
-                for kind, found in places.items()
-                for name, one in found.items()
-                for path, why in _whys(f"{kind}.{name}", one).items()
-            },
-            **_whys("", {"windows_at_rest": measured.rest}),
+            path + key: one.why
+            for path, found in metrics_by_path.items()
+            for key, one in found.items()
+            if one.value is None
         },
     }
-    return {key: _finite(value) for key, value in found.items()}
+    return {key: _finite(value) for key, value in content.items()}
 
 
 def _finite(value: Any) -> Any:
@@ -249,38 +245,16 @@ def _finite(value: Any) -> Any:
     return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-def _values(found: MetricValues) -> dict[str, float | None]:
-    return {key: one.value for key, one in found.items()}
-
-
-def _whys(path: str, found: MetricValues) -> dict[str, str]:
-    """Returns why there are no numbers, by their paths."""
-    start = f"{path}." if path else ""
-    return {f"{start}{key}": one.why for key, one in found.items() if one.value is None}
-
-
-def _joint_load(lever: JointLoad) -> dict[str, Any]:
-    weights = {site: one.value for site, one in lever.weight.items()}
-    why = lever.imbalance.why or None
-    return {**lever._asdict(), "weight": weights, "imbalance": lever.imbalance.value, "why": why}
-
-
-def _sharing_ratio(pair: SharingRatio) -> dict[str, Any]:
-    expected = pair.expected_nm
-    return {
-        **pair._asdict(),
-        "expected_nm": expected.value,
-        "off": pair.off,
-        "why": expected.why or None,
-    }
+def _values(metrics: MetricValues) -> dict[str, float | None]:
+    return {key: one.value for key, one in metrics.items()}
 
 
 class ComparisonRow(NamedTuple):
     """A quantity of every run.
 
     Attributes:
-        quantity: what it is: its key, its name, its unit, its group.
-        entries: per column the number, or why there is none.
+        quantity: its entry in the catalogue.
+        entries: the metric of each column.
     """
 
     quantity: Quantity
@@ -288,7 +262,7 @@ class ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The numbers, None where there is none."""
+        """The numbers; None for missing ones."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -297,14 +271,14 @@ class MetricComparison(NamedTuple):
 
     Attributes:
         columns: the names of the runs.
-        rows: the quantities of which at least one run could have one, in the order of the catalogue.
+        rows: the quantities that at least one run could have, in the order of the catalogue.
     """
 
     columns: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]
 
     def row(self, key: str) -> ComparisonRow:
-        """Returns a quantity's row by its key; KeyError where there is none."""
+        """Returns a quantity's row by its key; KeyError without one."""
         for row in self.rows:
             if row.quantity.key == key:
                 return row
@@ -316,23 +290,17 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
 
     Args:
         logs: the logs; torn, short and empty ones too.
-        names: what the columns are called; left out: by the logs' files.
+        names: of the columns; by default those of the logs' files.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    return tabulate_metrics(
-        [compute_log_metrics(log) for log in logs], tuple(names) or tuple(map(_name, logs))
-    )
+    columns = tuple(names) or tuple(Path(log.source).stem for log in logs)
+    return tabulate_metrics([compute_log_metrics(log) for log in logs], columns)
 
 
 def tabulate_metrics(measured: Sequence[LogMetrics], names: Sequence[str]) -> MetricComparison:
-    """Returns measurements side by side.
-
-    Args:
-        measured: one per run.
-        names: of the columns.
-    """
+    """Returns the metrics of runs side by side, by the names of the columns."""
     rows = [
         ComparisonRow(quantity, tuple(one.whole(quantity) for one in measured)) for quantity in QUANTITIES
     ]
@@ -356,7 +324,3 @@ def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
             for row in comparison.rows
         ],
     }
-
-
-def _name(log: Log) -> str:
-    return Path(log.source).stem

@@ -5,7 +5,6 @@ docs/metrics.md.
 """
 
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +12,12 @@ from numpy.typing import ArrayLike
 
 
 class Metric(NamedTuple):
-    """A number, or why there is none.
+    """A number, or the reason why there is none.
 
     Attributes:
-        value: the number, finite; None where there is none.
-        why: why there is none, in words; "" where there is one.
-        applies: False where there could be none, in whatever log of this experiment: then nothing is unknown.
+        value: the number, finite; None without one.
+        why: the reason; "" with a number.
+        applies: False if no log of this experiment could have one: then nothing is unknown.
     """
 
     value: float | None
@@ -27,27 +26,21 @@ class Metric(NamedTuple):
 
 
 MetricValues = dict[str, Metric]
-"""What was found, by the key of its quantity."""
+"""Metrics by the keys of their quantities."""
 
 
 def metric(value: float | None, why: str = "it is no finite number") -> Metric:
-    """Returns a number as it is said; with the reason where there is none."""
-    if value is None or not math.isfinite(value):
-        return Metric(None, why)
-    return Metric(float(value))
+    """Returns a metric of a number; with the reason if it is None or not finite."""
+    return Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
 
 
-def unavailable(keys: Iterable[str], why: str, *, applies: bool = True) -> MetricValues:
-    """Returns that none of these is known, and why; or that there are none to know."""
-    return {key: Metric(None, why, applies) for key in keys}
+def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
+    """Returns the quantities of a group, or those of it that are `of` a kind of place, without a number."""
+    return {q.key: Metric(None, why, applies) for q in QUANTITIES if q.group == group and of in ("", q.of)}
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over rows of the column where it is largest; NaN of no rows.
-
-    Args:
-        values: shape (K, n).
-    """
+    """Returns the root mean square over rows of the column with the largest; NaN of no rows, shape (K, n)."""
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return math.nan
@@ -61,15 +54,15 @@ def peak(values: ArrayLike) -> float:
 
 
 class Quantity(NamedTuple):
-    """What is measured.
+    """An entry of the catalogue.
 
     Attributes:
-        key: how programs call it; ends in its unit where it has one.
-        of: of what there is one: "run", "site", "link" or "wall".
-        group: under which heading it stands.
-        name: how people call it.
+        key: its name in programs; ends in its unit, if any.
+        of: the kind of place that has one: "run", "site", "link" or "wall".
+        group: its heading.
+        name: its name for people.
         unit: its unit; "" for a number without.
-        whole: how a run has one: "max" and "sum" over all places, "mean".
+        whole: reduction to the run: "max" or "sum" over all places.
     """
 
     key: str

@@ -9,32 +9,23 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.site_setup import Law
-from ...core.vectors import Array
 from ...scenario import SiteSpec
 from ..aligned import AlignedRecords
-from .metric_catalogue import Metric, MetricValues, metric, unavailable
+from .metric_catalogue import LEARNING, MetricValues, metric, unavailable
 
 ESTIMATE_END_S = 5.0
 """Length of the end of a run over which slopes are fitted, s."""
 
-PARAMETER_ERROR_KEYS = (
-    "theta_error_first",
-    "theta_error_last",
-    "theta_energy_first_j",
-    "theta_energy_last_j",
-    "theta_slope_per_s",
-)
-
 
 class ParameterEstimates(NamedTuple):
-    """The estimates of a site.
+    """Estimates of a site.
 
     Attributes:
-        learnt: whether each is learnt.
-        theta: the truth; None where it is not known.
+        learnt: True for each that the law adapts.
+        theta: the true parameters; None if unknown.
         first: the estimates of the first record, shape (5,).
         last: of the last one, shape (5,).
-        slope_per_s: of straight lines through the last 5 s, shape (5,), 1/s; None where there is no line.
+        slope_per_s: of straight lines through the last 5 s, shape (5,), 1/s; None with less than two records.
     """
 
     learnt: list[bool]
@@ -44,59 +35,45 @@ class ParameterEstimates(NamedTuple):
     slope_per_s: list[float] | None
 
 
-def read_parameter_estimates(spec: SiteSpec, track: AlignedRecords) -> ParameterEstimates:
-    """Returns the estimates of a site, and how they move at the end."""
-    gains = spec.control.gains(spec.arm.theta)
-    moved = (track.theta_hat != track.theta_hat[0]).any(axis=0)
-    learns = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
-    slope = _slope(track)
-    return ParameterEstimates(
-        learns.tolist(),
-        spec.arm.theta.tolist() if has_known_theta(spec) else None,
-        track.theta_hat[0].tolist(),
-        track.theta_hat[-1].tolist(),
-        None if slope is None else slope.tolist(),
-    )
+def read_parameter_estimates(spec: SiteSpec, records: AlignedRecords) -> ParameterEstimates:
+    """Returns the estimates of a site, and their least-squares slopes at the end."""
+    gains, theta_hat = spec.control.gains(spec.arm.theta), records.theta_hat
+    moved = (theta_hat != theta_hat[0]).any(axis=0)
+    adapted = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
+    rows, slope = records.known_at_end(ESTIMATE_END_S), None
+    if np.count_nonzero(rows) >= 2:
+        x = records.t_s[rows] - records.t_s[rows].mean()
+        slope = (x @ theta_hat[rows] / (x @ x)).tolist()
+    theta = spec.arm.theta.tolist() if has_known_theta(spec) else None
+    return ParameterEstimates(adapted.tolist(), theta, theta_hat[0].tolist(), theta_hat[-1].tolist(), slope)
 
 
-def _slope(track: AlignedRecords) -> Array | None:
-    """Returns the slopes of least-squares lines through the recorded estimates of the last 5 s, 1/s."""
-    t_s = track.t_s
-    rows = track.known & (t_s > t_s[-1] - ESTIMATE_END_S)
-    if np.count_nonzero(rows) < 2:
-        return None
-    x = t_s[rows] - t_s[rows].mean()
-    slope: Array = x @ track.theta_hat[rows] / (x @ x)
-    return slope
-
-
-def measure_parameter_error(spec: SiteSpec, track: AlignedRecords | None) -> MetricValues:
-    """Returns how far the estimates are from the truth, at both ends, and how fast they still move."""
-    if track is None:
-        return unavailable(PARAMETER_ERROR_KEYS, "no records of the site")
-    found, gains = read_parameter_estimates(spec, track), spec.control.gains(spec.arm.theta)
-    rows = np.array(found.learnt)
+def measure_parameter_error(spec: SiteSpec, records: AlignedRecords | None) -> MetricValues:
+    """Returns the distance of the estimates from theta at both ends, and their rate of change at the end."""
+    if records is None:
+        return unavailable(LEARNING, "no records of the site")
+    estimates, gains = read_parameter_estimates(spec, records), spec.control.gains(spec.arm.theta)
+    rows = np.array(estimates.learnt)
     if not rows.any():
-        return unavailable(PARAMETER_ERROR_KEYS, "nothing is learnt", applies=False)
-    slope = None if found.slope_per_s is None else float(np.linalg.norm(np.array(found.slope_per_s)[rows]))
-    moves = {"theta_slope_per_s": metric(slope, "less than two records in the last 5 s")}
-    if found.theta is None:
-        return {**unavailable(PARAMETER_ERROR_KEYS[:4], "theta of the arm is not known"), **moves}
-    off = np.array([found.first, found.last])[:, rows] - np.array(found.theta)[rows]
-    distance = np.linalg.norm(off, axis=1)
-    energy: list[Metric] = [Metric(None, "the gains of learning are not known")] * 2
+        return unavailable(LEARNING, "nothing is learnt", applies=False)
+    slopes = estimates.slope_per_s
+    slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
+    metrics = unavailable(LEARNING, "theta of the arm is not known")
+    metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
+    if estimates.theta is None:
+        return metrics
+    off = np.array([estimates.first, estimates.last])[:, rows] - np.array(estimates.theta)[rows]
+    distance = np.linalg.norm(off, axis=1).tolist()
+    energy: list[float | None] = [None, None]
     if gains.law is Law.ADAPTIVE:
-        held = 0.5 * (off**2 / np.array(gains.Gamma)[rows]).sum(axis=1)
-        energy = [metric(value) for value in held.tolist()]
-    return {
-        "theta_error_first": metric(distance[0]),
-        "theta_error_last": metric(distance[1]),
-        "theta_energy_first_j": energy[0],
-        "theta_energy_last_j": energy[1],
-        **moves,
-    }
+        energy = (0.5 * (off**2 / np.array(gains.Gamma)[rows]).sum(axis=1)).tolist()
+    why = "it is no finite number" if gains.law is Law.ADAPTIVE else "the gains of learning are not known"
+    for n, end in enumerate(("first", "last")):
+        metrics[f"theta_error_{end}"] = metric(distance[n])
+        metrics[f"theta_energy_{end}_j"] = metric(energy[n], why)
+    return metrics
 
 
 def has_known_theta(spec: SiteSpec) -> bool:
-    """True where the scenario knows the arm's parameters."""
+    """True if the scenario knows the arm's parameters."""
     return bool(getattr(spec.arm, "known", True))

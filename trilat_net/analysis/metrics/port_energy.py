@@ -27,189 +27,147 @@ from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario, SiteSpec
-from ..aligned import AlignedRecords, PeerMotion, PeerTrajectory
+from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
 from ..arm_rows import inertia_product_rows, regressor_rows
 from ..dominance_history import DominanceHistory
 from ..torque_split import TorqueSplit
-from .metric_catalogue import Metric, MetricValues, metric, unavailable
+from .metric_catalogue import ENERGY, Metric, MetricValues, metric, unavailable
 from .parameter_error import has_known_theta
-
-PORT_ENERGY_KEYS = (
-    "controller_j",
-    "hands_j",
-    "hands_most_j",
-    "walls_j",
-    "walls_most_j",
-    "mechanical_j",
-    "unaccounted_j",
-)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is held, of every period, shape (K - 1,), J.
+    """Returns the work of a torque that is held over every period, shape (K - 1,), J.
 
     Args:
-        torque: from each row to the next, shape (K - 1, 2) or more rows, N m.
+        torque: of every period, shape (K - 1, 2) or more rows, N m.
         q: joint angles, shape (K, 2), rad.
     """
-    way = np.diff(q, axis=0)
-    work: Array = np.einsum("kj,kj->k", torque[: len(way)], way)
+    work: Array = np.einsum("kj,kj->k", torque[: len(q) - 1], np.diff(q, axis=0))
     return work
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that follows the present, of every period, shape (K - 1,), J.
-
-    Args:
-        torque: shape (K, 2), N m.
-        q: joint angles, shape (K, 2), rad.
-    """
+    """Returns the work of a torque that follows the present, shape (K, 2), N m, per period, (K - 1,), J."""
     return held_work(0.5 * (torque[:-1] + torque[1:]), q)
 
 
-def held_control_torque(track: AlignedRecords, scenario: Scenario) -> Array:
+def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     """Returns the torque that the controller held over every period, shape (K - 1, 2), N m.
 
-    tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit. An arm
-    outside of the program was told tau; what its drives made of it in between is not known: the trapezoid.
+    The drives of an arm outside of the program got tau; their torque in between is unknown: the trapezoid.
     """
-    spec, tau = scenario.sites[track.site], track.tau
+    spec = scenario.sites[records.site]
     if spec.plant == "external":
-        mean: Array = 0.5 * (tau[:-1] + tau[1:])
+        mean: Array = 0.5 * (records.tau[:-1] + records.tau[1:])
         return mean
-    u = tau[:-1].copy()
-    if Scheme[scenario.scheme.upper()] is Scheme.SECOND_ORDER:
-        limit = spec.limits.tau_limit_nm
-        u[1:] = np.clip(1.5 * tau[1:-1] - 0.5 * tau[:-2], -limit, limit)
-    return u
+    digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
+    return records.held_torque(spec.limits.tau_limit_nm, digital=digital)
 
 
-def mechanical_energy(spec: SiteSpec, track: AlignedRecords) -> Array:
-    """Returns the arm's kinetic and potential energy, shape (K,), J; of height zero where it is level.
+def mechanical_energy(spec: SiteSpec, records: AlignedRecords) -> Array:
+    """Returns the arm's kinetic and potential energy, shape (K,), J; of height zero when level.
 
     1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)).
     """
-    theta, q = spec.arm.theta, track.q
-    kinetic = 0.5 * np.einsum("kj,kj->k", track.qd, inertia_product_rows(theta, q, track.qd))
+    theta, q = spec.arm.theta, records.q
+    kinetic = 0.5 * np.einsum("kj,kj->k", records.qd, inertia_product_rows(theta, q, records.qd))
     height = theta[3] * np.sin(q[:, 0]) + theta[4] * np.sin(q[:, 0] + q[:, 1])
     energy: Array = kinetic + spec.arm.g_m_s2 * height
     return energy
 
 
-def measure_port_energy(scenario: Scenario, track: AlignedRecords, by: TorqueSplit) -> MetricValues:
-    """Returns the energies of a site's ports, over the periods whose both ends are recorded.
+def measure_port_energy(scenario: Scenario, records: AlignedRecords, torque: TorqueSplit) -> MetricValues:
+    """Returns the energies of a site's ports, over the periods with both ends recorded.
 
     Args:
         scenario: the experiment.
-        track: the site's records.
-        by: who pushed it.
+        records: of the site.
+        torque: ON its arm.
     """
-    spec, there = scenario.sites[track.site], track.known_periods
-    if not there.any():
-        return unavailable(PORT_ENERGY_KEYS, "no two records in a row")
+    spec, known, q = scenario.sites[records.site], records.known_periods, records.q
+    if not known.any():
+        return unavailable(ENERGY, "no two records in a row", of="site")
 
-    def summed(amounts: Array) -> Array:
-        return np.cumsum(np.where(there, amounts, 0.0))
+    def total(amounts: Array) -> Array:
+        return np.cumsum(np.where(known, amounts, 0.0))
 
-    controller = summed(held_work(held_control_torque(track, scenario), track.q))
-    hands = summed(trapezoid_work(by.operator_now, track.q) + held_work(by.operator_held, track.q))
-    walls = summed(trapezoid_work(by.environment_now, track.q) + held_work(by.environment_held, track.q))
+    controller = total(held_work(held_control_torque(records, scenario), q))
+    operator = total(trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q))
+    walls = total(trapezoid_work(torque.environment_now, q) + held_work(torque.environment_held, q))
     found = {
         "controller_j": metric(controller[-1]),
-        "hands_j": metric(hands[-1]),
-        "hands_most_j": metric(max(0.0, float(hands.max()))),
+        "hands_j": metric(operator[-1]),
+        "hands_most_j": metric(max(0.0, float(operator.max()))),
         "walls_j": metric(walls[-1]) if spec.environment else NO_WALLS,
         "walls_most_j": metric(max(0.0, float(walls.max()))) if spec.environment else NO_WALLS,
     }
     if not has_known_theta(spec):
-        return {**found, **unavailable(("mechanical_j", "unaccounted_j"), "theta of the arm is not known")}
-    change = summed(np.diff(mechanical_energy(spec, track)))
-    rest = change - controller - hands - walls
-    return {
-        **found,
-        "mechanical_j": metric(change[-1]),
-        "unaccounted_j": metric(float(np.abs(rest).max())),
-    }
+        unknown = Metric(None, "theta of the arm is not known")
+        return {**found, "mechanical_j": unknown, "unaccounted_j": unknown}
+    change = total(np.diff(mechanical_energy(spec, records)))
+    unaccounted = np.abs(change - controller - operator - walls)
+    return {**found, "mechanical_j": metric(change[-1]), "unaccounted_j": metric(float(unaccounted.max()))}
 
 
 NO_WALLS = Metric(None, "the scenario has no environment here", applies=False)
 
-DELAY_ENERGY_KEYS = ("delay_j", "delay_most_j")
-
 
 def measure_delay_energy(
     log: Log,
-    found: Mapping[str, AlignedRecords],
-    shares: Mapping[str, DominanceHistory],
+    aligned: Mapping[str, AlignedRecords],
+    dominance: Mapping[str, DominanceHistory],
     peer: str,
     site: str,
 ) -> MetricValues:
-    """Returns the energy that the delay of a link gave: in all, and the most until any time, J.
+    """Returns the energy that the delay of a link injects: in all, and the most until any time, J.
 
-    Over the periods that rest on records alone and in which the site follows its peers; of the torque that
-    the law asks for, before its limit.
-
-    Args:
-        log: the log.
-        found: the sites' records.
-        shares: their shares in their peers.
-        peer: who sends.
-        site: who receives.
+    Over the periods that follow from records alone and in which the site follows its peers; of the torque
+    that the law asks for, before its limit.
     """
     spec = log.scenario.sites[site]
-    absent = [name for name in (peer, site) if name not in found]
-    if absent:
-        return unavailable(DELAY_ENERGY_KEYS, f"no records of {', '.join(absent)}")
     gains = spec.control.gains(spec.arm.theta)
+    absent = [name for name in (peer, site) if name not in aligned]
+    if absent:
+        return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
     if gains.law is Law.OWN:
-        return unavailable(DELAY_ENERGY_KEYS, "a law of somebody's own: what it makes of a peer is not known")
-    track, other = found[site], found[peer]
-    if min(len(track.known), len(other.known)) < 2:
-        return unavailable(DELAY_ENERGY_KEYS, "no two records in a row")
-    used, past = track.used[peer], PeerTrajectory(other)
-    # before its first sample the peer rests at its start pose (L7)
-    seen = past.at(np.where(used >= 0, used / other.rate_hz, -1.0))
-    now = past.at(track.t_s)
-    known = seen.known & now.known & track.follows
-    there = track.known_periods & known[:-1] & known[1:]
-    if not there.any():
-        return unavailable(DELAY_ENERGY_KEYS, "no period rests on records of both sites")
-    share, j = shares[site], list(track.used).index(peer)
-    torque = _delay_torque(gains, track, other, seen, now, share.alpha[:, j, None], share.rate[:, j, None])
-    given = np.cumsum(np.where(there, trapezoid_work(torque, track.q), 0.0))
-    return {"delay_j": metric(given[-1]), "delay_most_j": metric(max(0.0, float(given.max())))}
+        return unavailable(ENERGY, "a law of somebody's own: what it makes of a peer is not known", of="link")
+    records, other = aligned[site], aligned[peer]
+    if min(len(records.known), len(other.known)) < 2:
+        return unavailable(ENERGY, "no two records in a row", of="link")
+    view = view_delayed_peer(records, other, PeerTrajectory(other))
+    known = view.seen.known & view.now.known & records.follows
+    judged = records.known_periods & known[:-1] & known[1:]
+    if not judged.any():
+        return unavailable(ENERGY, "no period rests on records of both sites", of="link")
+    j, factors = list(records.used).index(peer), dominance[site]
+    torque = _delay_torque(gains, records, other, view, factors.alpha[:, [j]], factors.rate[:, [j]])
+    injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
+    return {"delay_j": metric(injected[-1]), "delay_most_j": metric(max(0.0, float(injected.max())))}
 
 
 def _delay_torque(
     gains: Gains,
-    track: AlignedRecords,
+    records: AlignedRecords,
     other: AlignedRecords,
-    seen: PeerMotion,
-    now: PeerMotion,
+    view: DelayedPeer,
     alpha: Array,
     rate: Array,
 ) -> Array:
-    """Returns what the delay adds to the torque of a law, shape (K, 2), N m."""
-    late = seen.q - now.q
+    """Returns the torque that the delay adds to that of the law, shape (K, 2), N m."""
+    late = view.seen.q - view.now.q
     off = alpha * late
-    off_rate = alpha * (seen.qd - now.qd) + rate * late
+    off_rate = alpha * (view.seen.qd - view.now.qd) + rate * late
     if gains.law is Law.ADAPTIVE:
         Lambda = np.array(gains.Lambda)
-        Y = regressor_rows(0.0, track.q, track.qd, Lambda * off, Lambda * off_rate)
-        torque = np.einsum("kij,kj->ki", Y, track.theta_hat)
+        Y = regressor_rows(0.0, records.q, records.qd, Lambda * off, Lambda * off_rate)
+        torque = np.einsum("kij,kj->ki", Y, records.theta_hat)
         added: Array = torque + np.array(gains.Kp) * Lambda * off + np.array(gains.Kd) * off_rate
         return added
     added = np.array(gains.K) * off + np.array(gains.Kd) * off_rate
-    if any(gains.k_f):
-        added = added + np.array(gains.k_f) * alpha * _reflected_delay_torque(track, other)
+    if any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
+        used = records.used[other.site]
+        row = np.clip(used - other.first, 0, len(other.known) - 1)
+        came = np.where((used >= 0)[:, None], -other.tau_x[row], 0.0)
+        now = [np.interp(records.t_s, other.t_s, -column) for column in other.tau_x.T]
+        added = added + np.array(gains.k_f) * alpha * (came - np.stack(now, axis=1))
     return added
-
-
-def _reflected_delay_torque(track: AlignedRecords, other: AlignedRecords) -> Array:
-    """Returns the torque on a peer's arm as it came, less the one at the same time, shape (K, 2), N m."""
-    used = track.used[other.site]
-    row = np.clip(used - other.first, 0, len(other.known) - 1)
-    came = np.where((used >= 0)[:, None], -other.tau_x[row], 0.0)
-    now = np.stack([np.interp(track.t_s, other.t_s, -column) for column in other.tau_x.T], axis=1)
-    late: Array = came - now
-    return late

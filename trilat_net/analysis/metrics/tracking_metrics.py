@@ -5,7 +5,6 @@ its master as that was when the sample in use was taken. Effort counts the torqu
 within its limit, gravity compensation included.
 """
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,98 +14,96 @@ from ...log.log_reader import Log
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
 from ..aligned import AlignedRecords, find_latest_rows
-from .metric_catalogue import Metric, MetricValues, metric, peak, rms, unavailable
-
-TRACKING_KEYS = ("settle_s", "rms_error_rad", "max_error_rad", "max_error_end_rad")
-SPREAD_KEYS = ("spread_rms_rad", "spread_max_rad", "spread_end_rad")
-FOLLOWING_KEYS = ("following_rms_rad", "following_max_rad", "following_end_rad")
+from .metric_catalogue import (
+    EFFORT,
+    FOLLOWING,
+    SPREAD,
+    TRACKING,
+    MetricValues,
+    metric,
+    peak,
+    rms,
+    unavailable,
+)
 
 
 def measure_tracking(log: Log, site: str) -> MetricValues:
     """Returns settling, RMS and peak of a site's e."""
     part = log[site]
     if not len(part):
-        return unavailable(TRACKING_KEYS, f"no records of {site}")
-    errors, settle_s = site_signals.joint_errors(part), site_signals.settling_time_s(part)
-    still = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} rad in the last record"
+        return unavailable(TRACKING, f"no records of {site}")
+    errors = site_signals.joint_errors(part)
+    unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} rad in the last record"
     return {
-        "settle_s": Metric(None, still) if settle_s is None else metric(settle_s),
+        "settle_s": metric(site_signals.settling_time_s(part), unsettled),
         "rms_error_rad": metric(rms(errors)),
         "max_error_rad": metric(peak(errors)),
         "max_error_end_rad": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
     }
 
 
-def measure_spread(log: Log, found: Mapping[str, AlignedRecords]) -> MetricValues:
+def measure_spread(log: Log, aligned: Mapping[str, AlignedRecords]) -> MetricValues:
     """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
 
-    Instants are the ticks of the first site of which every other site has its own latest tick recorded.
+    Instants are the ticks of the first site at which every other site has its own latest tick recorded.
     """
-    absent = [site for site in log.sites if site not in found]
+    absent = [site for site in log.sites if site not in aligned]
     if absent:
-        return unavailable(SPREAD_KEYS, f"no records of {', '.join(absent)}")
-    first = found[log.sites[0]]
+        return unavailable(SPREAD, f"no records of {', '.join(absent)}")
+    first = aligned[log.sites[0]]
     known, poses = first.known.copy(), []
-    for track in found.values():
-        row, there = find_latest_rows(track, first.t_s)
-        known &= there
-        poses.append(track.q[row])
+    for records in aligned.values():
+        row, recorded = find_latest_rows(records, first.t_s)
+        known &= recorded
+        poses.append(records.q[row])
     if not known.any():
-        return unavailable(SPREAD_KEYS, "no instant of which every site has a record")
-    q: Array = np.stack(poses)[:, known]
-    spread = q.max(axis=0) - q.min(axis=0)
-    end_s = min(float(track.t_s[-1]) for track in found.values())
+        return unavailable(SPREAD, "no instant of which every site has a record")
+    spread: Array = np.ptp(np.stack(poses)[:, known], axis=0)
+    end_s = min(float(records.t_s[-1]) for records in aligned.values())
     last = spread[first.t_s[known] > end_s - END_WINDOW_S]
+    none = "no instant of the last second of which every site has a record"
     return {
         "spread_rms_rad": metric(rms(spread)),
         "spread_max_rad": metric(peak(spread)),
-        "spread_end_rad": metric(
-            peak(last), "no instant of the last second of which every site has a record"
-        ),
+        "spread_end_rad": metric(peak(last), none),
     }
 
 
-def measure_following(log: Log, found: Mapping[str, AlignedRecords], peer: str, site: str) -> MetricValues:
+def measure_following(log: Log, aligned: Mapping[str, AlignedRecords], peer: str, site: str) -> MetricValues:
     """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of the tick.
 
     At every tick t_k of the slave from its first sample of that master on: the master's angles in the record
     whose sample the slave has in use, less the slave's own.
     """
-    roles = [log.scenario.sites[name].role for name in (peer, site)]
-    if roles != ["master", "slave"]:
-        return unavailable(FOLLOWING_KEYS, "no link of a master to a slave", applies=False)
-    absent = [name for name in (peer, site) if name not in found]
+    if [log.scenario.sites[name].role for name in (peer, site)] != ["master", "slave"]:
+        return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
+    absent = [name for name in (peer, site) if name not in aligned]
     if absent:
-        return unavailable(FOLLOWING_KEYS, f"no records of {', '.join(absent)}")
-    master, slave = found[peer], found[site]
-    used = slave.used[peer]
-    row = used - master.first
-    inside = (used >= 0) & (row >= 0) & (row < len(master.known))
+        return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
+    master, slave = aligned[peer], aligned[site]
+    row = slave.used[peer] - master.first
+    inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
     row = np.clip(row, 0, len(master.known) - 1)
     known = slave.known & inside & master.known[row]
     if not known.any():
-        return unavailable(FOLLOWING_KEYS, f"no record of {site} uses a recorded sample of {peer}")
-    off = master.q[row] - slave.q
-    last = slave.known_at_end(END_WINDOW_S)[known]
-    off = off[known]
-    end = peak(off[last]) if last.any() else math.nan
+        return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
+    off = (master.q[row] - slave.q)[known]
     return {
         "following_rms_rad": metric(rms(off)),
         "following_max_rad": metric(peak(off)),
-        "following_end_rad": metric(end, "no sample in the last second"),
+        "following_end_rad": metric(
+            peak(off[slave.known_at_end(END_WINDOW_S)[known]]), "no sample in the last second"
+        ),
     }
-
-
-EFFORT_KEYS = ("effort_nm2_s", "rms_tau_nm", "peak_tau_nm", "saturated_share")
 
 
 def measure_effort(log: Log, site: str) -> MetricValues:
     """Returns effort and saturation of a site."""
-    part, spec = log[site], log.scenario.sites[site]
+    part = log[site]
     if not len(part):
-        return unavailable(EFFORT_KEYS, f"no records of {site}")
+        return unavailable(EFFORT, f"no records of {site}")
     tau = site_signals.controller_torques(part)
-    at_limit = np.any(np.abs(tau) >= spec.limits.tau_limit_nm, axis=1)
+    at_limit = np.any(np.abs(tau) >= log.scenario.sites[site].limits.tau_limit_nm, axis=1)
     return {
         "effort_nm2_s": metric(float(np.einsum("kj,kj->", tau, tau)) / part.rate_hz),
         "rms_tau_nm": metric(rms(tau)),

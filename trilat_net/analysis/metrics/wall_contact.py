@@ -13,31 +13,20 @@ from ...scenario import SiteSpec
 from ..aligned import AlignedRecords, Bools
 from ..arm_rows import EndEffectorRows
 from ..torque_sources import wall_depth, wall_force
-from .metric_catalogue import MetricValues, metric, unavailable
+from .metric_catalogue import CONTACT, MetricValues, metric, unavailable
 
 CONTACT_END_S = 5.0
-"""Length of the end of a run that the second half of the quantities looks at, s."""
-
-RUN_CONTACT_KEYS = (
-    "force_mean_n",
-    "force_deviation_n",
-    "force_peak_n",
-    "hits",
-    "contact_share",
-    "depth_max_m",
-)
-END_CONTACT_KEYS = ("end_force_mean_n", "end_force_deviation_n", "end_force_peak_n", "end_hits")
-CONTACT_KEYS = (*RUN_CONTACT_KEYS, *END_CONTACT_KEYS)
+"""Length of the end of a run for the quantities of the end, s."""
 
 
 class WallContact(NamedTuple):
-    """A wall as a tip met it, over the recorded ticks.
+    """Contact of an end effector with a wall, over the recorded ticks.
 
     Attributes:
         t_s: shape (K,), s.
         force: along its normal, shape (K,), N.
-        depth: of the tip in it, shape (K,), m.
-        began: whether the force began at that tick, shape (K,).
+        depth: of the end effector in it, shape (K,), m.
+        began: True if the force began at that tick, shape (K,).
     """
 
     t_s: Array
@@ -51,41 +40,35 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     return [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
 
 
-def find_wall_contact(actor: TorqueSource, track: AlignedRecords, tip: EndEffectorRows) -> WallContact:
-    """Returns how a tip met a wall."""
-    t_s = track.nominal_s
-    force = wall_force(actor, t_s, tip)
+def find_wall_contact(
+    wall: TorqueSource, records: AlignedRecords, end_effector: EndEffectorRows
+) -> WallContact:
+    """Returns the contact of an end effector with a wall.
+
+    The first record, of all and after a gap, begins no contact: its beginning is unknown.
+    """
+    t_s, known = records.nominal_s, records.known
+    force = wall_force(wall, t_s, end_effector)
     touches = force > 0.0
-    # the first record, of all and behind a gap, begins nothing: nobody knows since when it touches
-    begins = touches & np.concatenate([[False], ~touches[:-1] & track.known[:-1]])
-    known = track.known
-    return WallContact(t_s[known], force[known], wall_depth(actor, tip)[known], begins[known])
+    begins = touches & np.concatenate([[False], ~touches[:-1] & known[:-1]])
+    return WallContact(t_s[known], force[known], wall_depth(wall, end_effector)[known], begins[known])
 
 
 def measure_wall_contact(
-    actor: TorqueSource, track: AlignedRecords | None, tip: EndEffectorRows | None
+    wall: TorqueSource, records: AlignedRecords | None, end_effector: EndEffectorRows | None
 ) -> MetricValues:
-    """Returns force, hits and depth of a wall, over the run and over its last 5 s.
-
-    Args:
-        actor: the wall.
-        track: the site's records; None without any.
-        tip: where its tip was.
-    """
-    if track is None or tip is None:
-        return unavailable(CONTACT_KEYS, "no records of the site")
-    how = find_wall_contact(actor, track, tip)
-    last = how.t_s > how.t_s[-1] - CONTACT_END_S
-    found = _contact_metrics(how, np.ones(len(last), dtype=np.bool_), RUN_CONTACT_KEYS[:4])
-    return {
-        **found,
-        "contact_share": metric(float((how.force > 0.0).mean())),
-        "depth_max_m": metric(max(0.0, float(how.depth.max()))),
-        **_contact_metrics(how, last, END_CONTACT_KEYS),
+    """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without records."""
+    if records is None or end_effector is None:
+        return unavailable(CONTACT, "no records of the site")
+    contact = find_wall_contact(wall, records, end_effector)
+    metrics = {
+        "contact_share": metric(float((contact.force > 0.0).mean())),
+        "depth_max_m": metric(max(0.0, float(contact.depth.max()))),
     }
-
-
-def _contact_metrics(how: WallContact, rows: Bools, keys: tuple[str, ...]) -> MetricValues:
-    force = how.force[rows]
-    values = (force.mean(), force.std(), force.max(), np.count_nonzero(how.began[rows]))
-    return {key: metric(float(value)) for key, value in zip(keys, values, strict=True)}
+    for prefix, rows in (("", slice(None)), ("end_", contact.t_s > contact.t_s[-1] - CONTACT_END_S)):
+        force = contact.force[rows]
+        metrics[f"{prefix}force_mean_n"] = metric(float(force.mean()))
+        metrics[f"{prefix}force_deviation_n"] = metric(float(force.std()))
+        metrics[f"{prefix}force_peak_n"] = metric(float(force.max()))
+        metrics[f"{prefix}hits"] = metric(float(np.count_nonzero(contact.began[rows])))
+    return {key: metrics[key] for key in unavailable(CONTACT, "")}
