@@ -18,7 +18,7 @@ def inertia_product_rows(theta: Array, q: Array, x: Array) -> Array:
     Args:
         theta: the arm's parameters, shape (5,).
         q: joint angles, shape (K, 2), rad.
-        x: what M multiplies, shape (K, 2).
+        x: the factor of M, shape (K, 2).
     """
     bend = theta[1] * np.cos(q[:, 1])
     cross = theta[2] + bend
@@ -50,7 +50,7 @@ def regressor_rows(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
 
 
 class EndEffectorRows(NamedTuple):
-    """Where the tip is and how fast, and how it moves with the joints.
+    """Position, velocity and Jacobian of the end effector.
 
     Attributes:
         at: shape (K, 2), m.
@@ -64,7 +64,7 @@ class EndEffectorRows(NamedTuple):
 
 
 def compute_end_effector(lengths: tuple[float, float], q: Array, qd: Array) -> EndEffectorRows:
-    """Returns the tip of an arm.
+    """Returns the end effector of an arm.
 
     Args:
         lengths: of the two links, m.

@@ -26,14 +26,14 @@ Bools = NDArray[np.bool_]
 
 
 class PredictedDelivery(NamedTuple):
-    """What a link does to the samples 0 to M - 1 of its peer.
+    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it.
 
     Attributes:
-        stamp_ns: when each was taken, ns since the epoch, shape (M,).
-        due_ns: when each is due, ns since the epoch, shape (M,); `LOST` where it is lost.
+        stamp_ns: of each, ns since the epoch, shape (M,).
+        due_ns: when each is due, ns since the epoch, shape (M,); `LOST` for a lost one.
         drawn_ns: the same by the model's own delay alone, without duplicates, order and play-out.
-        measured: where nothing is injected: a sample is due at once, shape (M,).
-        copies: duplicates that the link makes of them.
+        measured: True if nothing is injected: a sample is due at once, shape (M,).
+        copies: duplicates that the link makes.
     """
 
     stamp_ns: Ints
@@ -44,43 +44,32 @@ class PredictedDelivery(NamedTuple):
 
     @property
     def lost(self) -> Bools:
-        """Where the link loses the sample, shape (M,)."""
+        """True for samples that the link loses, shape (M,)."""
         lost: Bools = self.due_ns == LOST
         return lost
 
     @property
     def drawn_ms(self) -> Array:
-        """The delays that the model gives to samples that it does not lose; none of a measured one, ms."""
+        """The injected delays of the samples that are not lost, ms."""
         kept = ~self.lost & ~self.measured
         delays: Array = (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
         return delays
 
     def release(self, rate_hz: int) -> Ints:
-        """Returns the receiver's tick at which each comes into use if it is there, shape (M,); or LOST."""
+        """Returns the receiver's tick at which each comes into use if it has arrived, shape (M,); or LOST."""
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         release: Ints = np.where(self.lost, LOST, ticks)
         return release
 
 
 def first_ticks(due_ns: Ints, rate_hz: int) -> Ints:
-    """Returns the first ticks at or after some times; `core.grid.first_tick_at` for arrays.
-
-    Args:
-        due_ns: ns since the epoch, shape (M,).
-        rate_hz: the rate of the ticks, Hz.
-    """
+    """Returns the first ticks at or after times, ns; `core.ticks.first_tick_at` for arrays."""
     ticks: Ints = -(-due_ns * rate_hz // NS_PER_S)
     return ticks
 
 
 def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
-    """Returns what a link does to the first samples of its peer.
-
-    Args:
-        log: the log.
-        peer: who sends.
-        site: who receives.
-        count: how many samples.
+    """Returns the predicted delivery of the first `count` samples of a link, peer -> site.
 
     Raises:
         LogError: a record names a change that is none.
@@ -106,7 +95,7 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
 
 
 def _due(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
-    """Returns when each sample is due, and how many copies were made: the link's row as a site has it."""
+    """Returns when each sample is due, and the number of copies; by a row of the core's link."""
     row: Row = np.zeros(1, LINK_DTYPE)[0]
     row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(models)
     row.used, row.foreseen = -1, -1
@@ -137,13 +126,13 @@ def _models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void
 
 
 class Arrivals(NamedTuple):
-    """What came over a link, in the order taken in.
+    """Arrivals over a link, in the order of the records.
 
     Attributes:
         tick: the receiver's tick, shape (A,).
         sample: the sample's own tick, shape (A,).
-        delay_us: the number beside it in the record, shape (A,), us.
-        refused: how many more came with a stamp out of range, or of a tick that their sender never makes.
+        delay_us: its one-way delay in the record, shape (A,), us.
+        refused: number of others with a stamp out of range, or of a tick that their sender never makes.
     """
 
     tick: Ints
@@ -153,13 +142,13 @@ class Arrivals(NamedTuple):
 
     @property
     def first(self) -> "Arrivals":
-        """The same without what came again, by sample."""
+        """The first arrival of each sample, by sample."""
         sample, place = np.unique(self.sample, return_index=True)
         return Arrivals(self.tick[place], sample, self.delay_us[place], self.refused)
 
 
 def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
-    """Returns what came to a site, per peer."""
+    """Returns the arrivals at a site, per peer."""
     part = log[site]
     counts, entries = part.arrivals
     tick = np.repeat(part.tick, counts)
@@ -175,7 +164,7 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
 
 
 def _in_range(tick: Ints, sample: Ints, rate_hz: int, peer_rate_hz: int) -> Bools:
-    """Returns which stamps a link takes: none before the epoch, none more than the limit ahead."""
+    """Returns the stamps that a link accepts: none before the epoch, none more than the limit ahead."""
     latest_ns = tick * NS_PER_S // rate_hz + AHEAD_LIMIT_NS
     limit = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S  # in ticks: a stamp itself might overflow
     known: Bools = (sample >= 0) & (sample <= limit)
@@ -183,30 +172,30 @@ def _in_range(tick: Ints, sample: Ints, rate_hz: int, peer_rate_hz: int) -> Bool
 
 
 def count_sent(log: Log, peer: str, newest: int) -> int:
-    """Returns how many samples a peer has sent, as far as the log tells.
+    """Returns how many samples a peer has sent, as far as the log shows.
 
     Args:
         log: the log.
-        peer: who sends.
-        newest: the newest of its samples that came anywhere; -1: none.
+        peer: the sender.
+        newest: the newest of its samples that arrived anywhere; -1 for none.
     """
     part = log[peer]
-    said = [event.ticks for event in log.events if event.kind == "end" and event.member == peer]
+    stated = [event.ticks for event in log.events if event.kind == "end" and event.member == peer]
     recorded = int(part.tick[-1]) + 1 if len(part) else 0
-    return min(max(newest + 1, recorded, *said), log.scenario.ticks(peer))
+    return min(max(newest + 1, recorded, *stated), log.scenario.ticks(peer))
 
 
 def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
-    """Returns for which samples it is known whether they came, shape (M,).
+    """Returns for which samples it is known whether they arrived, shape (M,).
 
-    Known are those that came, those older than the newest that came, and those older than the slowest
-    took; except those that may have come in a tick whose record is missing.
+    Known are those that arrived, those older than the newest that arrived, and those older than the slowest
+    took; except those that may have arrived in a tick whose record is missing.
 
     Args:
         log: the log.
-        site: who receives.
+        site: the receiver.
         stamp_ns: the stamps of the samples 0 to M - 1, ns since the epoch.
-        came: what came of them, each once.
+        came: their first arrivals.
     """
     part, count = log[site], len(stamp_ns)
     if not len(part):

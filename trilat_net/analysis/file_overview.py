@@ -16,12 +16,9 @@ from ..errors import LogError
 from ..log.log_layout import SESSION
 from ..log.log_reader import open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress
-from ..log.record_columns import Ints
 from ..net import topics
 from ..net.loop_stats import ticks_per_stats
-from .health import describe_link_health, describe_session, describe_site_health
-
-JsonObject = dict[str, Any]
+from .health import JsonObject, describe_link_health, describe_session, describe_site_health, percentiles
 
 _NOTHING = (array("Q"), array("Q"), array("Q"))
 MOST_LISTED_GAPS = 1000
@@ -29,15 +26,15 @@ MOST_LISTED_GAPS = 1000
 
 
 class FileInventory:
-    """What is in a file, or in the files of one log.
+    """Content of a file, or of the files of one log.
 
     Args:
         paths: the files.
-        progress: told how many bytes are read, and how many there are in all.
+        progress: called with the bytes read and those in all.
 
     Attributes:
         files: facts of every file, keys ending in their units.
-        metadata: of all files, by name; where several have one name, of the last.
+        metadata: of all files, by name; of the last with a name.
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
@@ -51,10 +48,10 @@ class FileInventory:
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
-            told = None if progress is None else _shifted(progress, before, total)
+            shifted = None if progress is None else _shifted(progress, before, total)
             try:
                 with path.open("rb") as stream:
-                    self._read(path, McapReader(stream, str(path), told))
+                    self._read(path, McapReader(stream, str(path), shifted))
             except OSError as error:
                 raise LogError(f"{path}: cannot be read: {error.strerror}") from None
             before += path.stat().st_size
@@ -95,8 +92,8 @@ class FileInventory:
         """Returns the facts of every channel by topic, keys ending in their units.
 
         Args:
-            session: the session, if these are files of ours.
-            rates_hz: the tick rate of its sites.
+            session: its name, if these are files of ours.
+            rates_hz: the tick rates of its sites.
         """
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
         return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
@@ -120,7 +117,7 @@ class FileInventory:
 
 
 def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int]) -> JsonObject:
-    """Returns what is missing of a channel whose messages are numbered; else nothing."""
+    """Returns the gaps of a channel with consecutive numbers; else None for each."""
     where = topics.parse_key(topic.removeprefix("/"))
     of_a_site = where is not None and where.session == session and where.member in rates_hz
     if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
@@ -136,12 +133,8 @@ def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int
 
 
 def _between_ms(log_ns: Any) -> JsonObject | None:
-    """Returns how much time lay between messages as they came, ms; None where there are no two."""
-    if len(log_ns) < 2:
-        return None
-    passed: Ints = np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64))
-    p50, p99, largest = np.percentile(passed, (50.0, 99.0, 100.0)).tolist()
-    return {"p50": p50 / 1e6, "p99": p99 / 1e6, "max": largest / 1e6}
+    """Returns the time between messages in the order of the file, ms; None of less than two."""
+    return percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6)
 
 
 def _shifted(progress: Progress, before: int, total: int) -> Progress:
@@ -149,11 +142,11 @@ def _shifted(progress: Progress, before: int, total: int) -> Progress:
 
 
 def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
-    """Returns what is in a file, or in the parts of one log, ready for JSON; keys end in their units.
+    """Returns the facts of a file, or of the parts of one log, ready for JSON; keys end in their units.
 
     Args:
         paths: the files.
-        progress: told how much is read, and how much there is.
+        progress: called with the amount read and that in all.
 
     Returns:
         files: facts of each.
@@ -188,7 +181,7 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
 
 
 def _half(progress: Progress | None, which: int) -> Progress | None:
-    """Returns what tells of the first or the second half of the work."""
+    """Returns a callback for the first or the second half of the work."""
     if progress is None:
         return None
     return lambda done, total: progress(which * total + done, 2 * total)

@@ -4,14 +4,17 @@ Invariant: keys end in their unit; a quantity that the log does not determine is
 estimates are those in force while the session ran, without later improvement.
 """
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.ticks import NS_PER_S
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
 from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns
 
 
@@ -21,13 +24,13 @@ class ClockSummary(NamedTuple):
     Attributes:
         offset_us: the sender's clock minus the receiver's, by the last statistics, us.
         offset_first_us: the same by the first ones.
-        drift_ppm: by how much it grows, us/s, by the last estimate; None where none was made.
-        drift_bound_ppm: how far that is from the truth at most.
-        bound_us: how far the offset in force was from the truth at most, by the last statistics, us.
+        drift_ppm: growth of the offset, us/s, by the last estimate; None without one.
+        drift_bound_ppm: bound of its error.
+        bound_us: bound of the error of the offset in force, by the last statistics, us.
         bound_p50_us: the median of that.
         bound_max_us: its largest.
-        rtt_min_us: smallest round trip; None where none was made.
-        faults: samples that came before they were sent by more than the bound: a clock has stepped.
+        rtt_min_us: smallest round trip; None without one.
+        faults: samples that arrived before they were sent by more than the bound: a clock has stepped.
     """
 
     offset_us: int
@@ -42,23 +45,23 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True where both ends read one and the same clock."""
+        """True if both ends read one and the same clock."""
         return self.bound_max_us == 0 and self.offset_us == 0
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns what a site knew of a peer's clock; None where nothing was measured, as in virtual time."""
+    """Returns the estimates of a peer's clock at a site; None if nothing was measured, as in virtual time."""
     stats = [stats for stats in log.link_stats(site) if peer in stats.offset_us]
     if not stats:
         return None
     bounds = [each.bound_us.get(peer, 0) for each in stats]
     trips = [trip for each in stats if (trip := each.rtt_us.get(peer, -1)) >= 0]
-    said = [e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)]
+    drifts = [e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)]
     return ClockSummary(
         offset_us=stats[-1].offset_us[peer],
         offset_first_us=stats[0].offset_us[peer],
-        drift_ppm=said[-1].drift_ppb / 1e3 if said else None,
-        drift_bound_ppm=said[-1].drift_bound_ppb / 1e3 if said else None,
+        drift_ppm=drifts[-1].drift_ppb / 1e3 if drifts else None,
+        drift_bound_ppm=drifts[-1].drift_bound_ppb / 1e3 if drifts else None,
         bound_us=bounds[-1],
         bound_p50_us=float(np.median(bounds)),
         bound_max_us=max(bounds),
@@ -74,13 +77,13 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
 
 
 def describe_session(log: Log) -> JsonObject:
-    """Returns what a log says of its session."""
-    said, scenario = log.session, log.scenario
-    epoch_ns = _number(said.get("epoch_unix_ns", ""))
+    """Returns the facts of a log's session."""
+    session, scenario = log.session, log.scenario
+    epoch_ns = _number(session.get("epoch_unix_ns", ""))
     seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
     live = log.driver == "live" and epoch_ns is not None
     return {
-        "session": said["session"],
+        "session": session["session"],
         "driver": log.driver,
         "complete": log.complete,
         "began_utc": _date(epoch_ns) if live and epoch_ns is not None else None,
@@ -91,46 +94,47 @@ def describe_session(log: Log) -> JsonObject:
             "name": scenario.name,
             "title": scenario.title,
             "sha256": log.scenario_sha256,
-            "as_named": log.scenario_sha256 == said.get("scenario_sha256"),
+            "as_named": log.scenario_sha256 == session.get("scenario_sha256"),
             "duration_s": scenario.duration_s,
             "seed": scenario.seed,
             "sites": list(log.sites),
         },
-        **{key: said.get(key) for key in _PROVENANCE},
+        **{key: session.get(key) for key in _PROVENANCE},
         "versions": {
-            key.removeprefix("version_"): value for key, value in said.items() if key.startswith("version_")
+            key.removeprefix("version_"): value
+            for key, value in session.items()
+            if key.startswith("version_")
         },
         "accounts": log.accounts,
     }
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Returns what a log says of a site's records and of its loop."""
+    """Returns the facts of a site's records and of its loop."""
     part, spec = log[site], log.scenario.sites[site]
-    made = next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
     timed = log.driver == "live"
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
         "records": len(part),
-        "made_ticks": made,
+        "made_ticks": made_ticks(log, site),
         "expected_ticks": log.scenario.ticks(site),
         "missing": log.missing(site),
-        "late_us": _spread(part.late_us, 1.0) if timed else None,
-        "busy_us": _spread(part.busy_us, 1.0) if timed else None,
-        "overruns": int(np.count_nonzero(part.late_us >= 1e6 / spec.rate_hz)) if timed else None,
+        "late_us": percentiles(part.late_us) if timed else None,
+        "busy_us": percentiles(part.busy_us) if timed else None,
+        "overruns": count_overruns(part) if timed else None,
     }
 
 
 def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
-    """Returns what a log says of a directed link, peer -> site."""
+    """Returns the facts of a directed link, peer -> site."""
     clock = summarise_clock(log, peer, site)
     stats = log.link_stats(site)[-1:]
     counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
-        "age_ms": _spread(sample_ages_ns(log, peer, site), 1e6),
-        "one_way_ms": _spread(_one_way_us(log, peer, site), 1e3),
+        "age_ms": percentiles(sample_ages_ns(log, peer, site), unit=1e6),
+        "one_way_ms": percentiles(_one_way_us(log, peer, site), unit=1e3),
         "clock_offset_us": None if clock is None else clock.offset_us,
         "clock_bound_us": None if clock is None else clock.bound_us,
         **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
@@ -148,12 +152,28 @@ def _one_way_us(log: Log, peer: str, site: str) -> Ints:
     return delays
 
 
-def _spread(values: Ints, unit: float) -> JsonObject | None:
-    """Returns median, 99th percentile and largest, in units of so many; None where there is nothing."""
-    if not len(values):
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
+
+
+def percentiles(
+    values: ArrayLike, shares: Mapping[str, float] = PERCENTILES, unit: float = 1.0
+) -> dict[str, float] | None:
+    """Returns percentiles by name, in multiples of a unit; None of no values."""
+    array = np.asarray(values)
+    if not array.size:
         return None
-    p50, p99, largest = (np.percentile(values, (50.0, 99.0, 100.0)) / unit).tolist()
-    return {"p50": p50, "p99": p99, "max": largest}
+    found = (np.percentile(array, list(shares.values())) / unit).tolist()
+    return dict(zip(shares, found, strict=True))
+
+
+def made_ticks(log: Log, site: str) -> int | None:
+    """Returns the number of ticks that a site made, by its own event; None without one."""
+    return next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
+
+
+def count_overruns(part: SiteLog) -> int:
+    """Returns how many ticks began later than a whole period."""
+    return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
 
 
 def _number(text: str) -> int | None:

@@ -36,17 +36,7 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """How numbers are spread.
-
-    Attributes:
-        mean: their mean.
-        deviation: their standard deviation.
-        p50: half of them are at most this.
-        p95: 95 % of them are.
-        p99: 99 % of them are.
-        min: the smallest.
-        max: the largest.
-    """
+    """Statistics of numbers: mean, standard deviation, percentiles and extremes."""
 
     mean: float
     deviation: float
@@ -58,12 +48,12 @@ class ValueStatistics(NamedTuple):
 
 
 class AgeHistogram(NamedTuple):
-    """How many ticks had which age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`.
+    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`.
 
     Attributes:
-        first_ms: where the first bin begins, ms.
+        first_ms: begin of the first bin, ms.
         width_ms: width of a bin, ms.
-        ticks: how many ticks each bin counts.
+        ticks: in each bin.
     """
 
     first_ms: float
@@ -72,18 +62,18 @@ class AgeHistogram(NamedTuple):
 
 
 class SampleCounts(NamedTuple):
-    """What became of the samples of a link, as the receiver's records show it.
+    """Counts of the samples of a link, by the receiver's records.
 
     Attributes:
-        sent: samples that the peer has sent.
-        judged: of those, the ones of which it is known whether they came.
-        arrived: of the judged, the ones that came.
-        missing: of the judged, the ones that did not: lost on the way.
-        lost: of the arrived, the ones that the link's model lost.
-        late: of the arrived, the ones that came after they were due.
-        superseded: of the arrived, the ones never used: a newer one came into use before or with them.
-        duplicate: arrivals of what had arrived before.
-        copies: duplicates that the link's model made.
+        sent: by the peer.
+        judged: of those, the ones of which it is known whether they arrived.
+        arrived: of the judged.
+        missing: of the judged, lost on the way.
+        lost: of the arrived, lost by the link's model.
+        late: of the arrived, after they were due.
+        superseded: of the arrived, never used: a newer one came into use before or with them.
+        duplicate: arrivals of samples that had arrived before.
+        copies: duplicates made by the link's model.
         refused: arrivals whose stamp was out of range.
     """
 
@@ -100,19 +90,19 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """One directed link in a run. What the log cannot tell is None.
+    """One directed link in a run; what the log does not determine is None.
 
     Attributes:
-        peer: who sends.
-        site: who receives.
-        stated: what it was said to do, from the start and after every change.
+        peer: the sender.
+        site: the receiver.
+        stated: its models in force, from the start and after every change.
         drawn_ms: the delays that its model gave to the samples, before order and play-out.
         age_ms: the effective delay, over the ticks from the first sample in use on.
         ages: the same as a histogram.
         first_use_s: when the first sample came into use, s.
-        ticks_without_new: share of ticks that had the same sample in use as the tick before.
+        ticks_without_new: share of ticks with the same sample in use as the tick before.
         silence_ms: the longest time that one sample stayed in use, ms.
-        counts: what became of the samples.
+        counts: of the samples.
         loss: share of the judged samples that could not come into use: missing or lost.
         burst: mean number of those in a row.
         one_way_us: measured one-way delay of the arrivals, us.
@@ -139,20 +129,20 @@ class LinkSummary(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """True where one constant delay is all that there is to say of it."""
-        as_said = self.counts is None or not (self.counts.late or self.counts.missing)
-        return as_said and has_one_constant_delay(self.stated)
+        """True if one constant delay describes all of it."""
+        as_stated = self.counts is None or not (self.counts.late or self.counts.missing)
+        return as_stated and has_one_constant_delay(self.stated)
 
 
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """True where a link was said to give every sample one and the same delay, and to lose none."""
+    """True if the models of a link give every sample one and the same delay, and lose none."""
     (_, link), *later = states
     exact = link.core().kind == DelayKind.CONSTANT and not (link.loss or link.duplicate or link.outages_s)
     return exact and not later
 
 
 def summarise_links(log: Log) -> list[LinkSummary]:
-    """Returns what every link did, by receiver and then by peer, in scenario order.
+    """Returns a summary of every link, by receiver and then by peer, in scenario order.
 
     Raises:
         LogError: a record names a change that is none.
@@ -163,12 +153,14 @@ def summarise_links(log: Log) -> list[LinkSummary]:
         peer: max(int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there)
         for peer in log.sites
     }
-    uses = []
+    summaries = []
     for site in log.sites:
         for peer, over_link in came[site].items():
             states = list_stated_models(log, f"{peer}->{site}", changed)
-            uses.append(_use(log, peer, site, states, count_sent(log, peer, newest[peer]), over_link))
-    return uses
+            summaries.append(
+                _summarise_link(log, peer, site, states, count_sent(log, peer, newest[peer]), over_link)
+            )
+    return summaries
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
@@ -181,7 +173,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Returns how numbers are spread, or None where there are none."""
+    """Returns the statistics of numbers; None of none."""
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return None
@@ -190,11 +182,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
 
 
 def bin_ages(age_ns: Ints) -> AgeHistogram | None:
-    """Returns how many ages lie in each of at most `BINS` bins of 1, 2 or 5 times a power of ten ms.
-
-    Args:
-        age_ns: ages, ns.
-    """
+    """Returns a histogram of ages, ns, in at most `MOST_AGE_BINS` bins of 1, 2 or 5 times 10^n ms."""
     if not len(age_ns):
         return None
     low, high = int(age_ns.min()), int(age_ns.max())
@@ -204,7 +192,7 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
     return AgeHistogram(low // width_ns * width_ns / 1e6, width_ns / 1e6, ticks)
 
 
-def _use(
+def _summarise_link(
     log: Log, peer: str, site: str, states: list[StatedModel], count: int, came: Arrivals
 ) -> LinkSummary:
     part, used = log[site], log[site].used[peer]
@@ -223,8 +211,8 @@ def _use(
         compute_statistics(age_ns / 1e6),
         bin_ages(age_ns),
         float(part.t_s[in_use[0]]) if len(in_use) else None,
-        _without_new(part, used),
-        _silence_ms(part, used),
+        _share_without_new(part, used),
+        _longest_silence_ms(part, used),
         _counts(part, used, fate, came, known) if len(part) else None,
         loss,
         burst,
@@ -232,12 +220,12 @@ def _use(
     )
 
 
-def _without_new(part: SiteLog, used: Ints) -> float | None:
+def _share_without_new(part: SiteLog, used: Ints) -> float | None:
     pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
     return float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None
 
 
-def _silence_ms(part: SiteLog, used: Ints) -> float | None:
+def _longest_silence_ms(part: SiteLog, used: Ints) -> float | None:
     if not (used >= 0).any():
         return None
     ticks = np.append(part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1)

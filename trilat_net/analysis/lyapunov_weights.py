@@ -17,12 +17,12 @@ KD_SHAPE_TOLERANCE = 1e-9
 
 
 class LyapunovWeights(NamedTuple):
-    """beta, as far as there is one.
+    """Weights beta, as far as they exist.
 
     Attributes:
         beta: per site, sum N, so that equal shares give the paper's ones, shape (N,).
-        groups: the closed groups of sites, each a tuple of indices: nobody in it follows anybody outside.
-        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None where the Kd differ in shape.
+        groups: the closed groups of sites, each a tuple of indices: none in it follows a site outside.
+        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ in shape.
     """
 
     beta: Array
@@ -31,12 +31,12 @@ class LyapunovWeights(NamedTuple):
 
     @property
     def unique(self) -> bool:
-        """True where there is one closed group: then pi is unique, though some of its entries may be 0."""
+        """True if there is one closed group: then pi is unique, though some of its entries may be 0."""
         return len(self.groups) == 1
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Returns the groups of sites that reach each other and nobody else along shares, alpha shape (N, N)."""
+    """Returns the groups of sites that reach each other and no other along shares, alpha shape (N, N)."""
     reach = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
     for _ in range(len(alpha).bit_length()):
         reach = reach @ reach
@@ -49,9 +49,9 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def left_perron_vector(alpha: Array) -> Array:
-    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites that nobody ends up following.
+    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites outside of closed groups.
 
-    Where two closed groups make it ambiguous, each counts by its number of sites.
+    If several closed groups make it ambiguous, each counts by its number of sites.
     """
     pi = np.zeros(len(alpha))
     groups = find_closed_groups(alpha)
@@ -63,9 +63,9 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None where no such scalars are, Kd shape (N, n).
+    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd shape (N, n).
 
-    Where every Kd is zero nothing couples the sites, and every scale will do: ones.
+    If every Kd is zero, nothing couples the sites and any scale holds: ones.
     """
     if not Kd.any():
         return np.ones(len(Kd))
@@ -80,7 +80,7 @@ def find_kd_scales(Kd: Array) -> Array | None:
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Returns beta_i = pi_i / c_i; where the Kd differ in shape, pi alone, which lets V rise.
+    """Returns beta_i = pi_i / c_i; if the Kd differ in shape, pi alone, which lets V rise.
 
     Args:
         alpha: the dominance matrix, shape (N, N).

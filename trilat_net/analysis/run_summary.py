@@ -4,7 +4,6 @@ Invariant: keys end in their unit; a quantity that the log does not determine is
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,19 +12,17 @@ from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario.expect import END_WINDOW_S
 from . import site_signals
-from .health import summarise_clock
+from .health import PERCENTILES, JsonObject, count_overruns, made_ticks, percentiles, summarise_clock
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
-from .timeline import AppliedChange, StatedModel, diverged_at_s, find_mode_intervals, list_changes
-
-JsonObject = dict[str, Any]
+from .timeline import diverged_at_s, find_mode_intervals, list_changes
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Returns what can be said of a log in numbers, ready for JSON.
+    """Returns the numbers of a log, ready for JSON; of torn, short and empty ones too.
 
     Args:
-        log: the log; torn, short and empty ones too.
-        twin: the same experiment with nobody at the arms, or None.
+        log: the log.
+        twin: the same experiment without operators, or None.
     """
     sites = {name: _site(log, name, twin) for name in log.sites}
     settled = [site["settle_s"] for site in sites.values()]
@@ -41,7 +38,16 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "missing": sum(site["missing"] for site in sites.values()),
         "sites": sites,
         "links": {use.name: _link(log, use) for use in summarise_links(log)},
-        "changes": [_changed(changed) for changed in list_changes(log)],
+        "changes": [
+            {
+                "at_s": changed.change.at_s,
+                "about": changed.about,
+                "to": changed.text,
+                "site": changed.site,
+                "taken_at_tick": changed.taken_at_tick,
+            }
+            for changed in list_changes(log)
+        ],
     }
 
 
@@ -63,31 +69,25 @@ def _scenario(log: Log) -> JsonObject:
 
 def _site(log: Log, name: str, twin: Log | None) -> JsonObject:
     part, spec = log[name], log.scenario.sites[name]
+    made, expected = made_ticks(log, name), log.scenario.ticks(name)
+    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, PERCENTILES
+    at_limit = np.abs(site_signals.controller_torques(part)) >= spec.limits.tau_limit_nm
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
-        **_records(log, part),
-        **_motion(part),
-        "peak_tau_nm": _largest(site_signals.controller_torques(part)),
-        "saturated_ticks": _ticks_at_limit(part, spec.limits.tau_limit_nm),
-        "late_us": _spread(part.late_us, {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}),
-        "busy_us": _spread(part.busy_us, {"p50": 50.0, "p99": 99.0, "max": 100.0}),
-        "overruns": int(np.count_nonzero(part.late_us >= 1e6 / spec.rate_hz)),
-        **_moved(log, twin, name),
-    }
-
-
-def _records(log: Log, part: SiteLog) -> JsonObject:
-    """Counts records; what is missing is missing of the ticks that the site said it made, if it said so."""
-    made = next((e.ticks for e in log.events if e.kind == "end" and e.member == part.name), None)
-    expected = log.scenario.ticks(part.name)
-    return {
         "records": len(part),
         "expected_ticks": expected,
         "made_ticks": made,
         "missing": max(0, (expected if made is None else made) - len(part)),
         "diverged_at_s": diverged_at_s(part),
         "modes": [span._asdict() for span in find_mode_intervals(part)],
+        **_motion(part),
+        "peak_tau_nm": _largest(site_signals.controller_torques(part)),
+        "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
+        "late_us": percentiles(part.late_us, late) or dict.fromkeys(late),
+        "busy_us": percentiles(part.busy_us, busy) or dict.fromkeys(busy),
+        "overruns": count_overruns(part),
+        **_displacement(log, twin, name),
     }
 
 
@@ -104,11 +104,18 @@ def _motion(part: SiteLog) -> JsonObject:
 
 
 def _link(log: Log, use: LinkSummary) -> JsonObject:
-    """Returns what can be said of a link."""
     counts, clock = use.counts, summarise_clock(log, use.peer, use.site)
     return {
         "delay_ms": _known(use.stated[0].link.moments().mean_ms),
-        "stated": [_stated(state) for state in use.stated],
+        "stated": [
+            {
+                "from_s": state.from_s,
+                "link": state.link.describe(),
+                "mean_ms": _known(state.link.moments().mean_ms),
+                "deviation_ms": _known(state.link.moments().deviation_ms),
+            }
+            for state in use.stated
+        ],
         "drawn_ms": use.drawn_ms._asdict() if use.drawn_ms else None,
         "age_ms": use.age_ms._asdict() if use.age_ms else dict.fromkeys(ValueStatistics._fields),
         "ages": use.ages._asdict() if use.ages else None,
@@ -125,32 +132,12 @@ def _link(log: Log, use: LinkSummary) -> JsonObject:
     }
 
 
-def _stated(state: StatedModel) -> JsonObject:
-    mean_ms, deviation_ms = state.link.moments()
-    return {
-        "from_s": state.from_s,
-        "link": state.link.describe(),
-        "mean_ms": _known(mean_ms),
-        "deviation_ms": _known(deviation_ms),
-    }
-
-
-def _changed(changed: AppliedChange) -> JsonObject:
-    return {
-        "at_s": changed.change.at_s,
-        "about": changed.about,
-        "to": changed.text,
-        "site": changed.site,
-        "taken_at_tick": changed.taken_at_tick,
-    }
-
-
 def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _moved(log: Log, twin: Log | None, name: str) -> JsonObject:
-    """Returns how far the hands moved a site, per joint: at most, and at the last tick of both runs."""
+def _displacement(log: Log, twin: Log | None, name: str) -> JsonObject:
+    """Returns how far operators moved a site, per joint: at most, and at the last tick of both runs."""
     if twin is None:
         return {"hands_moved_max_rad": None, "hands_moved_end_rad": None}
     moved = site_signals.operator_displacement(log, twin, name)[2]
@@ -160,17 +147,6 @@ def _moved(log: Log, twin: Log | None, name: str) -> JsonObject:
     }
 
 
-def _ticks_at_limit(part: SiteLog, limit_nm: float) -> int:
-    return int(np.count_nonzero(np.any(np.abs(site_signals.controller_torques(part)) >= limit_nm, axis=1)))
-
-
 def _largest(values: ArrayLike) -> float | None:
     array = np.abs(np.asarray(values))
     return float(array.max()) if array.size else None
-
-
-def _spread(values: ArrayLike, percentiles: dict[str, float]) -> dict[str, float | None]:
-    array = np.asarray(values)
-    if not array.size:
-        return dict.fromkeys(percentiles)
-    return dict(zip(percentiles, np.percentile(array, list(percentiles.values())).tolist(), strict=True))

@@ -42,7 +42,7 @@ def controller_torques(part: SiteLog) -> Array:
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of the hands ON the arm, shape (K, 2), N m: the negative of tau_x."""
+    """Returns the torque of operator and environment ON the arm, shape (K, 2), N m: the negative of tau_x."""
     return 0.0 - part.tau_x.reshape(-1, JOINTS)  # 0 - 0 is 0, where -0 would print as such
 
 
@@ -59,7 +59,7 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Returns the sites that somebody pushes, by the scenario or by the records."""
+    """Returns the sites with an operator, by the scenario or by the records."""
     return [name for name in log.sites if log.scenario.sites[name].hands or np.any(log[name].tau_x)]
 
 
@@ -71,7 +71,7 @@ def largest_remaining_error(part: SiteLog) -> Array:
 
 
 def settling_time_s(part: SiteLog) -> float | None:
-    """Returns when an error last exceeded `SETTLED_RAD`, s; 0 if none did, None if one still does."""
+    """Returns when an error last exceeded `SETTLED_ERROR_RAD`, s; 0 if none did, None if one still does."""
     if not len(part):
         return None
     above = np.flatnonzero(largest_remaining_error(part) > SETTLED_ERROR_RAD)
@@ -81,12 +81,12 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far hands moved a site: the ticks that both logs have, their time, and the difference.
+    """Returns how far operators moved a site, at the ticks that both logs have.
 
     Args:
         log: the log.
-        twin: the same experiment with nobody at the arms.
-        site: which site.
+        twin: the same experiment without operators.
+        site: the site.
 
     Returns:
         tick: shape (K,).

@@ -22,12 +22,12 @@ FOLLOWING_MODES = ("run", "diverged")
 
 
 class AppliedChange(NamedTuple):
-    """A change of a link or of a site's shares.
+    """A change of a link or of a site's dominance factors.
 
     Attributes:
-        change: what it is, complete.
-        site: who carried it out.
-        taken_at_tick: the tick whose record names it; None where the scenario itself has it.
+        change: the whole change.
+        site: the site that carried it out.
+        taken_at_tick: the tick whose record names it; None for a change of the scenario.
     """
 
     change: Change
@@ -36,12 +36,12 @@ class AppliedChange(NamedTuple):
 
     @property
     def about(self) -> str:
-        """What it changes: a link "j->i", or the shares of a site."""
+        """Its subject: a link "j->i", or the shares of a site."""
         return self.change.link or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
-        """What that becomes."""
+        """The value after it."""
         if self.change.link:
             return self.change.after.describe()
         shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.shares.items() if share)
@@ -49,7 +49,7 @@ class AppliedChange(NamedTuple):
 
 
 class ModeInterval(NamedTuple):
-    """A time in which a site held, braked or returned.
+    """An interval in which a site held, braked or returned.
 
     Attributes:
         mode: "hold", "brake" or "return".
@@ -63,7 +63,7 @@ class ModeInterval(NamedTuple):
 
 
 class StatedModel(NamedTuple):
-    """What a link was said to do from some time on.
+    """A link model in force from a time on.
 
     Attributes:
         from_s: the first stamp for which it holds, s after the epoch.
@@ -75,7 +75,7 @@ class StatedModel(NamedTuple):
 
 
 def list_changes(log: Log) -> list[AppliedChange]:
-    """Returns what was changed before the run ended, in the order of the times from which it held.
+    """Returns the changes before the end of the run, in the order of the times from which they held.
 
     Raises:
         LogError: a record names a change that is none.
@@ -99,12 +99,12 @@ def _read(log: Log, text: str) -> Change:
 def list_stated_models(
     log: Log, link: str, changed: Sequence[AppliedChange] | None = None
 ) -> list[StatedModel]:
-    """Returns what a link was said to do, from the start and after every change of it.
+    """Returns the models of a link, "j->i", from the start and after every change of it.
 
     Args:
         log: the log.
-        link: its name, "j->i".
-        changed: as from `changes`; None looks them up.
+        link: its name.
+        changed: as from `list_changes`; None looks them up.
     """
     later = list_changes(log) if changed is None else changed
     return [
@@ -121,7 +121,7 @@ def recorded_end_s(log: Log) -> float:
 
 
 def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
-    """Returns when a site held, braked or returned, in order."""
+    """Returns the intervals in which a site held, braked or returned, in order."""
     modes: list[str] = part.mode.tolist()
     if all(mode in FOLLOWING_MODES for mode in modes):
         return []

@@ -1,6 +1,4 @@
-"""Torques of operator and environment models, over all rows of a log at once.
-
-Springs, dampers, pulses, walls.
+"""Torques of operator and environment models (springs, dampers, walls), over all rows of a log at once.
 
 Invariant: written from the definitions of the scenario, independently of the core; the tests compare the
 two. Torques act ON the arm.
@@ -14,7 +12,7 @@ from .arm_rows import EndEffectorRows
 
 
 def wall_depth(actor: TorqueSource, tip: EndEffectorRows) -> Array:
-    """Returns how deep a tip is in a wall, shape (K,), m; negative outside of it."""
+    """Returns the depth of an end effector in a wall, shape (K,), m; negative outside of it."""
     depth: Array = (np.array(actor.a) - tip.at) @ np.array(actor.b)
     return depth
 
@@ -22,7 +20,7 @@ def wall_depth(actor: TorqueSource, tip: EndEffectorRows) -> Array:
 def wall_force(actor: TorqueSource, t_s: Array, tip: EndEffectorRows) -> Array:
     """Returns the force of a wall along its normal, shape (K,), N: it pushes, and never pulls.
 
-    max(K depth - B outward speed, 0) inside of it, 0 outside, and while it is not there.
+    max(K depth - B outward speed, 0) inside of it, 0 outside, and before its start and after its end.
     """
     depth = wall_depth(actor, tip)
     push = np.maximum(actor.K[0] * depth - actor.B[0] * (tip.speed @ np.array(actor.b)), 0.0)
@@ -32,7 +30,7 @@ def wall_force(actor: TorqueSource, t_s: Array, tip: EndEffectorRows) -> Array:
 
 
 def _target_progress(actor: TorqueSource, t_s: Array) -> tuple[Array, Array]:
-    """Returns the share of its way that a target has made, and the rate of that, 1/s: minimum jerk."""
+    """Returns the progress of a target from 0 to 1, minimum jerk, and its rate, 1/s."""
     span_s = actor.move_end_s - actor.move_start_s
     if span_s <= 0.0:
         return (t_s > actor.move_start_s).astype(np.float64), np.zeros(len(t_s))
@@ -52,12 +50,10 @@ def compute_spring_effort(actor: TorqueSource, t_s: Array, at: Array, speed: Arr
 def compute_source_torque(
     actor: TorqueSource, t_s: Array, q: Array, qd: Array, tip: EndEffectorRows
 ) -> Array:
-    """Returns what one actor does to the joints, shape (K, 2), N m, ON the arm.
-
-    Springs, dampers and walls: what is a function of the state. Pulses and recorded torques are not.
+    """Returns the torque of a spring, damper or wall ON the arm, shape (K, 2), N m.
 
     Raises:
-        ValueError: it acts in another way.
+        ValueError: it is another source: pulses and recorded torques are no function of the state.
     """
     if actor.acts is TorqueKind.WALL:
         force = wall_force(actor, t_s, tip)[:, None] * np.array(actor.b)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.run_summary import JsonObject
+from ..analysis.health import JsonObject
 from ..execution.log_checks import CheckLine
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario

@@ -200,6 +200,20 @@ def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
         **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
         "parameters": {site: estimates._asdict() for site, estimates in metrics.estimates.items()},
         "windows_at_rest": None if windows is None else int(windows),
+        **_details_to_json(metrics),
+        "unknown": {
+            path + key: one.why
+            for path, found in metrics_by_path.items()
+            for key, one in found.items()
+            if one.value is None
+        },
+    }
+    return {key: _finite(value) for key, value in content.items()}
+
+
+def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
+    """Returns what is no single number: loads, force sharing, stiffness, responses."""
+    return {
         "levers": [
             {
                 **load._asdict(),
@@ -226,14 +240,7 @@ def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
             }
             for one in metrics.responses
         ],
-        "unknown": {
-            path + key: one.why
-            for path, found in metrics_by_path.items()
-            for key, one in found.items()
-            if one.value is None
-        },
     }
-    return {key: _finite(value) for key, value in content.items()}
 
 
 def _finite(value: Any) -> Any:
