@@ -1,14 +1,14 @@
-"""The first program of a container: makes ready what a read-only container lacks, and becomes the command.
+"""Entry program of a container: prepares cache and results folder, then becomes the command.
 
 Usage: entry.py [--results FOLDER --heir FILE] COMMAND...
 
-- The cache of compiled code that the image holds is copied to where the program may write: Numba uses no
-  other. On another processor than the one that made it, it is passed over, and the program compiles.
-- FOLDER is on the host. The engine makes a folder that is mounted but does not exist, and root owns it. So,
-  as root, this gives FOLDER to the owner of FILE, a file of the person who starts the containers, and
-  becomes that user; where that is root, `SERVANT`. Started as anybody else, it stays what it is.
+- The image's cache of compiled code is copied to a writable folder, because Numba uses no read-only one. On
+  another processor than the one that built it, Numba ignores it and compiles.
+- FOLDER is on the host. The engine creates a missing mounted folder as root. So, as root, this program gives
+  FOLDER to the owner of FILE, a file of the user who starts the containers, and becomes that user, or
+  `SERVANT` if that is root. Started as any other user, it remains that user.
 
-Law: the command never runs as root of the host, and nobody is deprived: only what is root's is given away.
+Invariant: the command never runs as root of the host, and only files that root owns change their owner.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 SERVANT = 10001
-"""The user of the image: nobody's number on a usual host."""
+"""The user of the image: unused on most hosts."""
 _CACHE = Path("/opt/trilat/cache")
 _NO_NAMESPACE = ["0", "0", "4294967295"]
 
@@ -37,14 +37,14 @@ class Owner(NamedTuple):
 
 
 def heir(mark: Path, user_map: Path = Path("/proc/self/uid_map")) -> Owner:
-    """Returns who shall own the results.
+    """Returns the owner of the results.
 
     Args:
-        mark: a file of the person who starts the containers.
-        user_map: the map of users of this process. Where an engine is rootless, root is that very person.
+        mark: a file of the user who starts the containers.
+        user_map: this process's map of users. Under a rootless engine, root is that user.
 
     Raises:
-        OSError: the mark is not there.
+        OSError: the mark does not exist.
     """
     facts = mark.stat()
     if facts.st_uid == 0 and user_map.read_text(encoding="ascii").split() == _NO_NAMESPACE:
@@ -53,12 +53,12 @@ def heir(mark: Path, user_map: Path = Path("/proc/self/uid_map")) -> Owner:
 
 
 def give(folder: Path, owner: Owner) -> None:
-    """Gives a folder, what lies in it and the folder above to their owner, as far as they are root's.
+    """Gives a folder, its content and its parent to their owner, as far as root owns them.
 
-    The folder above stays root's where the owner is no person of the host.
+    The parent remains root's if the owner is `SERVANT`, who is no user of the host.
 
     Raises:
-        OSError: something cannot be made or given.
+        OSError: a file cannot be made or given.
     """
     above = folder.parent
     if above.stat().st_uid == 0:
@@ -72,21 +72,17 @@ def give(folder: Path, owner: Owner) -> None:
 
 
 def become(owner: Owner) -> None:
-    """Becomes a user for good.
-
-    Raises:
-        OSError: it is not permitted.
-    """
+    """Becomes a user for good; raises OSError if that is not permitted."""
     os.setgroups([])
     os.setgid(owner.group)
     os.setuid(owner.user)
 
 
 def hand_over(results: Path, mark: Path) -> None:
-    """Sees to it that this process, as whoever it is from now on, may write into a folder.
+    """Makes a folder writable for this process, as the user that it becomes.
 
     Raises:
-        SystemExit: it may not; the sentence says who needs which folder.
+        SystemExit: that is impossible; the message names the user and the folder.
     """
     owner = Owner(os.getuid(), os.getgid())
     try:
@@ -96,7 +92,7 @@ def hand_over(results: Path, mark: Path) -> None:
             become(owner)
         results.mkdir(exist_ok=True)
         if not os.access(results, os.W_OK | os.X_OK):
-            raise PermissionError(0, "it belongs to somebody else")
+            raise PermissionError(0, "it belongs to another user")
     except OSError as error:
         sys.stderr.write(
             f"error: user {owner} cannot write into {results}: {error.strerror}; on the host, "
@@ -106,22 +102,22 @@ def hand_over(results: Path, mark: Path) -> None:
 
 
 def warm(cache: Path, own: Path) -> None:
-    """Copies a cache to where this process may write; as much of it as there is room for."""
+    """Copies a cache into a writable folder, as far as there is room."""
     with suppress(OSError):  # shutil.Error is one: without a cache the program compiles
         shutil.copytree(cache, own, dirs_exist_ok=True)
 
 
 def main(arguments: Sequence[str]) -> NoReturn:
-    """Makes ready, and becomes the command."""
+    """Prepares, and becomes the command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--results", type=Path)
     parser.add_argument("--heir", type=Path)
     parser.add_argument("command", nargs=argparse.REMAINDER)
-    asked = parser.parse_args(arguments)
-    if asked.results is not None:
-        hand_over(asked.results, asked.heir)
+    options = parser.parse_args(arguments)
+    if options.results is not None:
+        hand_over(options.results, options.heir)
     warm(_CACHE, Path(os.environ["XDG_CACHE_HOME"]))
-    os.execvp(asked.command[0], asked.command)
+    os.execvp(options.command[0], options.command)
 
 
 if __name__ == "__main__":

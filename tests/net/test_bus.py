@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.bus import Bus, Inbox, LocalNetwork, StampedInbox, StampingRing, matches_key
+from trilat_net.net.bus import Bus, Inbox, LocalNetwork, StampedInbox, StampingRing
 
 from .networks import NETWORKS, Network
 from .waiting import drained, received, until
@@ -327,24 +327,6 @@ def test_rings_with_nothing_in_them_give_none(network: Network) -> None:
 def test_leaving_twice_is_leaving_once(pair: tuple[Bus, Bus]) -> None:
     for _ in range(2):
         pair[0].close()
-
-
-@pytest.mark.parametrize(
-    ("expression", "key", "included"),
-    [
-        ("a/b", "a/b", True),
-        ("a/*", "a/b", True),
-        ("a/*", "a/b/c", False),
-        ("a/*", "a", False),
-        ("a/**", "a", True),
-        ("a/**", "a/b/c", True),
-        ("**/c", "a/b/c", True),
-        ("a/*/c", "a/b/c", True),
-        ("a/*/c", "b/b/c", False),
-    ],
-)
-def test_key_expressions(expression: str, key: str, included: bool) -> None:
-    assert matches_key(expression, key) is included
 
 
 def test_members_of_two_networks_never_meet() -> None:

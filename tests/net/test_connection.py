@@ -1,15 +1,27 @@
-"""How a member takes part: what the command line and a file say together."""
+"""Endpoints by default, from the command line and from a file together; the router process."""
+
+import re
+import socket
+from collections.abc import Callable
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from trilat_net.errors import SessionError, UsageError
+from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.connection import (
+    ROUTER_POLL_NS,
     Connection,
+    choose_session_endpoints,
+    default_endpoint,
+    default_endpoints,
     find_free_endpoints,
     open_bus,
     resolve_member_connection,
     resolve_router_connection,
+    run_router,
 )
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
@@ -154,3 +166,148 @@ def test_a_peer_waits_for_nobody() -> None:
     assert bus is not None
     bus.close()
     assert clock.sleeps == 0
+
+
+NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=40)
+
+
+def port(endpoint: str) -> int:
+    found = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
+    assert found, endpoint
+    return int(found[1])
+
+
+@given(NAMES, st.integers(0, 1000))
+def test_defaults_are_unprivileged_loopback_ports_below_the_ephemeral_ones(session: str, index: int) -> None:
+    assert 1024 <= port(default_endpoint(session, index)) < 32_768
+
+
+@given(NAMES, st.lists(NAMES, min_size=2, max_size=64, unique=True))
+def test_sites_of_a_session_have_endpoints_of_their_own(session: str, sites: list[str]) -> None:
+    places = default_endpoints(session, sites)
+    assert list(places) == sites
+    assert len(set(places.values())) == len(sites)
+    assert places[sites[0]] == default_endpoint(session, 0)
+
+
+def test_they_are_a_published_function_of_session_and_site() -> None:
+    assert default_endpoint("paper", 0) == "tcp/127.0.0.1:24448"
+    assert default_endpoint("paper", 2) == "tcp/127.0.0.1:24450"
+
+
+def test_most_sessions_do_not_share_ports() -> None:
+    first = {default_endpoint(f"session-{n}", 0) for n in range(100)}
+    assert len(first) > 80
+
+
+def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
+    endpoints = find_free_endpoints(8)
+    assert len(set(endpoints)) == 8
+    sockets = [socket.socket() for _ in endpoints]
+    try:
+        for endpoint, probe in zip(endpoints, sockets, strict=True):
+            probe.bind(("127.0.0.1", port(endpoint)))
+    finally:
+        for probe in sockets:
+            probe.close()
+
+
+def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
+    """So that `trilat set` and `trilat ping` find it without being told."""
+    sites = ("a", "b", "c")
+    places = list(default_endpoints("endpoints-test", sites).values())
+    assert choose_session_endpoints("endpoints-test", sites) == places
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port(places[1])))
+        taken.listen()
+        others = choose_session_endpoints("endpoints-test", sites)
+    assert len(set(others)) == 3
+    assert not set(others) & set(places)
+
+
+class Played(ManualClock):
+    """A clock on which things happen, each after one more sleep; then the router is stopped."""
+
+    def __init__(self, *events: Callable[[], object], rest: int = 0) -> None:
+        super().__init__()
+        self._events = [*events, *([lambda: None] * rest)]
+        self.over = False
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        super().sleep_until(deadline_ns)
+        if self._events:
+            self._events.pop(0)()
+        else:
+            self.over = True
+
+    def stopped(self) -> bool:
+        return self.over
+
+
+def routed(clock: Played, network: LocalNetwork, until_idle_s: float | None = None) -> list[str]:
+    said: list[str] = []
+    run_router(network.join(), clock, clock.stopped, said.append, until_idle_s)
+    return said
+
+
+def announced(network: LocalNetwork, key: str) -> Bus:
+    bus = network.join()
+    bus.announce(key)
+    return bus
+
+
+def test_it_says_who_comes_and_goes_in_every_session() -> None:
+    network = LocalNetwork()
+    there = announced(network, "trilat/one/m1/alive/1")
+    announced(network, "other/one/m1/alive/1")
+    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), there.close)
+    assert routed(clock, network) == [
+        "session one: m1 is here",
+        "session two: s is here",
+        "session one: m1 has left",
+    ]
+
+
+def test_two_starts_of_one_member_are_two_and_one_start_is_one() -> None:
+    """A token may be heard twice, as after a link that healed; it is said once."""
+    network = LocalNetwork()
+    first = announced(network, "trilat/t/m1/alive/1")
+    clock = Played(
+        lambda: first.announce("trilat/t/m1/alive/1"),
+        lambda: announced(network, "trilat/t/m1/alive/2"),
+        first.close,
+    )
+    assert routed(clock, network) == [
+        "session t: m1 is here",
+        "session t: m1 is here",
+        "session t: m1 has left",
+    ]
+
+
+def test_it_stays_until_members_have_come_and_all_have_left_for_so_long() -> None:
+    network = LocalNetwork()
+    members: list[Bus] = []
+
+    def comes() -> None:
+        members.append(announced(network, f"trilat/t/m1/alive/{len(members)}"))
+
+    def goes() -> None:
+        members[-1].close()
+
+    idle_ns = 4 * ROUTER_POLL_NS
+    nothing = [lambda: None] * 10
+    pause = [lambda: None] * 2
+    clock = Played(*nothing, comes, *nothing, goes, *pause, comes, *nothing, goes, rest=100)
+    said = routed(clock, network, idle_ns * 1e-9)
+    assert said[-1] == "no member for 0.2 s"
+    assert len(said) == 5
+    assert not clock.over
+    assert clock.monotonic_ns() == (10 + 1 + 10 + 1 + 2 + 1 + 10 + 1 + 4) * ROUTER_POLL_NS
+
+
+def test_without_a_time_it_stays_for_ever() -> None:
+    network = LocalNetwork()
+    there = announced(network, "trilat/t/m1/alive/1")
+    clock = Played(there.close, rest=1000)
+    routed(clock, network)
+    assert clock.over

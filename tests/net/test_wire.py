@@ -206,10 +206,11 @@ def test_random_bytes_raise_wire_errors_only(data: bytes) -> None:
     only_wire_errors(data)
 
 
-@pytest.mark.parametrize("end", range(0, len(payload()), 3))
-def test_a_truncated_record_is_refused(end: int) -> None:
-    with pytest.raises(WireError):
-        decode(payload()[:end], State)
+def test_a_truncated_record_is_refused() -> None:
+    data = payload()
+    for end in range(len(data)):
+        with pytest.raises(WireError):
+            decode(data[:end], State)
 
 
 @given(st.lists(st.tuples(st.integers(0, len(payload()) - 1), st.integers(0, 255)), min_size=1, max_size=4))
@@ -272,18 +273,11 @@ def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick:
         tick=tick,
         t_ns=5,
         mode="run",
-        age_us=counts,
-        accepted=counts,
-        late=counts,
-        duplicate=counts,
-        refused=counts,
-        dropped=counts,
+        **dict.fromkeys(("age_us", "accepted", "late", "duplicate", "refused", "dropped"), counts),
+        **dict.fromkeys(("offset_us", "bound_us", "delay_us"), counts),
         late_max_us=1,
         busy_max_us=2,
         overruns=3,
-        offset_us=counts,
-        bound_us=counts,
-        delay_us=counts,
         grid_error_us=-4,
         slew_ppb=5,
     )

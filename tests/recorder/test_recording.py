@@ -99,20 +99,17 @@ def test_strangers_are_counted_and_dropped(name: str, channel: str, payload: byt
 
 
 @pytest.mark.parametrize("channel", [topics.STATE, topics.LINK, topics.EVENT])
-@pytest.mark.parametrize(
-    ("reason", "payload"),
-    [("malformed", b""), ("malformed", b"\xc1"), ("malformed", b"\x80"), ("oversized", bytes(70_000))],
-)
-def test_malformed_payloads_are_counted_and_dropped(channel: str, reason: str, payload: bytes) -> None:
+def test_malformed_payloads_are_counted_and_dropped(channel: str) -> None:
     desk = Desk()
-    desk.take("m", channel, payload)
+    desk.take("m", channel, b"", b"\xc1", b"\x80", bytes(70_000))
     desk.whole("m", "s")
-    assert desk.recording.dropped[reason] == 1
-    assert desk.log().accounts[f"dropped: {reason}"] == "1"
+    assert desk.recording.dropped == {"malformed": 3, "oversized": 1}
+    accounts = desk.log().accounts
+    assert (accounts["dropped: malformed"], accounts["dropped: oversized"]) == ("3", "1")
     assert desk.recording.problem() is None
 
 
-@pytest.mark.parametrize("t_ns", [-(2**63), -1, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("t_ns", [-(2**63), 2**64 - 1])
 @pytest.mark.parametrize("kind", ["state", "link", "event"])
 def test_no_time_stamp_of_any_size_ends_the_recording(kind: str, t_ns: int) -> None:
     desk = Desk()
