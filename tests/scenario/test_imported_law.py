@@ -103,7 +103,7 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
     Site(load_scenario("two_sites").setup("s")._replace(own=Listening))
     assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
     scenario = load_scenario("two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"})
-    with pytest.raises(ScenarioError, match=r"needs the arm's parameters, which nobody knows"):
+    with pytest.raises(ScenarioError, match=r"needs the arm's parameters, which are unknown"):
         Site(scenario.setup("s"))
 
 
@@ -143,7 +143,7 @@ def test_overrides_of_a_resolved_scenario_reach_what_a_law_is_made_with(
 
 
 def test_settings_stand_beside_the_name_of_the_law() -> None:
-    with pytest.raises(ScenarioError, match=r"stands beside its name, as in control.gain = 5"):
+    with pytest.raises(ScenarioError, match=r"next to its name, as in control.gain = 5"):
         load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 

@@ -1,7 +1,7 @@
 """Delay models of a directed link by name, and what they share: loss, duplicates, outages, order, play-out.
 
 Invariant: each model states its mean and deviation in closed form, and the core draws from just that
-distribution. Loss is stated by its share and the mean length of its bursts, which people measure; the
+distribution. Loss is stated by its share and the mean length of its bursts, as measured; the
 two-state chain that draws it follows from these in closed form. Keys end in their unit.
 """
 
@@ -178,7 +178,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
-"""A microsecond or more: what is drawn is rounded to that."""
+"""A microsecond or more, to which every draw is rounded."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
@@ -187,7 +187,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     Attributes:
         delay_ms: its mean, ms.
-        half_width_ms: how far it goes to either side, ms; at most the mean.
+        half_width_ms: half of its width, ms; at most the mean.
     """
 
     delay_ms: Milliseconds
@@ -231,8 +231,8 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
         return self.delay_ms + self.deviation_ms * hazard, deviation_ms
 
 
-class GammaDelay(LinkBase, frozen=True, kw_only=True, tag="gamma"):
-    """Gamma distribution.
+class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
+    """A distribution that is given by its moments.
 
     Attributes:
         delay_ms: its mean, ms.
@@ -241,41 +241,36 @@ class GammaDelay(LinkBase, frozen=True, kw_only=True, tag="gamma"):
 
     delay_ms: PositiveMilliseconds
     deviation_ms: Deviation
+
+    def _moments(self) -> tuple[float, float]:
+        return self.delay_ms, self.deviation_ms
+
+    def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns the problem of a deviation that is out of proportion to its mean."""
+        delay_ms, deviation_ms = self._moments()
+        if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
+            return None
+        text = f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
+        return KeyProblem("deviation_ms", text)
+
+
+class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
+    """Gamma distribution."""
 
     def _delay(self) -> LinkModel:
         """Shape m^2 / s^2, scale s^2 / m."""
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
 
-    def _moments(self) -> tuple[float, float]:
-        return self.delay_ms, self.deviation_ms
 
-    def _find_delay_problem(self) -> KeyProblem | None:
-        return _find_spread_problem(self.delay_ms, self.deviation_ms)
-
-
-class LogNormalDelay(LinkBase, frozen=True, kw_only=True, tag="lognormal"):
-    """Log-normal distribution.
-
-    Attributes:
-        delay_ms: its mean, ms.
-        deviation_ms: its standard deviation, ms.
-    """
-
-    delay_ms: PositiveMilliseconds
-    deviation_ms: Deviation
+class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
+    """Log-normal distribution."""
 
     def _delay(self) -> LinkModel:
         """Sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
         return LinkModel(kind=DelayKind.LOG_NORMAL, location=location, scale=math.sqrt(variance))
-
-    def _moments(self) -> tuple[float, float]:
-        return self.delay_ms, self.deviation_ms
-
-    def _find_delay_problem(self) -> KeyProblem | None:
-        return _find_spread_problem(self.delay_ms, self.deviation_ms)
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
@@ -338,14 +333,6 @@ class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
         above, below, density = _probability(a), _probability(-a), _density(a)
         variance = above + a * above * a * below + a * density * (below - above) - density * density
         return m * above + s * density, s * math.sqrt(max(variance, 0.0))
-
-
-def _find_spread_problem(delay_ms: float, deviation_ms: float) -> KeyProblem | None:
-    """Returns the problem of a deviation that is out of proportion to its mean."""
-    if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
-        return None
-    text = f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
-    return KeyProblem("deviation_ms", text)
 
 
 def _density(x: float) -> float:

@@ -135,7 +135,7 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int) -> None:
         raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
     if getattr(kind, "needs_theta", False) and not context.theta:
         raise ScenarioError(
-            f"{code} needs the arm's parameters, which nobody knows (arm.known = false): identify the arm "
+            f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "
             "and leave known out, or choose a law that learns them",
             path=path,
         )

@@ -84,7 +84,7 @@ def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: s
         raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
     if "settings" in settings:
         raise ScenarioError(
-            "what a law from outside is made with stands beside its name, as in control.gain = 5",
+            "the settings of a user's law stand next to its name, as in control.gain = 5",
             path=f"{path}.settings",
         )
     sha256 = hash_law_source(code, f"{path}.law")

@@ -33,14 +33,7 @@ class Arm(Frozen, frozen=True):
     """The two links of a planar arm; defaults are the paper's, as point masses at the link ends.
 
     Attributes:
-        l1_m: length of link 1, m.
-        m1_kg: mass of link 1, kg.
-        lc1_m: distance of its centre of mass from joint 1, m.
-        I1_kg_m2: inertia about its centre of mass, kg m^2.
-        l2_m: length of link 2, m.
-        m2_kg: mass of link 2, kg.
-        lc2_m: distance of its centre of mass from joint 2, m.
-        I2_kg_m2: inertia about its centre of mass, kg m^2.
+        l1_m: this and the others down to I2_kg_m2 are those of `ArmLinks`.
         g_m_s2: gravitational acceleration, m/s^2.
         known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
             formula. Only for an arm outside of the program.

@@ -44,12 +44,12 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     if isinstance(law, ForceReflecting) and sites != FORCE_REFLECTION_SITES:
         raise ScenarioError(
             f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more of "
-            "them it is not said whose contact a site feels; choose p_d, pd_d or adaptive, or two sites",
+            "them the contact that a site feels is ambiguous; choose p_d, pd_d or adaptive, or two sites",
             path=f"{path}.control.law",
         )
     if isinstance(law, KnownGravityLaw) and not site.arm.known and law.gravity * site.arm.g_m_s2 > 0.0:
         raise ScenarioError(
-            f"{law.__struct_config__.tag} takes gravity from the arm's masses, which nobody knows "
+            f"{law.__struct_config__.tag} takes gravity from the arm's masses, which are unknown "
             "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
             "horizontal plane, or choose adaptive, which learns it",
             path=f"{path}.control.gravity",
