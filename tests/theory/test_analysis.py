@@ -34,7 +34,7 @@ def digital() -> LinearAnalysis:
 def test_it_is_frozen_and_has_all(calm: LinearAnalysis) -> None:
     assert calm.verdict == "stable"
     assert calm.continuous.zeros == 2  # a pose that all share, per joint
-    assert calm.margin.spans[0].high_s == pytest.approx(0.23, abs=0.01)
+    assert calm.margin.intervals[0].high_s == pytest.approx(0.23, abs=0.01)
     with pytest.raises(FrozenInstanceError):
         calm.notes = ()  # type: ignore[misc]
 

@@ -101,21 +101,21 @@ def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0))
     one = site(rng, "known", [wall])
     x = np.zeros(ARGUMENT_COUNT)
-    assert not evaluate_site_rates(one, x).acted.any()  # the stretched arm is on the free side
+    assert not evaluate_site_rates(one, x).external.any()  # the stretched arm is on the free side
     x[Q] = np.pi, 0.0
-    assert evaluate_site_rates(one, x).acted[0] == pytest.approx(0.0, abs=1e-12)  # no lever
+    assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
     x[Q] = 2.5, 0.1
-    assert np.abs(evaluate_site_rates(one, x).acted).max() > 1.0
+    assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
     x[QD] = 1e3, 0.0
-    assert np.abs(evaluate_site_rates(one, x).acted).max() in (
+    assert np.abs(evaluate_site_rates(one, x).external).max() in (
         0.0,
-        np.abs(evaluate_site_rates(one, x).acted).max(),
+        np.abs(evaluate_site_rates(one, x).external).max(),
     )
     outward = np.sign(
-        evaluate_site_rates(one, x * np.where(np.arange(ARGUMENT_COUNT) == QD.start, 0.0, 1.0)).acted[0]
+        evaluate_site_rates(one, x * np.where(np.arange(ARGUMENT_COUNT) == QD.start, 0.0, 1.0)).external[0]
     )
     x[QD] = outward * 1e3, 0.0
-    assert not evaluate_site_rates(one, x).acted.any()  # faster outward than the spring would push
+    assert not evaluate_site_rates(one, x).external.any()  # faster outward than the spring would push
 
 
 def test_an_estimate_at_an_end_of_its_box_stays_where_it_would_leave_and_goes_where_it_would_return() -> None:

@@ -22,14 +22,14 @@ def test_the_impedance_has_a_free_and_a_clamped_line_for_each_hand() -> None:
     size = draw_port_impedance(section).axes[0]
     assert len(size.lines) == 4
     drawn = np.asarray(size.lines[0].get_ydata())
-    np.testing.assert_allclose(drawn, np.abs(section.felt[0].free))
+    np.testing.assert_allclose(drawn, np.abs(section.transparency[0].free))
 
 
 def test_where_a_criterion_fails_is_shaded() -> None:
     section = section_of("two_sites")
     above, below = draw_port_passivity(section).axes
-    assert len(above.patches) == len(section.velocity.dips.below)
-    assert len(below.patches) == sum(len(one.dips.below) for one in section.two_ports)
+    assert len(above.patches) == len(section.velocity.minima.below)
+    assert len(below.patches) == sum(len(one.minima.below) for one in section.two_ports)
     above, below = draw_port_passivity(section_of("p_d_margin")).axes
     assert not above.patches
     assert not below.patches

@@ -82,7 +82,7 @@ def test_a_run_decays_as_its_rightmost_root_says() -> None:
     run = trajectories(scenario).sites["m"]
     late = run.t_s > 60.0
     q1_rad, q2_rad = run.q[late].mean(axis=0)
-    root = analyse_linear_loop(scenario, pose=(q1_rad, q2_rad)).judged.rightmost
+    root = analyse_linear_loop(scenario, pose=(q1_rad, q2_rad)).decisive.rightmost
     assert root is not None
     turns = np.flatnonzero(np.diff(np.sign(run.qd[late, 0])))
     t_s, e = run.t_s[late], np.abs((run.q - run.q_des)[late, 0])

@@ -17,7 +17,7 @@ from trilat_net.theory.delay_roots import compute_delay_spectrum
 @given(a=st.floats(0.2, 5.0))
 def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
     """x' = -a x(t - T): stable up to a T = pi/2, crossing at a."""
-    (span,) = find_delay_margin(loop(0.0, (1.0, -a))).spans
+    (span,) = find_delay_margin(loop(0.0, (1.0, -a))).intervals
     assert (span.low_s, span.low) == (0.0, None)
     assert span.high is not None
     assert span.high_s == pytest.approx(math.pi / 2 / a, rel=1e-9)
@@ -35,9 +35,9 @@ def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
     """x'' + 0.1 x' + x = -0.4 x(t - T) with its windows; each end is a root on the axis."""
     system = loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
     found = find_delay_margin(system)
-    assert len(found.spans) > 1
-    assert found.spans[0].low is None
-    for span in found.spans:
+    assert len(found.intervals) > 1
+    assert found.intervals[0].low is None
+    for span in found.intervals:
         inside = 0.5 * (span.low_s + span.high_s)
         assert compute_delay_spectrum(set_common_delay(system, inside), 1).verdict == "stable"
         if span.high is not None:
@@ -54,10 +54,10 @@ def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
     rng = np.random.default_rng(seed)
     system = loop(rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3))))
     found = find_delay_margin(system)
-    ends = [end for span in found.spans for end in (span.low_s, span.high_s)]
+    ends = [end for span in found.intervals for end in (span.low_s, span.high_s)]
     for T in (0.0, 0.1, 0.4, 1.0, 2.5):
         if all(abs(T - end) > 0.01 for end in ends if 0 < end < MAX_COMMON_DELAY_S):
-            inside = any(span.low_s <= T <= span.high_s for span in found.spans)
+            inside = any(span.low_s <= T <= span.high_s for span in found.intervals)
             assert (compute_delay_spectrum(set_common_delay(system, T), 1).verdict == "stable") == inside
 
 
@@ -70,6 +70,6 @@ def test_roots_at_zero_cross_nothing() -> None:
 def test_force_reflection_in_contact_has_a_margin_between_calm_and_hammering() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
-    (span,) = find_delay_margin(linearise_scenario(scenario, find_equilibrium(scenario))).spans
+    (span,) = find_delay_margin(linearise_scenario(scenario, find_equilibrium(scenario))).intervals
     assert 0.02 < span.high_s < 0.2
     assert "crosses at" in find_delay_margin(linearise_scenario(scenario, find_equilibrium(scenario))).words

@@ -80,7 +80,7 @@ def test_with_the_damping_that_is_lacking_it_is_passive_and_with_less_it_is_not(
 
 def test_where_p_d_is_not_passive_ends_where_its_sine_says() -> None:
     """d = K abs(sin(w T)) / w."""
-    (span,) = judged(pair(d=(1.0, 1.0))).dips.below
+    (span,) = judged(pair(d=(1.0, 1.0))).minima.below
     w = 2.0 * np.pi * span.to_hz
     assert np.sin(0.2 * w) / w == pytest.approx(0.1, rel=1e-6)
     assert span.from_hz == pytest.approx(1e-3)

@@ -75,7 +75,7 @@ def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(law: str, scheme: str
     pencil, names, _ = build_tick_pencil(now, rest)
     whole = build_companion_matrix(pencil)
     start = {f"{site}.q{j + 1}": off[i, j] for (i, site), j in itertools.product(enumerate("ms"), range(2))}
-    X = begun(whole, pencil.late, names, np.array([start.get(name, 0.0) for name in names]))
+    X = begun(whole, pencil.delayed_states, names, np.array([start.get(name, 0.0) for name in names]))
     run = trajectories(scenario)
     q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(POSE, 2)
     places = [names.index(f"{site}.q{j + 1}") for site in "ms" for j in range(2)]

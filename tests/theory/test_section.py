@@ -28,11 +28,11 @@ def test_p_d_is_passive_from_the_line_of_its_stability_on(name: str, K: float) -
     assert beyond.velocity.passive
     assert beyond.pole.passive
     assert not beyond.absolute.below
-    assert not any(one.dips.below for one in beyond.two_ports)
+    assert not any(one.minima.below for one in beyond.two_ports)
     below = section_of(name, (("control.K", K), ("control.d", 0.98 * line)))
     assert not below.velocity.passive
     assert below.absolute.below
-    assert all(one.dips.below for one in below.two_ports if len(below.sites) == 2)
+    assert all(one.minima.below for one in below.two_ports if len(below.sites) == 2)
 
 
 def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
@@ -41,13 +41,13 @@ def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
     for name, overrides in (("p_d_margin", ()), ("training", bare), ("two_sites", ())):
         section = section_of(name, overrides)
         assert section.verdict == "stable"
-        fails = [one for one in section.two_ports if one.dips.below and not one.clamped]
+        fails = [one for one in section.two_ports if one.minima.below and not one.clamped]
         if not section.absolute.below:
             assert not fails
         if section.velocity.passive:
             assert not section.absolute.below
             assert all(one.passive for one in section.joints.values())
-        worst = max((span.to_hz for span in section.velocity.dips.below), default=0.0)
+        worst = max((span.to_hz for span in section.velocity.minima.below), default=0.0)
         assert all(span.to_hz <= worst * 1.001 for span in section.absolute.below)
 
 
@@ -68,17 +68,20 @@ def test_three_sites_have_every_pair_with_the_third_off_and_clamped_and_two_have
 
 
 def test_hands_feel_the_slave_unless_another_site_is_named() -> None:
-    assert [(one.at, one.of, one.joint) for one in section_of("p_d_margin").felt] == [
+    assert [(one.at, one.of, one.joint) for one in section_of("p_d_margin").transparency] == [
         ("m1", "s", 1),
         ("m1", "s", 2),
         ("m2", "s", 1),
         ("m2", "s", 2),
     ]
-    assert {(one.at, one.of) for one in section_of("p_d_margin", of="m1").felt} == {("m2", "m1"), ("s", "m1")}
+    assert {(one.at, one.of) for one in section_of("p_d_margin", of="m1").transparency} == {
+        ("m2", "m1"),
+        ("s", "m1"),
+    }
 
 
 def test_equal_masters_feel_the_same() -> None:
-    first, second = section_of("p_d_margin").felt[::2]
+    first, second = section_of("p_d_margin").transparency[::2]
     np.testing.assert_allclose(first.free, second.free, rtol=1e-9)
     np.testing.assert_allclose(first.clamped, second.clamped, rtol=1e-9)
 
@@ -87,7 +90,7 @@ def test_only_the_paper_s_law_has_an_r() -> None:
     section = section_of("two_sites")
     assert section.proof is not None
     assert section.proof.passive
-    assert section.true
+    assert section.estimates_true
     assert section_of("p_d_margin").proof is None
 
 
@@ -97,7 +100,7 @@ def test_estimates_that_are_not_the_truth_let_the_linear_loop_give_back_what_the
     rest = find_equilibrium(scenario, POSE)
     learnt = np.tile([0.5, 0.45, -0.29, 2.0, 1.0], (3, 1))  # as a run of it ends
     section = analyse_ports(scenario, rest._replace(q=np.tile([-0.124, 0.337], (3, 1)), theta_hat=learnt))
-    assert not section.true
+    assert not section.estimates_true
     assert section.proof is not None
     assert not section.proof.passive
 
@@ -109,7 +112,7 @@ def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
     near = (*bare, ("link.delay_ms", 1.0), ("sites.m.control.d", 30.0))
     section = section_of("contact", near)
     assert section.clamped_verdict == "stable"
-    assert section.felt[0].width_db > 2.0
+    assert section.transparency[0].width_db > 2.0
 
 
 def test_a_network_that_passes_one_way_only_has_no_damping_that_saves_all_weights() -> None:

@@ -18,9 +18,9 @@ def test_what_is_passive_is_said_in_a_word_each() -> None:
 def test_what_is_not_passive_says_where_and_by_how_much() -> None:
     section = section_of("two_sites")
     text = "\n".join(describe_ports(section))
-    (span,) = section.velocity.dips.below
+    (span,) = section.velocity.minima.below
     assert f"not passive at 0.001-{span.to_hz:.3g} Hz" in text
-    assert f"least eigenvalue {section.velocity.dips.least:.3g} at" in text
+    assert f"least eigenvalue {section.velocity.minima.least:.3g} at" in text
     assert "no damping at the joints would make it so" in text
     assert "as the proof asks: passive; sites weighted 1, 1" in text
     assert "some make it unstable at" in text
@@ -43,7 +43,7 @@ def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
         section = section_of(name)
         facts = json.loads(json.dumps(ports_to_json(section), allow_nan=False))
         assert facts["passive_qd"]["holds"] is section.velocity.passive
-        assert facts["passive_qd"]["least"] == section.velocity.dips.least
-        assert facts["felt"][0]["width_db"] == section.felt[0].width_db
+        assert facts["passive_qd"]["least"] == section.velocity.minima.least
+        assert facts["felt"][0]["width_db"] == section.transparency[0].width_db
         assert (facts["passive_r"] is None) is (section.proof is None)
     assert facts["passive_qd"]["lacking_nm_s_rad"] is None

@@ -11,98 +11,98 @@ from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
 from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
 
-_MOST_SPANS = 3
+_SHOWN_BANDS = 3
 
 
-def describe_ports(section: PortAnalysis) -> list[str]:
-    """Returns the section as lines.
-
-    Args:
-        section: what there is to say.
-    """
-    low, high = section.band_hz
+def describe_ports(ports: PortAnalysis) -> list[str]:
+    """Returns a port analysis as lines."""
+    low, high = ports.band_hz
     lines = [
-        f"Ports of {', '.join(section.sites)}, hands and environments off, {low:g}-{high:g} Hz "
-        "(a grid refined at dips: evidence, no proof)"
+        f"Ports of {', '.join(ports.sites)}, operators and environments off, {low:g}-{high:g} Hz "
+        "(a grid refined at minima: evidence, no proof)"
     ]
-    if section.resolved_hz < high:
+    if ports.resolved_hz < high:
         lines.append(
-            f"  above {section.resolved_hz:.3g} Hz the grid does not follow the phase of the longest delay"
+            f"  above {ports.resolved_hz:.3g} Hz the grid does not follow the phase of the longest delay"
         )
-    if section.verdict == "unstable":
-        return [*lines, "  the loop without hands is unstable: it is neither passive nor has it an impedance"]
-    if section.pole.order:
-        kind = "as that of masses adrift" if section.pole.passive else "which no passive network has"
-        lines.append(f"  at zero frequency Y has a pole of order {section.pole.order}, {kind}")
-    lines.append(f"  hands passive in qd: {_passive(section.velocity)}")
-    lines += [f"    joint {joint} alone: {_passive(one)}" for joint, one in section.joints.items()]
-    if section.proof is not None:
+    if ports.verdict == "unstable":
+        return [*lines, "  the loop without operators is unstable: not passive, and without an impedance"]
+    if ports.pole.order:
+        kind = "as of free masses" if ports.pole.passive else "which no passive network has"
+        lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
+    lines.append(f"  operators passive in qd: {_describe_passivity(ports.velocity)}")
+    lines += [f"    joint {joint} alone: {_describe_passivity(one)}" for joint, one in ports.joints.items()]
+    if ports.proof is not None:
         lines.append(
-            f"  hands passive in r = qd + Lambda e, as the proof asks: {_proof(section, section.proof)}"
+            "  operators passive in r = qd + Lambda e, the proof's premise: "
+            f"{_describe_proof(ports, ports.proof)}"
         )
-    lines.append(f"  any passive hands in qd, best weights: {_absolute(section)}")
-    lines += [f"    Llewellyn, {text}" for text in _two_ports(section)]
-    if section.clamped_verdict == "unstable":
-        lines.append(
-            f"  with {section.felt[0].of} clamped the loop is unstable: nothing steady is felt of it"
-        )
-        return lines
-    return [*lines, *(f"  {_felt(one)}" for one in section.felt)]
+    lines.append(f"  any passive operators in qd, best weights: {_describe_absolute_stability(ports)}")
+    lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
+    if ports.clamped_verdict == "unstable":
+        clamped = ports.transparency[0].of
+        return [*lines, f"  with {clamped} clamped the loop is unstable: it has no steady impedance"]
+    return [*lines, *(f"  {_describe_transparency(one)}" for one in ports.transparency)]
 
 
-def _proof(section: PortAnalysis, one: Passivity) -> str:
-    beta = ", ".join(f"{weight:.3g}" for weight in section.beta)
-    said = f"{_passive(one, damping=False)}; sites weighted {beta}"
-    if one.passive or section.true:
-        return said
-    return f"{said}; estimates here are not the truth, and what they store the proof counts and this does not"
+def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
+    beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
+    text = f"{_describe_passivity(proof, damping=False)}; sites weighted {beta}"
+    if proof.passive or ports.estimates_true:
+        return text
+    return f"{text}; estimates here are not true, and the proof counts the energy that they store"
 
 
-def _passive(one: Passivity, *, damping: bool = True) -> str:
+def _describe_passivity(one: Passivity, *, damping: bool = True) -> str:
     if one.passive:
         return "passive"
-    dips = one.dips
-    least = f"not passive {_spans(dips.below)}; least eigenvalue {dips.least:.3g} at {dips.least_hz:.3g} Hz"
+    minima = one.minima
+    least = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    text = f"not passive {_list_bands(minima.below)}; {least}"
     if not damping:
-        return least
+        return text
     if math.isinf(one.lacking_nm_s_rad):
-        return f"{least}; no damping at the joints would make it so"
-    return f"{least}; {one.lacking_nm_s_rad:.3g} N m s/rad more at each joint would make it so"
+        return f"{text}; no damping at the joints would make it so"
+    return f"{text}; {one.lacking_nm_s_rad:.3g} N m s/rad more at each joint would make it so"
 
 
-def _spans(spans: tuple[FrequencyBand, ...]) -> str:
-    said = [f"{span.from_hz:.3g}-{span.to_hz:.3g}" for span in spans[:_MOST_SPANS]]
-    more = f" and {len(spans) - _MOST_SPANS} ranges more" if len(spans) > _MOST_SPANS else ""
-    return f"at {', '.join(said)} Hz{more}"
+def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
+    shown = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_SHOWN_BANDS]]
+    more = f" and {len(bands) - _SHOWN_BANDS} ranges more" if len(bands) > _SHOWN_BANDS else ""
+    return f"at {', '.join(shown)} Hz{more}"
 
 
-def _absolute(section: PortAnalysis) -> str:
-    dips = section.absolute
-    if not dips.below:
+def _describe_absolute_stability(ports: PortAnalysis) -> str:
+    minima = ports.absolute
+    if not minima.below:
         return "stable"
-    can = "some make" if len(section.sites) <= 3 else "some may make"
-    return f"{can} it unstable {_spans(dips.below)}; margin {dips.least:.3g} at {dips.least_hz:.3g} Hz"
+    can = "some make" if len(ports.sites) <= 3 else "some may make"
+    margin = f"margin {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    return f"{can} it unstable {_list_bands(minima.below)}; {margin}"
 
 
-def _two_ports(section: PortAnalysis) -> list[str]:
-    """Returns where it fails, and for how many it holds."""
-    failing = [one for one in section.two_ports if one.dips.below]
-    holding = len(section.two_ports) - len(failing)
-    third = ", the third site free or clamped" if any(one.clamped for one in section.two_ports) else ""
+def _describe_two_ports(ports: PortAnalysis) -> list[str]:
+    """Returns the two-ports that fail the criterion, and the number of those that meet it."""
+    failing = [one for one in ports.two_ports if one.minima.below]
+    holding = len(ports.two_ports) - len(failing)
+    third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""
     every = f"every pair and joint{third}" if not failing else "the others"
-    counted = [f"{every}: holds ({holding} two-ports)"] if holding else []
-    return [*map(_two_port, failing), *counted]
+    return [
+        *map(_describe_failing_two_port, failing),
+        *([f"{every}: holds ({holding} two-ports)"] if holding else []),
+    ]
 
 
-def _two_port(one: TwoPort) -> str:
+def _describe_failing_two_port(one: TwoPort) -> str:
     third = f", {one.clamped} clamped" if one.clamped else ""
-    where = f"{one.sites[0]} and {one.sites[1]}{third}, joint {one.joint}"
+    minima = one.minima
     return (
-        f"{where}: fails {_spans(one.dips.below)}; least {one.dips.least:.3g} at {one.dips.least_hz:.3g} Hz"
+        f"{one.sites[0]} and {one.sites[1]}{third}, joint {one.joint}: fails {_list_bands(minima.below)}; "
+        f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
     )
 
 
-def _felt(one: Transparency) -> str:
+def _describe_transparency(one: Transparency) -> str:
     free, clamped = one.size_at(QUOTED_AT_HZ)
     low, high = one.band_hz
     return (

@@ -13,7 +13,13 @@ Definitions, equations and sources are in docs/linear.md and docs/ports.md.
 
 from .equilibrium import find_equilibrium
 from .linear_analysis import LinearAnalysis, analyse_linear_loop
-from .linear_edge import LinearEdge, find_linear_edge, iterate_linear_edges
+from .linear_edge import (
+    LinearEdge,
+    compute_growth_rates,
+    find_linear_edge,
+    find_root_crossings,
+    iterate_linear_edges,
+)
 from .linear_loop import DelayedTerm, LinearLoop, linearise_scenario
 from .operating_point import Equilibrium
 
@@ -24,8 +30,10 @@ __all__ = [
     "LinearEdge",
     "LinearLoop",
     "analyse_linear_loop",
+    "compute_growth_rates",
     "find_equilibrium",
     "find_linear_edge",
+    "find_root_crossings",
     "iterate_linear_edges",
     "linearise_scenario",
 ]

@@ -24,14 +24,13 @@ from .delay_roots import DelayPencil, compute_delay_spectrum, extract_moving_par
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
-"""Longer delays no link has."""
+"""The longest common delay that is searched."""
 _SHOWN = 3
-"""Ranges of delays that are told one by one."""
+"""Intervals that the text lists one by one."""
 _POINTS = 600
 _LOWEST = 1e-4
-"""The lowest frequency, as a share of the highest at which anything can cross."""
+"""The lowest frequency, relative to the highest at which a crossing is possible."""
 _BISECTIONS = 60
-_NEAR_ONE = 1e-6
 
 
 class AxisCrossing(NamedTuple):
@@ -40,7 +39,7 @@ class AxisCrossing(NamedTuple):
     Attributes:
         delay_s: the common delay, s.
         omega_rad_s: the frequency, rad/s.
-        pairs: how many pairs go to the right with rising delay; negative where they go to the left.
+        pairs: number of pairs that go to the right with rising delay; negative if they go to the left.
     """
 
     delay_s: float
@@ -52,10 +51,10 @@ class DelayInterval(NamedTuple):
     """Delays for which a loop is stable.
 
     Attributes:
-        low_s: from here on, s; 0 where it is stable without delay.
-        high_s: up to here, s; `MOST_S` where nothing crosses before.
-        low: what crosses at its beginning, or None.
-        high: what crosses at its end, or None.
+        low_s: its beginning, s; 0 if the loop is stable without delay.
+        high_s: its end, s; `MAX_COMMON_DELAY_S` if nothing crosses before.
+        low: the crossing at its beginning, or None.
+        high: the crossing at its end, or None.
     """
 
     low_s: float
@@ -63,108 +62,100 @@ class DelayInterval(NamedTuple):
     low: AxisCrossing | None
     high: AxisCrossing | None
 
+    @property
+    def words(self) -> str:
+        """Its ends and the frequency at its end; "" if it has no ends."""
+        if self.low is None and self.high is None:
+            return ""
+        low = "" if self.low is None else f"from {1e3 * self.low_s:.4g} ms "
+        if self.high is None:
+            return f"{low}on"
+        return f"{low}up to {1e3 * self.high_s:.4g} ms (crosses at {self.high.omega_rad_s:.4g} rad/s)"
+
 
 class DelayMargin(NamedTuple):
-    """For which common delay a loop is stable.
+    """The common delays for which a loop is stable.
 
     Attributes:
-        spans: where, by rising delay; none where it is unstable for every delay.
-        crossings: all that cross up to `MOST_S`, by rising delay.
+        intervals: by rising delay; none if it is unstable for every delay.
+        crossings: all up to `MAX_COMMON_DELAY_S`, by rising delay.
     """
 
-    spans: tuple[DelayInterval, ...]
+    intervals: tuple[DelayInterval, ...]
     crossings: tuple[AxisCrossing, ...]
 
     @property
     def words(self) -> str:
-        """For which delays it is stable, in words."""
-        if not self.spans:
+        """The delays for which the loop is stable, in words."""
+        if not self.intervals:
             return f"unstable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
-        texts = [_span_words(span) for span in self.spans]
+        texts = [interval.words for interval in self.intervals]
         if texts == [""]:
             return f"stable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
         more = f", and in {len(texts) - _SHOWN} more ranges" if len(texts) > _SHOWN else ""
         return f"stable for common delays {', '.join(texts[:_SHOWN])}{more}"
 
 
-def _span_words(span: DelayInterval) -> str:
-    if span.low is None and span.high is None:
-        return ""
-    low = "" if span.low is None else f"from {1e3 * span.low_s:.4g} ms "
-    if span.high is None:
-        return f"{low}on"
-    return f"{low}up to {1e3 * span.high_s:.4g} ms (crosses at {span.high.omega_rad_s:.4g} rad/s)"
-
-
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
     """Returns a loop with one delay on all of its links."""
     if not loop.delayed:
         return loop
-    A = np.sum([delayed.A for delayed in loop.delayed], axis=0)
-    B = np.sum([delayed.B for delayed in loop.delayed], axis=0)
+    A = np.sum([term.A for term in loop.delayed], axis=0)
+    B = np.sum([term.B for term in loop.delayed], axis=0)
     if delay_s == 0.0:
         return loop._replace(A=loop.A + A, B=loop.B + B, delayed=())
     return loop._replace(delayed=(DelayedTerm(delay_s, A, B),))
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Returns for which common delay a loop is stable.
-
-    Args:
-        loop: the loop; its own delays do not count.
-    """
-    found = find_axis_crossings(loop)
-    first_s = min((crossing.delay_s for crossing in found), default=0.2)
-    unstable = _unstable_pairs(set_common_delay(loop, 0.5 * min(first_s, 0.2)))
-    spans: list[DelayInterval] = []
+    """Returns the common delays for which a loop is stable; its own delays do not count."""
+    crossings = find_axis_crossings(loop)
+    first_s = min((crossing.delay_s for crossing in crossings), default=0.2)
+    count = _count_unstable_roots(set_common_delay(loop, 0.5 * min(first_s, 0.2)))
+    intervals: list[DelayInterval] = []
     low: AxisCrossing | None = None
-    count, open_ = unstable, unstable == 0
-    for crossing in found:
+    stable = count == 0
+    for crossing in crossings:
         count += 2 * crossing.pairs if crossing.omega_rad_s else crossing.pairs
-        if open_ and count > 0:
-            spans.append(DelayInterval(low.delay_s if low else 0.0, crossing.delay_s, low, crossing))
-            open_ = False
-        elif not open_ and count == 0:
-            low, open_ = crossing, True
-    if open_:
-        spans.append(DelayInterval(low.delay_s if low else 0.0, MAX_COMMON_DELAY_S, low, None))
-    return DelayMargin(tuple(spans), tuple(found))
+        if stable and count > 0:
+            intervals.append(DelayInterval(low.delay_s if low else 0.0, crossing.delay_s, low, crossing))
+            stable = False
+        elif not stable and count == 0:
+            low, stable = crossing, True
+    if stable:
+        intervals.append(DelayInterval(low.delay_s if low else 0.0, MAX_COMMON_DELAY_S, low, None))
+    return DelayMargin(tuple(intervals), tuple(crossings))
 
 
-def _unstable_pairs(loop: LinearLoop) -> int:
-    """Returns how many roots are to the right of the imaginary axis, conjugate ones and multiple ones too."""
+def _count_unstable_roots(loop: LinearLoop) -> int:
+    """Returns the number of roots to the right of the imaginary axis, with conjugates and multiplicities."""
     wanted = 8
     while True:
-        found = compute_delay_spectrum(loop, wanted)
-        right = [root for root in found.roots if root.s.real > 0.0]
-        if len(right) < len(found.roots) or len(found.roots) < wanted:
+        roots = compute_delay_spectrum(loop, wanted).roots
+        right = [root for root in roots if root.s.real > 0.0]
+        if len(right) < len(roots) or len(roots) < wanted:
             return sum(root.multiplicity * (2 if root.s.imag else 1) for root in right)
         wanted *= 2
 
 
 def find_axis_crossings(loop: LinearLoop) -> list[AxisCrossing]:
-    """Returns all pairs of roots that cross the imaginary axis for a common delay up to `MOST_S`.
-
-    Args:
-        loop: the loop; its own delays do not count.
-    """
+    """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`."""
     pencil = extract_moving_part(set_common_delay(loop, 1.0)).pencil
     if not len(pencil.delays_s):
         return []
     with limit_blas_threads():
-        sweep = _Sweep(pencil)
+        sweep = _FrequencySweep(pencil)
         grid = sweep.grid()
-        counts = sweep.outside(grid)
-        found = []
-        for place in np.flatnonzero(np.diff(counts)):
-            found += sweep.between(float(grid[place]), float(grid[place + 1]))
-    return sorted(_merged(found))
+        crossings = []
+        for place in np.flatnonzero(np.diff(sweep.count_outside(grid))):
+            crossings += sweep.search(float(grid[place]), float(grid[place + 1]))
+    return _merge(crossings)
 
 
-def _merged(found: Sequence[AxisCrossing]) -> list[AxisCrossing]:
-    """Returns crossings with those of one frequency and delay counted together."""
+def _merge(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
+    """Returns crossings, sorted, with those of one frequency and delay counted together."""
     merged: list[AxisCrossing] = []
-    for one in sorted(found):
+    for one in sorted(crossings):
         last = merged[-1] if merged else None
         if (
             last
@@ -174,63 +165,61 @@ def _merged(found: Sequence[AxisCrossing]) -> list[AxisCrossing]:
             merged[-1] = last._replace(pairs=last.pairs + one.pairs)
         else:
             merged.append(one)
-    return merged
+    return sorted(merged)
 
 
-class _Sweep:
+class _FrequencySweep:
     """The eigenvalues of G(j w) over frequency."""
 
     def __init__(self, pencil: DelayPencil) -> None:
-        self._A, self._late = pencil.A, pencil.late
-        self._Ad = pencil.Ad[0][:, pencil.late]
+        self._A, self._delayed = pencil.A, pencil.delayed_states
+        self._Ad = pencil.Ad[0][:, self._delayed]
         self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))
         self._modes: Complex = np.concatenate(
             [np.linalg.eigvals(pencil.A), np.linalg.eigvals(pencil.A + pencil.Ad[0])]
         ).astype(np.complex128)
 
     def grid(self) -> Array:
-        """Returns frequencies to look at, rad/s: more of them where the loop's own modes are."""
-        plain = np.geomspace(_LOWEST * self._highest, self._highest, _POINTS)
-        near = self._modes[np.abs(self._modes.imag) > 0.0]
-        about = np.abs(near.imag)[:, np.newaxis] + np.abs(near.real)[:, np.newaxis] * np.linspace(-3, 3, 13)
-        both = np.unique(np.concatenate([plain, about.ravel()]))
-        kept: Array = both[(both >= plain[0]) & (both <= plain[-1])]
+        """Returns frequencies to evaluate, rad/s, denser about the loop's own modes."""
+        even = np.geomspace(_LOWEST * self._highest, self._highest, _POINTS)
+        modes = self._modes[np.abs(self._modes.imag) > 0.0]
+        about = np.abs(modes.imag)[:, np.newaxis] + np.abs(modes.real)[:, np.newaxis] * np.linspace(-3, 3, 13)
+        both = np.unique(np.concatenate([even, about.ravel()]))
+        kept: Array = both[(both >= even[0]) & (both <= even[-1])]
         return kept
 
-    def values(self, omega: Array) -> Complex:
+    def eigenvalues(self, omega: Array) -> Complex:
         """Returns the eigenvalues of G(j w), shape (K, c)."""
-        n = len(self._A)
-        inner = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - self._A
+        inner = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(len(self._A)) - self._A
         G = np.linalg.solve(inner, np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape)))
-        return np.linalg.eigvals(G[:, self._late, :]).astype(np.complex128)
+        return np.linalg.eigvals(G[:, self._delayed, :]).astype(np.complex128)
 
-    def outside(self, omega: Array) -> NDArray[np.int64]:
-        """Returns how many of them have a modulus above 1, shape (K,)."""
-        counts: NDArray[np.int64] = (np.abs(self.values(omega)) > 1.0).sum(axis=1)
+    def count_outside(self, omega: Array) -> NDArray[np.int64]:
+        """Returns the number of eigenvalues with a modulus above 1, shape (K,)."""
+        counts: NDArray[np.int64] = (np.abs(self.eigenvalues(omega)) > 1.0).sum(axis=1)
         return counts
 
-    def between(self, low: float, high: float) -> list[AxisCrossing]:
+    def search(self, low: float, high: float) -> list[AxisCrossing]:
         """Returns the crossings between two frequencies whose counts differ."""
-        ends = self.outside(np.array([low, high]))
+        ends = self.count_outside(np.array([low, high]))
         if ends[0] == ends[1]:
             return []
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
-            count = self.outside(np.array([middle]))[0]
+            count = self.count_outside(np.array([middle]))[0]
             if count not in ends:
-                return self.between(low, middle) + self.between(middle, high)
+                return self.search(low, middle) + self.search(middle, high)
             low, high = (middle, high) if count == ends[0] else (low, middle)
             if high - low <= 1e-13 * high:
                 break
-        omega = 0.5 * (low + high)
-        values = self.values(np.array([omega]))[0]
-        order = np.argsort(np.abs(np.abs(values) - 1.0), kind="stable")
-        pairs = int(ends[0] - ends[1])
-        found = []
-        for value in values[order[: abs(pairs)]]:
+        omega, pairs = 0.5 * (low + high), int(ends[0] - ends[1])
+        values = self.eigenvalues(np.array([omega]))[0]
+        nearest = np.argsort(np.abs(np.abs(values) - 1.0), kind="stable")[: abs(pairs)]
+        crossings = []
+        for value in values[nearest]:
             phase = math.atan2(value.imag, value.real) % (2.0 * math.pi)
             turns = range(int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi)) + 2)
             delays_s = [(phase + 2.0 * math.pi * turn) / omega for turn in turns]
             sign = 1 if pairs > 0 else -1
-            found += [AxisCrossing(d, omega, sign) for d in delays_s if 0.0 < d <= MAX_COMMON_DELAY_S]
-        return found
+            crossings += [AxisCrossing(d, omega, sign) for d in delays_s if 0.0 < d <= MAX_COMMON_DELAY_S]
+        return crossings

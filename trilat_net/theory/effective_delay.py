@@ -22,13 +22,7 @@ from ..scenario.delay_models import LinkBase
 
 
 class EffectiveDelay(NamedTuple):
-    """Ages of the samples in use, s.
-
-    Attributes:
-        mean_s: the mean over the ticks of the receiver.
-        least_s: the least.
-        most_s: the most.
-    """
+    """Age of the samples in use over the receiver's ticks: mean, least and largest, s."""
 
     mean_s: float
     least_s: float
@@ -36,16 +30,10 @@ class EffectiveDelay(NamedTuple):
 
 
 def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: LinkBase) -> EffectiveDelay:
-    """Returns how old the samples of a peer are when a site uses them.
-
-    Args:
-        scenario: the experiment.
-        peer: the sender.
-        site: the receiver.
-        link: what the link between them is.
+    """Returns the age of a peer's samples at the ticks of a site that use them.
 
     Raises:
-        ScenarioError: nothing ever comes.
+        ScenarioError: no sample ever arrives.
     """
     own_hz, peer_hz = scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz
     model = link.core()
@@ -55,17 +43,34 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
         age_s = max(1, -(-delay_us * own_hz // 1_000_000)) / own_hz
         return EffectiveDelay(age_s, age_s, age_s)
     duration_s = min(scenario.duration_s, 2.0 + 2e-6 * model.location) if constant else scenario.duration_s
-    age = _counted(link, link_key(scenario.seed, f"{peer}->{site}"), own_hz, peer_hz, duration_s)
+    age = _count_ages(link, link_key(scenario.seed, f"{peer}->{site}"), own_hz, peer_hz, duration_s)
     if age is None:
         raise ScenarioError("no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name)
     return age
 
 
 @lru_cache(maxsize=256)
-def _counted(link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float) -> EffectiveDelay | None:
-    """Returns the ages at every tick of a receiver, from the first sample in use on, or None."""
-    channel = LinkSetup("peer", 1.0, peer_hz, (0.0, 0.0), key, (link.core(),), (link.points,))
-    receiver = Site(_receiver(own_hz, channel))
+def _count_ages(
+    link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
+) -> EffectiveDelay | None:
+    """Returns the ages from the first sample in use on, counted at a site with nothing but this link."""
+    receiver = Site(
+        SiteSetup(
+            name="receiver",
+            rate_hz=own_hz,
+            scheme=Scheme.DIGITAL,
+            gains=Gains(Law.KNOWN),
+            theta=np.ones(PARAMETERS),
+            g_m_s2=0.0,
+            lengths_m=(1.0, 1.0),
+            tau_limit_nm=1.0,
+            qd_limit_rad_s=1.0,
+            q0=(0.0, 0.0),
+            qd0=(0.0, 0.0),
+            actors=(),
+            links=(LinkSetup("peer", 1.0, peer_hz, (0.0, 0.0), key, (link.core(),), (link.points,)),),
+        )
+    )
     ticks = max(2, round(duration_s * own_hz))
     newest = np.full(ticks, -1, dtype=np.int64)
     for sample in range(round(duration_s * peer_hz)):
@@ -79,22 +84,3 @@ def _counted(link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: fl
     now_ns = np.arange(first, ticks) * NS_PER_S // own_hz
     ages_s = (now_ns - used[first:] * NS_PER_S // peer_hz) * 1e-9
     return EffectiveDelay(float(ages_s.mean()), float(ages_s.min()), float(ages_s.max()))
-
-
-def _receiver(rate_hz: int, link: LinkSetup) -> SiteSetup:
-    """Returns a site of which nothing but its receiving end is used."""
-    return SiteSetup(
-        name="receiver",
-        rate_hz=rate_hz,
-        scheme=Scheme.DIGITAL,
-        gains=Gains(Law.KNOWN),
-        theta=np.ones(PARAMETERS),
-        g_m_s2=0.0,
-        lengths_m=(1.0, 1.0),
-        tau_limit_nm=1.0,
-        qd_limit_rad_s=1.0,
-        q0=(0.0, 0.0),
-        qd0=(0.0, 0.0),
-        actors=(),
-        links=(link,),
-    )

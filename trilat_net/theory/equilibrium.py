@@ -18,29 +18,39 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
-from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
+from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop, locate_states
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import ESTIMATE, QD, describe_switching_points, has_estimate
+from .site_dynamics import ESTIMATE, STATE_SIZE, Q, describe_switching_points, has_estimate
 
 MAX_PROLONGATION = 8.0
-"""A run that is not at rest goes on for up to so many times its duration."""
-MAX_RUN_TICKS = 4_000_000
-"""Ticks of all sites together; a run goes on no further than that."""
-_KEPT = 100
-"""States of the last stretch that a mean is made of."""
+"""A run that is not at rest goes on for up to this multiple of its duration."""
+_MAX_RUN_TICKS = 4_000_000
+"""Limit of a prolonged run, in ticks of all sites together."""
+_MEAN_STATES = 100
+"""States of the last quarter in its mean."""
+
+MAX_EQUILIBRIUM_RESIDUAL = 1e-10
+"""The largest residual of an equilibrium."""
+_NEWTON_RESIDUAL = 1e-11
+"""A residual below this is rounding, rad/s^2."""
+_GAUSS_NEWTON_STEPS = 60
+_MAX_STEP = 0.3
+_MAX_HALVINGS = 20
+_FLAT = 1e-8
+"""A singular value this small, relative to the largest, belongs to a direction of further equilibria."""
 
 
 class EquilibriumRun(NamedTuple):
     """The end of a run.
 
     Attributes:
-        t_s: when it ended, s.
-        speed_rad_s: the largest joint speed of its last second, rad/s.
-        diverged: whether a site left its limits.
+        t_s: its time, s.
+        speed_rad_s: the largest joint speed of the last second, rad/s.
+        diverged: True if a site left its limits.
         q: joint angles at the end, shape (N, 2), rad.
         theta_hat: estimates at the end, shape (N, 5).
-        mean_q: joint angles on average over the last quarter, shape (N, 2), rad.
-        mean_theta_hat: estimates on average over the last quarter, shape (N, 5).
+        mean_q: mean joint angles over the last quarter, shape (N, 2), rad.
+        mean_theta_hat: mean estimates over the last quarter, shape (N, 5).
     """
 
     t_s: float
@@ -53,316 +63,276 @@ class EquilibriumRun(NamedTuple):
 
     @property
     def at_rest(self) -> bool:
-        """True where nothing moves any more."""
+        """True if the run ended at an equilibrium."""
         return not self.diverged and self.speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
 
 
 def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
-    """Runs a scenario until it rests, and for at most `LONGEST` times its duration.
-
-    Args:
-        scenario: the experiment.
+    """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration.
 
     Raises:
         ScenarioError: virtual time cannot run it.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
-    most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, MAX_RUN_TICKS / ticks))
+    most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
     run = FusedRun(prolong_scenario(scenario, most_s))
-    look_s = scenario.duration_s
+    until_s = scenario.duration_s
     while True:
-        q, theta_hat = _last_quarter(run, look_s)
+        states = []
+        for t_s in np.linspace(0.75 * until_s, until_s, _MEAN_STATES):
+            run.advance(float(t_s))
+            states.append((run.q, run.theta_hat))
         _, speed_rad_s = find_end_maxima(run.maxima)
-        if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * look_s > most_s:
+        if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
             break
-        look_s *= 2.0
+        until_s *= 2.0
+    mean_q, mean_theta_hat = (np.mean(values, axis=0) for values in zip(*states, strict=True))
     diverged = run.diverged_s is not None
-    return EquilibriumRun(run.ran_s, speed_rad_s, diverged, run.q, run.theta_hat, q, theta_hat)
+    return EquilibriumRun(run.ran_s, speed_rad_s, diverged, run.q, run.theta_hat, mean_q, mean_theta_hat)
 
 
-def _last_quarter(run: FusedRun, until_s: float) -> tuple[Array, Array]:
-    """Goes on with a run; returns the mean of its angles and estimates over the last quarter of its time."""
-    q, theta_hat = [], []
-    for t_s in np.linspace(0.75 * until_s, until_s, _KEPT):
-        run.advance(float(t_s))
-        q.append(run.q)
-        theta_hat.append(run.theta_hat)
-    return np.mean(q, axis=0), np.mean(theta_hat, axis=0)
+def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
+    """Returns the experiment prolonged: forces present at its end stay, nothing new begins."""
+    end_s = scenario.duration_s
+
+    def prolong(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+        return tuple(
+            msgspec.structs.replace(actor, end_s=1e9)
+            if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
+            else actor
+            for actor in actors
+            if getattr(actor, "start_s", 0.0) <= end_s
+        )
+
+    sites = {
+        name: msgspec.structs.replace(spec, hands=prolong(spec.hands), environment=prolong(spec.environment))
+        for name, spec in scenario.sites.items()
+    }
+    timeline = tuple(change for change in scenario.timeline if change.at_s <= end_s)
+    return msgspec.structs.replace(scenario, sites=sites, timeline=timeline, duration_s=duration_s)
 
 
-NEWTON_RESIDUAL = 1e-11
-"""A residual below this is rounding: accelerations in rad/s^2."""
-GAUSS_NEWTON_STEPS = 60
-_LARGEST_STEP = 0.3
-_HALVINGS = 20
-_FLAT = 1e-8
-"""A direction in which the field changes so little, beside the steepest, is one along which all rests."""
+def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
+    """Returns the accelerations and rates of estimates at a pose, in the order of the loop's states.
 
-
-def compute_equilibrium_residual(now: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns what is left at a rest: accelerations and rates of estimates, as the loop's states lie.
-
-    The derivatives of the angles are zero there and have zeros in their places.
+    The derivatives of the angles are zero.
     """
-    x = gather_site_arguments(now, rest)
-    parts = []
-    for i, site in enumerate(now.sites):
-        found = now.rates(i, x[i])
-        parts += [np.zeros(JOINTS), found.qdd]
-        if has_estimate(site):
-            parts.append(found.estimate)
-    return np.concatenate(parts)
+    x = gather_site_arguments(conditions, rest)
+    rates = [conditions.rates(i, x[i]) for i in range(len(conditions.sites))]
+    return _stack_states(conditions, [(np.zeros(JOINTS), one.qdd, one.estimate) for one in rates])
 
 
-def find_nearest_equilibrium(now: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium next to a pose, by Gauss and Newton with the least change of every step.
+def _stack_states(conditions: OperatingConditions, values: list[tuple[Array, Array, Array]]) -> Array:
+    """Returns values of (q, qd, theta_hat) of every site in the order of the loop's states."""
+    return np.concatenate(
+        [
+            part
+            for site, parts in zip(conditions.sites, values, strict=True)
+            for part in (parts if has_estimate(site) else parts[:2])
+        ]
+    )
 
-    Args:
-        now: what holds.
-        rest: the pose to begin from.
-    """
-    left = compute_equilibrium_residual(now, rest)
-    for _ in range(GAUSS_NEWTON_STEPS):
-        if np.abs(left).max() <= NEWTON_RESIDUAL:
+
+def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
+    """Returns the equilibrium nearest to a pose: Gauss-Newton steps of least norm from there."""
+    residual = compute_equilibrium_residual(conditions, rest)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
-        loop = linearise_loop(now, rest)
-        free = _free(loop)
+        loop = linearise_loop(conditions, rest)
+        free = _movable_states(loop)
         step = np.zeros(len(loop.names))
-        step[free] = np.linalg.lstsq(build_static_matrix(loop)[:, free], -left, rcond=_FLAT)[0]
-        share = min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), _LARGEST_STEP))
-        tried, after = rest, left
-        for _ in range(_HALVINGS):  # a wall met on the way turns the next step
-            tried = shift_equilibrium(now, rest, share * step)
-            after = compute_equilibrium_residual(now, tried)
-            if np.linalg.norm(after) < np.linalg.norm(left):
+        step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
+        share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
+        for _ in range(_MAX_HALVINGS):  # touching a wall changes the next step
+            tried = _shift_equilibrium(conditions, rest, share * step)
+            after = compute_equilibrium_residual(conditions, tried)
+            if np.linalg.norm(after) < np.linalg.norm(residual):
                 break
             share *= 0.5
         else:
             break
-        rest, left = tried, after
-    return rest._replace(residual=float(np.abs(left).max()))
+        rest, residual = tried, after
+    return rest._replace(residual=float(np.abs(residual).max()))
 
 
-def _free(loop: LinearLoop) -> list[int]:
+def _movable_states(loop: LinearLoop) -> list[int]:
     """Returns the states that an equilibrium may be moved along.
 
-    Velocities are zero, and what nothing moves (an estimate without a gain, one held at an end of its box)
-    stays where the run has it.
+    Velocities are zero, and a state that nothing moves (an estimate without a gain, one held at an end of
+    its box) keeps its value.
     """
-    movers = np.hstack([loop.A, *(delayed.A for delayed in loop.delayed)])
-    return [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(movers[n])]
+    effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
+    return [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(effects[n])]
 
 
-def build_static_matrix(loop: LinearLoop) -> Array:
-    """Returns A + sum_k A_k: what acts on what does not change."""
-    total = loop.A.copy()
-    for delayed in loop.delayed:
-        total += delayed.A
-    return total
-
-
-def shift_equilibrium(now: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
-    """Returns a rest shifted by a deviation of the loop's states, of which velocities do not count."""
+def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
+    """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
     q, theta_hat = rest.q.copy(), rest.theta_hat.copy()
-    first = 0
-    for i, site in enumerate(now.sites):
-        q[i] += step[first : first + JOINTS]
-        first += QD.stop
-        if has_estimate(site):
-            theta_hat[i] += step[first : first + ESTIMATE.stop - ESTIMATE.start]
-            first += ESTIMATE.stop - ESTIMATE.start
+    for i, at in enumerate(locate_states(conditions)):
+        own = step[at]
+        q[i] += own[Q]
+        if len(own) == STATE_SIZE:
+            theta_hat[i] += own[ESTIMATE]
     return rest._replace(q=q, theta_hat=theta_hat)
 
 
-def predict_from_start(now: OperatingConditions, start: Equilibrium) -> Equilibrium:
-    """Returns where the linear loop would come to rest from the start, did its other modes die away.
+def predict_from_start(conditions: OperatingConditions, start: Equilibrium) -> Equilibrium:
+    """Returns the equilibrium that the linear loop reaches from a start at rest if its other modes decay.
 
-    A loop with roots at zero keeps something of its history: with null vectors W' S = 0 and S V = 0 of S = A
+    A loop with roots at zero keeps part of its history: with null vectors W' S = 0 and S V = 0 of S = A
     + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x). Hale
     and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993), chapter 7.
-
-    Args:
-        now: what holds.
-        start: where all begin, and have been still.
     """
-    rest = find_nearest_equilibrium(now, start)
+    rest = find_nearest_equilibrium(conditions, start)
     for _ in range(3):
-        loop = linearise_loop(now, rest)
-        kept = _kept(loop, _deviation(now, start, rest))
+        still = np.zeros(JOINTS)
+        differences = [
+            (q, still, theta)
+            for q, theta in zip(start.q - rest.q, start.theta_hat - rest.theta_hat, strict=True)
+        ]
+        deviation = _stack_states(conditions, differences)
+        kept = _project_on_zero_roots(linearise_loop(conditions, rest), deviation)
         if kept is None:
             break
-        rest = find_nearest_equilibrium(now, shift_equilibrium(now, rest, kept))
+        rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))
     return rest._replace(how="predicted from the start poses: what the linear loop keeps of its start")
 
 
-def _deviation(now: OperatingConditions, start: Equilibrium, rest: Equilibrium) -> Array:
-    """Returns the start as a deviation from a rest; the history is still, and so is what counts of it."""
-    parts = []
-    for i, site in enumerate(now.sites):
-        parts += [start.q[i] - rest.q[i], np.zeros(JOINTS)]
-        if has_estimate(site):
-            parts.append(start.theta_hat[i] - rest.theta_hat[i])
-    return np.concatenate(parts)
-
-
-def _kept(loop: LinearLoop, deviation: Array) -> Array | None:
-    """Returns the part of a deviation that stays; None where roots at zero have too few vectors."""
-    left, values, right = np.linalg.svd(build_static_matrix(loop))
+def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
+    """Returns the part of a constant deviation that stays; None if roots at zero have too few vectors."""
+    left, values, right = np.linalg.svd(loop.static_matrix)
     count = int(np.sum(values <= _FLAT * values[0]))
     if not count:
         return None
     W, V = left[:, -count:], right[-count:].T
     D = np.eye(len(values))
-    for delayed in loop.delayed:
-        D += delayed.delay_s * delayed.A
+    for term in loop.delayed:
+        D += term.delay_s * term.A
     inner = W.T @ D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
-    found: Array = V @ np.linalg.solve(inner, W.T @ D @ deviation)
-    return found
-
-
-MAX_EQUILIBRIUM_RESIDUAL = 1e-10
-"""The largest residual of a rest."""
+    kept: Array = V @ np.linalg.solve(inner, W.T @ D @ deviation)
+    return kept
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, float] | None = None) -> Equilibrium:
-    """Returns where a scenario's sites rest.
+    """Returns the equilibrium of a scenario.
 
     Args:
         scenario: the experiment.
-        pose: a pose for all sites, rad, with estimates that are the truth; None: where a run of it ends.
+        pose: a pose for all sites, rad, with true estimates; None: the end of a run.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or rests nowhere.
-        UsageError: the pose is none.
+        ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its run.
+        UsageError: the pose is not two finite angles.
     """
-    now = derive_operating_conditions(scenario)
-    found = _at_end(scenario, now) if pose is None else _at(pose, now)
-    return found._replace(notes=tuple(_remarks(now, found)))
+    conditions = derive_operating_conditions(scenario)
+    rest = _find_at_run_end(scenario, conditions) if pose is None else _take_pose(pose, conditions)
+    return rest._replace(notes=tuple(_describe_limits(conditions, rest)))
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns where a scenario would rest by its linear loop, without a run of it.
+    """Returns the equilibrium that the linear loop predicts from the start poses, without a run.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or rests nowhere.
+        ScenarioError: the scenario has no linear loop, or no equilibrium there.
     """
-    now = derive_operating_conditions(scenario)
-    return _checked(scenario, predict_from_start(now, _start(now, scenario)))
-
-
-def _start(now: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Returns the start poses, still, with estimates that are the truth."""
-    q = np.array([spec.q0_rad for spec in scenario.sites.values()])
-    return Equilibrium(q, _estimates(now, np.array([site.theta for site in now.sites])), "", 0.0)
+    conditions = derive_operating_conditions(scenario)
+    return _require_equilibrium(scenario, predict_from_start(conditions, _start(conditions, scenario)))
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the rest of a scenario that is next to that of another one; the same where nothing changed.
+    """Returns the equilibrium of a scenario nearest to that of another one; the same if it still is one.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or rests nowhere.
+        ScenarioError: the scenario has no linear loop, or no equilibrium there.
     """
-    now = derive_operating_conditions(scenario)
-    start = rest._replace(theta_hat=_estimates(now, rest.theta_hat))
-    if float(np.abs(compute_equilibrium_residual(now, start)).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
+    conditions = derive_operating_conditions(scenario)
+    start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
+    if float(np.abs(compute_equilibrium_residual(conditions, start)).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
         return start
-    return _checked(scenario, find_nearest_equilibrium(now, start))
+    return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 
-def holds_any_shared_pose(now: OperatingConditions) -> bool:
-    """True where no site learns and nobody is at the arms: then a pose that all share is an equilibrium."""
-    return all(site.gains.law is Law.KNOWN and not site.actors for site in now.sites)
+def choose_equilibrium(scenario: Scenario) -> Equilibrium:
+    """Returns the equilibrium of a scenario: predicted if any shared pose is one, else the end of a run.
+
+    Any shared pose is an equilibrium if no site has estimates and no operator or environment acts.
+
+    Raises:
+        ScenarioError: the scenario has no linear loop, or no equilibrium there.
+    """
+    sites = derive_operating_conditions(scenario).sites
+    known = all(site.gains.law is Law.KNOWN and not site.actors for site in sites)
+    return predict_equilibrium(scenario) if known else find_equilibrium(scenario)
 
 
-def _estimates(now: OperatingConditions, theta_hat: Array) -> Array:
-    """Returns estimates with those of laws that learn nothing as the laws have them."""
-    rows = [theta_hat[i] if has_estimate(site) else site.gains.known for i, site in enumerate(now.sites)]
+def _start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
+    """Returns the start poses, at rest, with true estimates."""
+    q = np.array([spec.q0_rad for spec in scenario.sites.values()])
+    theta = np.array([site.theta for site in conditions.sites])
+    return Equilibrium(q, _complete_estimates(conditions, theta), "", 0.0)
+
+
+def _complete_estimates(conditions: OperatingConditions, theta_hat: Array) -> Array:
+    """Returns estimates in which those of laws that learn nothing are the parameters of the law."""
+    rows = [
+        theta_hat[i] if has_estimate(site) else site.gains.known for i, site in enumerate(conditions.sites)
+    ]
     return np.array(rows, dtype=np.float64)
 
 
-def _at(pose: tuple[float, float], now: OperatingConditions) -> Equilibrium:
-    """Returns one pose for all sites."""
+def _take_pose(pose: tuple[float, float], conditions: OperatingConditions) -> Equilibrium:
     if len(pose) != 2 or not np.isfinite(pose).all():
         raise UsageError(f"--pose is two angles in rad, as in --pose 0.1,0.3, not {pose}")
-    q = np.tile(np.array(pose, dtype=np.float64), (len(now.sites), 1))
-    theta = np.array([site.theta for site in now.sites])
-    rest = Equilibrium(q, _estimates(now, theta), "the pose that was asked for, with theta_hat = theta", 0.0)
-    return rest._replace(residual=float(np.abs(compute_equilibrium_residual(now, rest)).max()))
+    q = np.tile(np.array(pose, dtype=np.float64), (len(conditions.sites), 1))
+    theta = _complete_estimates(conditions, np.array([site.theta for site in conditions.sites]))
+    rest = Equilibrium(q, theta, "the pose that was asked for, with theta_hat = theta", 0.0)
+    return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
 
 
-def _at_end(scenario: Scenario, now: OperatingConditions) -> Equilibrium:
-    """Returns the equilibrium that a run leads to."""
+def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
     end = run_to_equilibrium(scenario)
     if end.diverged:
-        found = predict_from_start(now, _start(now, scenario))
-        return _checked(scenario, found._replace(how=f"the run diverges at {end.t_s:.4g} s; {found.how}"))
+        rest = predict_from_start(conditions, _start(conditions, scenario))
+        how = f"the run diverges at {end.t_s:.4g} s; {rest.how}"
+        return _require_equilibrium(scenario, rest._replace(how=how))
     if end.at_rest:
+        q, theta_hat = end.q, end.theta_hat
         how = f"the run is at rest at {end.t_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
-        return _checked(
-            scenario,
-            find_nearest_equilibrium(now, Equilibrium(end.q, _estimates(now, end.theta_hat), how, 0.0)),
+    else:
+        q, theta_hat = end.mean_q, end.mean_theta_hat
+        how = (
+            f"the run still moves at {end.t_s:.4g} s ({end.speed_rad_s:.2g} rad/s): the equilibrium nearest "
+            "to the mean of its last quarter"
         )
-    how = (
-        f"the run still moves at {end.t_s:.4g} s ({end.speed_rad_s:.2g} rad/s): the equilibrium next to the "
-        "mean of its last quarter"
-    )
-    return _checked(
-        scenario,
-        find_nearest_equilibrium(now, Equilibrium(end.mean_q, _estimates(now, end.mean_theta_hat), how, 0.0)),
-    )
+    start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
+    return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 
-def _checked(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
+def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
-            f"the loop rests nowhere near where its run ends ({rest.residual:.2g} rad/s^2 are left); give a "
-            "pose, as in --pose 0.1,0.3",
+            f"the loop has no equilibrium near the end of its run (residual {rest.residual:.2g} rad/s^2); "
+            "give a pose, as in --pose 0.1,0.3",
             source=scenario.name,
         )
     return rest
 
 
-def _remarks(now: OperatingConditions, rest: Equilibrium) -> Iterator[str]:
-    """Yields what is to be said of a rest."""
+def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iterator[str]:
     if rest.residual > MAX_EQUILIBRIUM_RESIDUAL:
         yield (
-            f"the pose is no rest: accelerations or rates of {rest.residual:.2g} are left there, and the "
+            f"the pose is no equilibrium: accelerations or rates of {rest.residual:.2g} remain, and the "
             "roots are those of equations frozen at it"
         )
-    x = gather_site_arguments(now, rest)
-    for i, site in enumerate(now.sites):
-        torque_nm = float(np.abs(now.rates(i, x[i]).tau).max())
+    x = gather_site_arguments(conditions, rest)
+    for i, site in enumerate(conditions.sites):
+        torque_nm = float(np.abs(conditions.rates(i, x[i]).tau).max())
         if torque_nm >= site.tau_limit_nm:
             yield (
-                f"{site.name} needs {torque_nm:.4g} N m to rest, and its clamp is {site.tau_limit_nm:g}: "
-                "the clamp is not in here"
+                f"{site.name} needs {torque_nm:.4g} N m at rest, and its clamp is {site.tau_limit_nm:g}: "
+                "the clamp is left out"
             )
         yield from describe_switching_points(site, x[i])
-
-
-def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the same experiment gone on for longer, with nothing new after its end.
-
-    Args:
-        scenario: the experiment.
-        duration_s: for how long, s.
-    """
-    end_s = scenario.duration_s
-
-    def on(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
-        begun = [actor for actor in actors if getattr(actor, "start_s", 0.0) <= end_s]
-        return tuple(
-            msgspec.structs.replace(actor, end_s=1e9)
-            if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
-            else actor
-            for actor in begun
-        )
-
-    sites = {
-        name: msgspec.structs.replace(spec, hands=on(spec.hands), environment=on(spec.environment))
-        for name, spec in scenario.sites.items()
-    }
-    timeline = tuple(change for change in scenario.timeline if change.at_s <= end_s)
-    return msgspec.structs.replace(scenario, sites=sites, timeline=timeline, duration_s=duration_s)

@@ -14,10 +14,9 @@ import numpy as np
 from ..errors import UsageError
 from ..scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot, Spectrum
-from .delay_margin import AxisCrossing, DelayMargin, find_delay_margin
+from .delay_margin import DelayMargin, find_delay_margin
 from .delay_roots import compute_delay_spectrum
 from .equilibrium import find_equilibrium
-from .linear_edge import is_digital
 from .linear_loop import LinearLoop, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .tick_map import compute_sampled_spectrum, find_common_rate_hz
@@ -25,50 +24,60 @@ from .tick_map import compute_sampled_spectrum, find_common_rate_hz
 DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
 SAMPLED_ROOT_DIFFERENCE = 0.01
-"""Continuous and sampled roots that differ by more, of abs(s), are told apart."""
+"""Continuous and sampled roots that differ by more, relative to abs(s), are both reported."""
 
 
 @dataclass(frozen=True)
 class LinearAnalysis:
-    """What linear analysis says of a scenario.
+    """The linear analysis of a scenario.
 
     Attributes:
         scenario: the experiment.
-        now: what holds at its end: shares, ages, who is at the arms.
-        rest: where it rests.
+        conditions: the numbers of the loop: dominance factors, ages, actors in force.
+        rest: the equilibrium.
         loop: the linear loop there.
         continuous: roots of the delay-differential equation.
-        sampled: roots of the loop as it is computed; None where the sites have several rates.
-        margin: for which common delay the continuous loop is stable.
-        notes: what is to be said of all that.
+        sampled: roots of the sampled loop; None if the sites have several rates.
+        margin: the common delays for which the continuous loop is stable.
     """
 
     scenario: Scenario
-    now: OperatingConditions
+    conditions: OperatingConditions
     rest: Equilibrium
     loop: LinearLoop
     continuous: Spectrum
     sampled: Spectrum | None
     margin: DelayMargin
-    notes: tuple[str, ...]
 
     @property
-    def judged(self) -> Spectrum:
-        """The roots that the verdict is about."""
+    def decisive(self) -> Spectrum:
+        """The roots on which the verdict is based."""
         return self.continuous if self.sampled is None else self.sampled
 
     @property
     def verdict(self) -> str:
-        """stable, unstable, or at the edge: of small motions about the rest."""
-        return self.judged.verdict
+        """stable, unstable, or at the edge: of small motions about the equilibrium."""
+        return self.decisive.verdict
 
     @property
-    def digital(self) -> bool:
-        """True where the controllers are plain digital ones, which the continuous loop only approximates."""
-        return is_digital(self.scenario)
+    def notes(self) -> tuple[str, ...]:
+        """Remarks on conditions, equilibrium and roots."""
+        notes = [*self.conditions.notes, *self.rest.notes]
+        if find_common_rate_hz(self.conditions) is None:
+            notes.append("sites tick at several rates: only the continuous loop is linearised")
+        elif self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
+            notes.append(
+                f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
+                f"{self.sampled.verdict}: the tick rate decides"
+            )
+        if self.decisive.drifting:
+            notes.append(
+                f"{self.decisive.drifting} of the roots at zero only drift: their modes keep their speed"
+            )
+        return tuple(notes)
 
-    def as_computed(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
-        """Returns the sampled root next to a continuous one, where they differ by more than `APART`."""
+    def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
+        """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or less."""
         if self.sampled is None or not self.sampled.roots:
             return None
         near = min(self.sampled.roots, key=lambda one: abs(one.s - root.s))
@@ -82,104 +91,76 @@ def analyse_linear_loop(
     pose: tuple[float, float] | None = None,
     roots: int = DEFAULT_ROOTS,
 ) -> LinearAnalysis:
-    """Returns what linear analysis says of a scenario.
+    """Returns the linear analysis of a scenario.
 
     Args:
         source: the name of a shipped scenario, a path, or a scenario.
-        overrides: what is to be changed of it, as texts KEY=VALUE.
-        pose: a pose for all sites, rad, with estimates that are the truth; None: where a run of it ends.
-        roots: how many roots, rightmost first.
+        overrides: changes of it, as texts KEY=VALUE.
+        pose: a pose for all sites, rad, with true estimates; None: the end of a run.
+        roots: number of roots, rightmost first.
 
     Raises:
-        ScenarioError: the scenario is none, or has no linear loop.
-        UsageError: another argument cannot be right.
+        ScenarioError: the scenario is not valid, or has no linear loop.
+        UsageError: another argument is not valid.
     """
     if not 1 <= roots <= MAX_ROOTS:
-        raise UsageError(f"--roots is how many roots are shown, 1 to {MAX_ROOTS}, not {roots}")
+        raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
     scenario = load_scenario(source, overrides)
-    now = derive_operating_conditions(scenario)
+    conditions = derive_operating_conditions(scenario)
     rest = find_equilibrium(scenario, pose)
-    loop = linearise_loop(now, rest)
+    loop = linearise_loop(conditions, rest)
     continuous = compute_delay_spectrum(loop, roots)
     near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    sampled = compute_sampled_spectrum(now, rest, near, roots)
-    found = LinearAnalysis(scenario, now, rest, loop, continuous, sampled, find_delay_margin(loop), ())
-    return LinearAnalysis(scenario, now, rest, loop, continuous, sampled, found.margin, tuple(_notes(found)))
+    sampled = compute_sampled_spectrum(conditions, rest, near, roots)
+    return LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
 
 
-def _notes(found: LinearAnalysis) -> list[str]:
-    notes = [*found.now.notes, *found.rest.notes]
-    if find_common_rate_hz(found.now) is None:
-        notes.append(
-            "sites tick at several rates: the loop as it is computed is not linearised, the continuous one is"
-        )
-    elif found.sampled is not None and found.sampled.verdict != found.continuous.verdict:
-        notes.append(
-            f"the continuous loop is {found.continuous.verdict}, the loop as it is computed is "
-            f"{found.sampled.verdict}: the tick rate decides"
-        )
-    if found.judged.drifting:
-        notes.append(
-            f"{found.judged.drifting} of the roots at zero only drift: what they belong to goes on at the "
-            "speed that it has"
-        )
-    return notes
-
-
-def linear_to_json(found: LinearAnalysis) -> dict[str, Any]:
-    """Returns all of an analysis as plain values."""
+def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
+    """Returns an analysis as plain values."""
+    names, conditions, rest = analysis.scenario.names, analysis.conditions, analysis.rest
     return {
-        "scenario": found.scenario.name,
-        "scenario_sha256": found.scenario.sha256,
-        "verdict": found.verdict,
+        "scenario": analysis.scenario.name,
+        "scenario_sha256": analysis.scenario.sha256,
+        "verdict": analysis.verdict,
         "rest": {
-            "how": found.rest.how,
-            "residual": found.rest.residual,
-            "q_rad": dict(zip(found.scenario.names, found.rest.q.tolist(), strict=True)),
-            "theta_hat": dict(zip(found.scenario.names, found.rest.theta_hat.tolist(), strict=True)),
+            "how": rest.how,
+            "residual": rest.residual,
+            "q_rad": dict(zip(names, rest.q.tolist(), strict=True)),
+            "theta_hat": dict(zip(names, rest.theta_hat.tolist(), strict=True)),
         },
-        "delay_in_use_ms": _ages(found),
-        "continuous": _spectrum(found.continuous),
-        "as_computed": None if found.sampled is None else _spectrum(found.sampled),
+        "delay_in_use_ms": {
+            f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
+            for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
+        },
+        "continuous": _spectrum_to_json(analysis.continuous),
+        "as_computed": None if analysis.sampled is None else _spectrum_to_json(analysis.sampled),
         "margin": {
-            "words": found.margin.words,
-            "stable": [{"from_s": span.low_s, "to_s": span.high_s} for span in found.margin.spans],
-            "crossings": [_crossing(one) for one in found.margin.crossings],
+            "words": analysis.margin.words,
+            "stable": [{"from_s": one.low_s, "to_s": one.high_s} for one in analysis.margin.intervals],
+            "crossings": [
+                {"delay_s": one.delay_s, "omega_rad_s": one.omega_rad_s, "pairs_to_the_right": one.pairs}
+                for one in analysis.margin.crossings
+            ],
         },
-        "notes": list(found.notes),
+        "notes": list(analysis.notes),
     }
 
 
-def _ages(found: LinearAnalysis) -> dict[str, float]:
-    names, alpha, age_s = found.scenario.names, found.now.alpha, found.now.age_s
+def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
     return {
-        f"{names[j]}->{names[i]}": 1e3 * float(age_s[i, j])
-        for i in range(len(names))
-        for j in range(len(names))
-        if alpha[i, j]
+        "verdict": spectrum.verdict,
+        "roots": [
+            {
+                "re_per_s": root.s.real,
+                "im_rad_s": root.s.imag,
+                "damping": root.damping,
+                "modes": root.multiplicity,
+                "states": list(root.states),
+            }
+            for root in spectrum.roots
+        ],
+        "zeros_by_structure": spectrum.zeros,
+        "of_those_drifting": spectrum.drifting,
+        "dropped_candidates": spectrum.dropped,
+        "order": spectrum.order,
     }
-
-
-def _spectrum(found: Spectrum) -> dict[str, Any]:
-    return {
-        "verdict": found.verdict,
-        "roots": [_root(root) for root in found.roots],
-        "zeros_by_structure": found.zeros,
-        "of_those_drifting": found.drifting,
-        "dropped_candidates": found.dropped,
-        "order": found.order,
-    }
-
-
-def _root(root: CharacteristicRoot) -> dict[str, Any]:
-    return {
-        "re_per_s": root.re_per_s,
-        "im_rad_s": root.im_rad_s,
-        "damping": root.damping,
-        "modes": root.multiplicity,
-        "states": list(root.states),
-    }
-
-
-def _crossing(one: AxisCrossing) -> dict[str, Any]:
-    return {"delay_s": one.delay_s, "omega_rad_s": one.omega_rad_s, "pairs_to_the_right": one.pairs}

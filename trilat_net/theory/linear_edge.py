@@ -5,73 +5,66 @@ sampled loop for the scheme `digital`, of the continuous loop otherwise. The equ
 followed along the key.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ..core.site_setup import Scheme
 from ..core.vectors import Array
-from ..errors import UsageError
+from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot
 from .delay_roots import compute_delay_spectrum
-from .equilibrium import (
-    MAX_EQUILIBRIUM_RESIDUAL,
-    compute_equilibrium_residual,
-    find_equilibrium,
-    follow_equilibrium,
-    holds_any_shared_pose,
-    predict_equilibrium,
-)
+from .equilibrium import choose_equilibrium, find_equilibrium, follow_equilibrium
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .site_dynamics import has_estimate
 from .tick_map import compute_sampled_spectrum
-
-_NEAR = 4
-"""So many continuous roots lead to the sampled ones."""
-
-
-def is_digital(scenario: Scenario) -> bool:
-    """True where the controllers are plain digital ones."""
-    return scenario.scheme == Scheme.DIGITAL.name.lower()
-
-
-def find_rightmost_root(
-    now: OperatingConditions, rest: Equilibrium, *, sampled: bool
-) -> CharacteristicRoot | None:
-    """Returns the rightmost root; None where there is none but those at zero.
-
-    Args:
-        now: what holds.
-        rest: where it is linearised.
-        sampled: whether the loop as it is computed counts; at several rates the continuous one does.
-    """
-    continuous = compute_delay_spectrum(linearise_loop(now, rest), _NEAR if sampled else 1)
-    if not sampled:
-        return continuous.rightmost
-    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    return (compute_sampled_spectrum(now, rest, near, 1) or continuous).rightmost
-
 
 EDGE_SCAN_POINTS = 24
 EDGE_TOLERANCE = 1e-6
+_CONTINUOUS_GUESSES = 4
+"""Number of continuous roots from which the sampled ones are sought."""
 _LOGARITHMIC = 20.0
-"""A range whose ends are further apart is scanned in equal steps of its logarithm."""
-_STEPS = 80
-_HALVED = 3
-"""Every so many steps a bracket is halved, whatever its ends say."""
-_INTEGERS = ("rate_hz", "seed")
+"""A range with a larger ratio of its ends is scanned in equal steps of the logarithm."""
+_MAX_STEPS = 80
+_HALVING_PERIOD = 3
+"""Every so many steps a bracket is halved, whatever its ends are."""
+_INTEGER_KEYS = ("rate_hz", "seed")
+
+ASSUMED_EQUILIBRIUM_REMARK = (
+    "the linear analysis of a law that learns is about the mean start pose, with true estimates: the "
+    "equilibrium of a run depends on its whole history"
+)
+
+
+def find_rightmost_root(
+    conditions: OperatingConditions, rest: Equilibrium, *, sampled: bool
+) -> CharacteristicRoot | None:
+    """Returns the rightmost root about an equilibrium; None if there are only those at zero.
+
+    Args:
+        conditions: the numbers of the loop.
+        rest: the equilibrium.
+        sampled: use the sampled loop; if the sites have several rates the continuous one is used.
+    """
+    continuous = compute_delay_spectrum(
+        linearise_loop(conditions, rest), _CONTINUOUS_GUESSES if sampled else 1
+    )
+    if not sampled:
+        return continuous.rightmost
+    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
+    return (compute_sampled_spectrum(conditions, rest, near, 1) or continuous).rightmost
 
 
 class LinearEdge(NamedTuple):
-    """Where a loop changes between stable and unstable.
+    """A value at which a loop changes between stable and unstable.
 
     Attributes:
-        key: what is changed.
+        key: the scenario's key.
         value: its value there, in its own unit.
         omega_rad_s: the frequency of the root that crosses, rad/s.
-        stable_above: whether it is stable above and not below; else the other way round.
+        stable_above: True if it is stable above and unstable below.
     """
 
     key: str
@@ -90,24 +83,7 @@ def find_linear_edge(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> LinearEdge | None:
-    """Returns the lowest value of a key at which the loop changes between stable and unstable.
-
-    Args:
-        scenario: the experiment.
-        key: what is changed, as in "control.d" or "link.delay_ms".
-        low: the least value.
-        high: the largest value.
-        rest: where it rests, if that is known; it is moved to the nearest equilibrium of each value.
-        points: values that are scanned.
-        sampled: whether the loop as it is computed counts; None: where the scheme is `digital`.
-
-    Returns:
-        The edge; None where the scan sees none.
-
-    Raises:
-        ScenarioError: a value is none for that key, or the scenario has no linear loop.
-        UsageError: the range is none.
-    """
+    """Returns the lowest edge, or None; see `iterate_linear_edges`."""
     return next(iterate_linear_edges(scenario, key, low, high, rest, points=points, sampled=sampled), None)
 
 
@@ -121,69 +97,78 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields all edges that a scan of a key sees, by rising value; see `edge`."""
+    """Yields all edges that a scan of a key finds, by rising value.
+
+    Args:
+        scenario: the experiment.
+        key: as in "control.d" or "link.delay_ms".
+        low: the least value.
+        high: the largest value.
+        rest: its equilibrium, if known; it is followed along the key.
+        points: number of values that are scanned.
+        sampled: use the sampled loop; None: if the scheme is `digital`.
+
+    Raises:
+        ScenarioError: a value is not valid for that key, or the scenario has no linear loop.
+        UsageError: the range is empty.
+    """
     if not (np.isfinite([low, high]).all() and low < high and points >= 2):
         raise UsageError(f"{key} is scanned from a value to a larger one, not {low:g} to {high:g}")
-    line = _Line(scenario, key, rest, sampled)
+    rate = _GrowthRate(scenario, key, rest, sampled)
+    spaced = np.geomspace if low > 0.0 and high / low > _LOGARITHMIC else np.linspace
+    values = spaced(low, high, points)
     before: tuple[float, float] | None = None
-    for value in _scan(key, low, high, points):
-        now = (float(value), line.at(float(value)))
+    for value in np.unique(np.round(values)) if rate.integer else values:
+        now = (float(value), rate.at(float(value)))
         if before is not None and (before[1] > 0.0) != (now[1] > 0.0):
-            yield line.closed(before, now)
+            yield rate.close_edge(before, now)
         before = now
 
 
-def _scan(key: str, low: float, high: float, points: int) -> Array:
-    apart = low > 0.0 and high / low > _LOGARITHMIC
-    values = np.geomspace(low, high, points) if apart else np.linspace(low, high, points)
-    return np.unique(np.round(values)) if _whole(key) else values
+class _GrowthRate:
+    """The real part of the rightmost root over the values of a key, 1/s.
 
-
-def _whole(key: str) -> bool:
-    """True for a key that takes whole numbers."""
-    return key.rpartition(".")[2] in _INTEGERS
-
-
-class _Line:
-    """The real part of the rightmost root over the values of a key, 1/s."""
+    Attributes:
+        integer: True if the key takes whole numbers.
+    """
 
     def __init__(self, scenario: Scenario, key: str, rest: Equilibrium | None, sampled: bool | None) -> None:
-        self._scenario, self._key = scenario, key
-        self._sampled = is_digital(scenario) if sampled is None else sampled
-        self._rest = rest or _first_rest(scenario)
+        self.integer = key.rpartition(".")[2] in _INTEGER_KEYS
+        self._scenario, self._key, self._sampled = scenario, key, sampled
+        self._rest = rest or choose_equilibrium(scenario)
         self._root: CharacteristicRoot | None = None
 
     def at(self, value: float) -> float:
-        """Returns the real part at a value; -infinity where no root but those at zero is there."""
-        scenario = load_scenario(self._scenario, {self._key: round(value) if _whole(self._key) else value})
-        now = derive_operating_conditions(scenario)
-        self._rest = _moved(scenario, now, self._rest)
-        self._root = find_rightmost_root(now, self._rest, sampled=self._sampled)
+        """Returns the real part at a value; -infinity if there are only roots at zero."""
+        scenario = load_scenario(self._scenario, {self._key: round(value) if self.integer else value})
+        conditions = derive_operating_conditions(scenario)
+        self._rest = follow_equilibrium(scenario, self._rest)
+        sampled = conditions.digital if self._sampled is None else self._sampled
+        self._root = find_rightmost_root(conditions, self._rest, sampled=sampled)
         return -np.inf if self._root is None else self._root.s.real
 
-    def closed(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
-        """Returns the edge between two values on its two sides: regula falsi, halved where it stalls."""
+    def close_edge(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
+        """Returns the edge between two (value, real part) of different signs."""
         (low, at_low), (high, at_high) = left, right
-        stable_above = at_low > 0.0
-        if _whole(self._key):
+        if self.integer:
             while high - low > 1.0:
                 middle = float((low + high) // 2.0)
                 low, high = (middle, high) if (self.at(middle) > 0.0) == (at_low > 0.0) else (low, middle)
         else:
-            low, high = self._close(low, high, [at_low, at_high])
+            low, high = self._narrow(low, high, [at_low, at_high])
         self.at(high)
         omega = 0.0 if self._root is None else self._root.s.imag
-        return LinearEdge(self._key, 0.5 * (low + high), omega, stable_above)
+        return LinearEdge(self._key, 0.5 * (low + high), omega, at_low > 0.0)
 
-    def _close(self, low: float, high: float, ends: list[float]) -> tuple[float, float]:
-        """Returns a bracket made narrow: by regula falsi, with the end that stays counted half, or halved."""
+    def _narrow(self, low: float, high: float, ends: list[float]) -> tuple[float, float]:
+        """Returns a narrow bracket: regula falsi with the weight of a kept end halved, and bisection."""
         smallest = EDGE_TOLERANCE * max(abs(low), abs(high))
         sign, weights = ends[0] > 0.0, ends
-        for step in range(_STEPS):
+        for step in range(_MAX_STEPS):
             if high - low <= smallest:
                 break
             middle = 0.5 * (low + high)
-            if step % _HALVED and np.isfinite(weights).all():
+            if step % _HALVING_PERIOD and np.isfinite(weights).all():
                 middle = (low * weights[1] - high * weights[0]) / (weights[1] - weights[0])
                 middle = min(max(middle, low + 0.4 * smallest), high - 0.4 * smallest)
             value = self.at(middle)
@@ -194,17 +179,47 @@ class _Line:
         return low, high
 
 
-def _first_rest(scenario: Scenario) -> Equilibrium:
-    """Returns where a scenario rests; without a run of it where a pose that all share is an equilibrium."""
-    return (
-        predict_equilibrium(scenario)
-        if holds_any_shared_pose(derive_operating_conditions(scenario))
-        else find_equilibrium(scenario)
-    )
+def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:
+    """Returns the real parts of the rightmost roots of neighbouring scenarios, 1/s, and remarks on them.
+
+    The equilibrium is followed from one scenario to the next. A real part is NaN if there is no linear loop
+    and -infinity if nothing moves; each remark comes once.
+    """
+    rest: Equilibrium | None = None
+    growth_per_s: list[float] = []
+    remarks: dict[str, None] = {}
+    for scenario in scenarios:
+        try:
+            rest, remark = _assume_equilibrium(scenario, rest)
+            conditions = derive_operating_conditions(scenario)
+            root = find_rightmost_root(conditions, rest, sampled=conditions.digital)
+            growth_per_s.append(-np.inf if root is None else root.s.real)
+        except ScenarioError as error:
+            remark = f"no linear analysis: {error.problem}"
+            growth_per_s.append(float("nan"))
+        if remark:
+            remarks[remark] = None
+    return growth_per_s, list(remarks)
 
 
-def _moved(scenario: Scenario, now: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns the rest next to another one; the same where the key does not move it."""
-    if float(np.abs(compute_equilibrium_residual(now, rest)).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
-        return rest
-    return follow_equilibrium(scenario, rest)
+def find_root_crossings(
+    scenario: Scenario, key: str, low: float, high: float
+) -> tuple[tuple[float, ...], str]:
+    """Returns the values of a key at which the rightmost root crosses the axis, rising, and a remark or "".
+
+    There are no values if the scenario has no linear loop; its own value of the key gives the equilibrium.
+    """
+    try:
+        rest, remark = _assume_equilibrium(scenario, None)
+        return tuple(one.value for one in iterate_linear_edges(scenario, key, low, high, rest)), remark
+    except ScenarioError as error:
+        return (), f"no linear analysis: {error.problem}"
+
+
+def _assume_equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple[Equilibrium, str]:
+    """Returns an equilibrium without a run if possible: at the mean start pose, or near that before."""
+    sites = derive_operating_conditions(scenario).sites
+    if any(map(has_estimate, sites)) and not any(site.actors for site in sites):
+        mean: Array = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0)
+        return find_equilibrium(scenario, (float(mean[0]), float(mean[1]))), ASSUMED_EQUILIBRIUM_REMARK
+    return choose_equilibrium(scenario) if before is None else follow_equilibrium(scenario, before), ""

@@ -6,6 +6,7 @@ Invariant: x are deviations from the equilibrium, in the order of the scenario's
 the joints that an operator adds; y are the joint velocities.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +30,21 @@ from .site_dynamics import (
     has_estimate,
 )
 
+STATE_NAMES = (
+    *(f"q{j + 1}" for j in range(JOINTS)),
+    *(f"qd{j + 1}" for j in range(JOINTS)),
+    *(f"theta{p + 1}" for p in range(PARAMETERS)),
+)
+"""Names of a site's states."""
+
 
 class DelayedTerm(NamedTuple):
-    """What comes into the loop after a delay.
+    """The part of the loop that acts after one delay.
 
     Attributes:
         delay_s: the delay in use, s.
         A: of the state, shape (n, n).
-        B: of the hands' torque, where a law reflects it, shape (n, m).
+        B: of the operators' torque, where a law reflects it, shape (n, m).
     """
 
     delay_s: float
@@ -65,127 +73,124 @@ class LinearLoop(NamedTuple):
     C: Array
     delayed: tuple[DelayedTerm, ...]
 
+    @property
+    def static_matrix(self) -> Array:
+        """A + sum_k A_k: the effect of a constant deviation."""
+        total = self.A.copy()
+        for term in self.delayed:
+            total += term.A
+        return total
+
 
 class LinearSite(NamedTuple):
     """One site of the loop.
 
     Attributes:
         at: places of its states in x.
-        own: which of a site's STATE numbers these are.
-        rates: derivatives of its rates, see `field.jacobian`.
+        rates: derivatives of its rates, see `differentiate_site_rates`.
     """
 
     at: slice
-    own: slice
     rates: SiteRates
 
     @property
-    def fast(self) -> Array:
-        """Derivatives of qdd and, where it adapts, of the estimate: shape (2 or 7, ARGUMENTS)."""
-        estimate = self.rates.estimate[: self.own.stop - QD.stop]
-        return np.vstack([self.rates.qdd, estimate])
+    def own(self) -> slice:
+        """Its states among a site's STATE_SIZE numbers."""
+        return slice(0, self.at.stop - self.at.start)
+
+    @property
+    def q(self) -> slice:
+        """Places of its angles in x."""
+        return slice(self.at.start, self.at.start + JOINTS)
+
+    @property
+    def qd(self) -> slice:
+        """Places of its velocities in x."""
+        return slice(self.at.start + JOINTS, self.at.start + 2 * JOINTS)
+
+    @property
+    def dynamic(self) -> slice:
+        """Places of its velocities and estimates in x."""
+        return slice(self.at.start + JOINTS, self.at.stop)
+
+    @property
+    def dynamic_rates(self) -> Array:
+        """Derivatives of qdd and, if it adapts, of the estimate: shape (2 or 7, ARGUMENT_COUNT)."""
+        return np.vstack([self.rates.qdd, self.rates.estimate[: self.own.stop - QD.stop]])
 
 
 def linearise_scenario(scenario: Scenario, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop of a scenario, linearised at a rest.
-
-    Args:
-        scenario: the experiment.
-        rest: where, see `rest.rest_of`.
+    """Returns the loop of a scenario, linearised at an equilibrium, see `find_equilibrium`.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, see `conditions`.
+        ScenarioError: the scenario has no linear loop, see `derive_operating_conditions`.
     """
     return linearise_loop(derive_operating_conditions(scenario), rest)
 
 
-def gather_site_arguments(now: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns what the rates of every site depend on while all is still, shape (N, ARGUMENTS)."""
-    x = np.zeros((len(now.sites), ARGUMENT_COUNT))
+def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> Array:
+    """Returns the arguments of every site's rates at an equilibrium, shape (N, ARGUMENT_COUNT)."""
+    x = np.zeros((len(conditions.sites), ARGUMENT_COUNT))
     x[:, Q], x[:, ESTIMATE] = rest.q, rest.theta_hat
-    x[:, Q_DES] = now.alpha @ rest.q
-    on_arm = np.array([_on_arm(now, i, x[i]) for i in range(len(now.sites))])
-    x[:, PEER_TORQUE] = now.alpha @ on_arm
+    x[:, Q_DES] = conditions.alpha @ rest.q
+    rates = [conditions.rates(i, x[i]) for i in range(len(conditions.sites))]
+    x[:, PEER_TORQUE] = conditions.alpha @ np.array([site.external + site.held for site in rates])
     return x
 
 
-def _on_arm(now: OperatingConditions, i: int, x: Array) -> Array:
-    found = now.rates(i, x)
-    torque: Array = found.acted + found.held
-    return torque
+def locate_states(conditions: OperatingConditions) -> list[slice]:
+    """Returns the places of every site's states in the loop's state."""
+    sizes = [STATE_SIZE if has_estimate(site) else QD.stop for site in conditions.sites]
+    return [slice(end - size, end) for size, end in zip(sizes, itertools.accumulate(sizes), strict=True)]
 
 
-def linearise_sites(now: OperatingConditions, rest: Equilibrium) -> list[LinearSite]:
+def linearise_sites(conditions: OperatingConditions, rest: Equilibrium) -> list[LinearSite]:
     """Returns every site, linearised by itself."""
-    x = gather_site_arguments(now, rest)
-    rows, first = [], 0
-    for i, site in enumerate(now.sites):
-        states = STATE_SIZE if has_estimate(site) else QD.stop
-        rows.append(
-            LinearSite(slice(first, first + states), slice(0, states), differentiate_site_rates(site, x[i]))
-        )
-        first += states
-    return rows
+    x = gather_site_arguments(conditions, rest)
+    return [
+        LinearSite(at, differentiate_site_rates(site, x[i]))
+        for i, (site, at) in enumerate(zip(conditions.sites, locate_states(conditions), strict=True))
+    ]
 
 
-def linearise_loop(now: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop under given conditions; see `linearised`."""
-    rows = linearise_sites(now, rest)
-    n, m = rows[-1].at.stop, JOINTS * len(rows)
-    A, B = np.zeros((n, n)), np.zeros((n, m))
-    for i, row in enumerate(rows):
-        A[_q(row), _qd(row)] = np.eye(JOINTS)
-        A[_fast(row), row.at] = row.fast[:, row.own]
-        B[_fast(row), _push(i)] = row.fast[:, EXTERNAL_TORQUE]
-    inputs, outputs = (
-        tuple(f"{name}.{y}{j + 1}" for name in now.names for j in range(JOINTS)) for y in _PORT
+def linearise_loop(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
+    """Returns the loop under given conditions, linearised at an equilibrium."""
+    sites = linearise_sites(conditions, rest)
+    n, m = sites[-1].at.stop, JOINTS * len(sites)
+    A, B, C = np.zeros((n, n)), np.zeros((n, m)), np.zeros((m, n))
+    for i, site in enumerate(sites):
+        A[site.q, site.qd] = np.eye(JOINTS)
+        A[site.dynamic, site.at] = site.dynamic_rates[:, site.own]
+        B[site.dynamic, _ports(i)] = site.dynamic_rates[:, EXTERNAL_TORQUE]
+        C[_ports(i), site.qd] = np.eye(JOINTS)
+    names = tuple(
+        f"{name}.{state}"
+        for name, site in zip(conditions.names, sites, strict=True)
+        for state in STATE_NAMES[site.own]
     )
-    C = np.zeros((m, n))
-    for i, row in enumerate(rows):
-        C[_push(i), _qd(row)] = np.eye(JOINTS)
-    return LinearLoop(_names(now), inputs, outputs, A, B, C, _delayed(now, rows, n, m))
+    inputs, outputs = (
+        tuple(f"{name}.{kind}{j + 1}" for name in conditions.names for j in range(JOINTS))
+        for kind in ("tau", "qd")
+    )
+    return LinearLoop(names, inputs, outputs, A, B, C, _delayed_terms(conditions, sites))
 
 
-_PORT = ("tau", "qd")
+def _delayed_terms(conditions: OperatingConditions, sites: list[LinearSite]) -> tuple[DelayedTerm, ...]:
+    """Returns the effect of the peers, one entry per distinct delay."""
+    n, m = sites[-1].at.stop, JOINTS * len(sites)
+    terms: dict[float, DelayedTerm] = {}
+    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
+        delay_s, share = float(conditions.age_s[i, j]), conditions.alpha[i, j]
+        term = terms.setdefault(delay_s, DelayedTerm(delay_s, np.zeros((n, n)), np.zeros((n, m))))
+        receiver, peer = sites[i], sites[j]
+        term.A[receiver.dynamic, peer.q] += share * receiver.dynamic_rates[:, Q_DES]
+        term.A[receiver.dynamic, peer.qd] += share * receiver.dynamic_rates[:, QD_DES]
+        reflected = share * receiver.dynamic_rates[:, PEER_TORQUE]
+        on_arm = peer.rates.external + peer.rates.held
+        term.A[receiver.dynamic, peer.at] += reflected @ on_arm[:, peer.own]
+        term.B[receiver.dynamic, _ports(int(j))] += reflected @ on_arm[:, EXTERNAL_TORQUE]
+    return tuple(terms[delay_s] for delay_s in sorted(terms))
 
 
-def _delayed(now: OperatingConditions, rows: list[LinearSite], n: int, m: int) -> tuple[DelayedTerm, ...]:
-    """Returns what comes from the peers, one entry per distinct delay."""
-    found: dict[float, DelayedTerm] = {}
-    for i, j in zip(*np.nonzero(now.alpha), strict=True):
-        delay_s, share = float(now.age_s[i, j]), now.alpha[i, j]
-        entry = found.setdefault(delay_s, DelayedTerm(delay_s, np.zeros((n, n)), np.zeros((n, m))))
-        receiver, peer = rows[i], rows[j]
-        entry.A[_fast(receiver), _q(peer)] += share * receiver.fast[:, Q_DES]
-        entry.A[_fast(receiver), _qd(peer)] += share * receiver.fast[:, QD_DES]
-        felt = share * receiver.fast[:, PEER_TORQUE]
-        on_arm = peer.rates.acted + peer.rates.held
-        entry.A[_fast(receiver), peer.at] += felt @ on_arm[:, peer.own]
-        entry.B[_fast(receiver), _push(int(j))] += felt @ on_arm[:, EXTERNAL_TORQUE]
-    return tuple(found[delay_s] for delay_s in sorted(found))
-
-
-def _q(row: LinearSite) -> slice:
-    return slice(row.at.start, row.at.start + JOINTS)
-
-
-def _qd(row: LinearSite) -> slice:
-    return slice(row.at.start + JOINTS, row.at.start + 2 * JOINTS)
-
-
-def _fast(row: LinearSite) -> slice:
-    return slice(row.at.start + JOINTS, row.at.stop)
-
-
-def _push(i: int) -> slice:
+def _ports(i: int) -> slice:
     return slice(JOINTS * i, JOINTS * (i + 1))
-
-
-def _names(now: OperatingConditions) -> tuple[str, ...]:
-    names = []
-    for site in now.sites:
-        states = [*(f"q{j + 1}" for j in range(JOINTS)), *(f"qd{j + 1}" for j in range(JOINTS))]
-        if has_estimate(site):
-            states += [f"theta{p + 1}" for p in range(PARAMETERS)]
-        names += [f"{site.name}.{state}" for state in states]
-    return tuple(names)

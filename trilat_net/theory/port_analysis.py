@@ -1,6 +1,4 @@
-"""Port analysis of a scenario's teleoperator.
-
-Passivity, absolute stability, transparency, also as JSON values.
+"""Port analysis of a scenario's teleoperator: passivity, absolute stability, transparency, also as JSON.
 
 Invariant: operators and environments are off, and their torque at the equilibrium stays as a constant, so
 that a held pose can be analysed too. An unstable loop has no steady oscillations: nothing but its
@@ -18,7 +16,6 @@ from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
-from ..errors import UsageError
 from ..scenario import Scenario
 from .delay_roots import compute_delay_spectrum
 from .frequency_search import (
@@ -44,7 +41,6 @@ from .port_passivity import (
 )
 from .port_response import (
     CLAMPED,
-    Complex,
     LoopOutput,
     PoleAtZero,
     PortResponse,
@@ -60,74 +56,51 @@ from .port_response import (
     select_ports,
     to_imaginary_axis,
 )
-from .port_transparency import QUOTED_AT_HZ, Transparency, measure_transparency
+from .port_transparency import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
 
 
-def freeze_external_torques(now: OperatingConditions, rest: Equilibrium) -> OperatingConditions:
-    """Returns the conditions with the torque of hands and environments held at what it is at the rest.
-
-    Args:
-        now: what the loop is made of.
-        rest: where it is linearised.
-    """
-    x = gather_site_arguments(now, rest)
+def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) -> OperatingConditions:
+    """Returns the conditions with the torque of operators and environments constant as at the equilibrium."""
+    x = gather_site_arguments(conditions, rest)
     sites = []
-    for i, site in enumerate(now.sites):
-        found = now.rates(i, x[i])
-        torque = tuple((found.acted + found.held).tolist())
-        sites.append(
-            site._replace(actors=(TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ())
-        )
-    return now._replace(sites=tuple(sites))
+    for i, site in enumerate(conditions.sites):
+        rates = conditions.rates(i, x[i])
+        torque = tuple((rates.external + rates.held).tolist())
+        constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
+        sites.append(site._replace(actors=constant))
+    return conditions._replace(sites=tuple(sites))
 
 
-def linearise_teleoperator(now: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop that hands and environments meet at their ports.
+def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
+    """Returns the loop at whose ports operators and environments act, without them."""
+    return linearise_loop(freeze_external_torques(conditions, rest), rest)
 
-    Args:
-        now: what the loop is made of.
-        rest: where it is linearised.
+
+def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> LoopOutput | None:
+    """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
+
+    None if a site has another law than the paper's, which has no r.
     """
-    return linearise_loop(freeze_external_torques(now, rest), rest)
-
-
-def build_proof_output(now: OperatingConditions, loop: LinearLoop) -> LoopOutput | None:
-    """Returns how r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10), is read off.
-
-    Args:
-        now: what the loop is made of.
-        loop: the loop.
-
-    Returns:
-        None where a site has another law than the paper's, which has no r.
-    """
-    if any(site.gains.law is not Law.ADAPTIVE for site in now.sites):
+    if any(site.gains.law is not Law.ADAPTIVE for site in conditions.sites):
         return None
-    C, late = (
-        loop.C.copy(),
-        {float(delay_s): np.zeros_like(loop.C) for delay_s in now.age_s[now.alpha != 0.0]},
-    )
-    for i, site in enumerate(now.sites):
+    C = loop.C.copy()
+    delays_s = conditions.age_s[conditions.alpha != 0.0]
+    delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
+    for i, site in enumerate(conditions.sites):
         for joint in range(JOINTS):
             row = JOINTS * i + joint
-            C[row, _angle(loop, site.name, joint)] += site.gains.Lambda[joint]
-            for j in np.flatnonzero(now.alpha[i]):
-                seen = site.gains.Lambda[joint] * now.alpha[i, j]
-                late[float(now.age_s[i, j])][row, _angle(loop, now.sites[j].name, joint)] -= seen
-    return LoopOutput(C, tuple(sorted(late.items())))
+            C[row, loop.names.index(f"{site.name}.q{joint + 1}")] += site.gains.Lambda[joint]
+            for j in np.flatnonzero(conditions.alpha[i]):
+                angle = loop.names.index(f"{conditions.sites[j].name}.q{joint + 1}")
+                factor = site.gains.Lambda[joint] * conditions.alpha[i, j]
+                delayed[float(conditions.age_s[i, j])][row, angle] -= factor
+    return LoopOutput(C, tuple(sorted(delayed.items())))
 
 
-def _angle(loop: LinearLoop, site: str, joint: int) -> int:
-    return loop.names.index(f"{site}.q{joint + 1}")
-
-
-def compute_proof_weights(now: OperatingConditions) -> Array:
-    """Returns beta_i = pi_i / c_i of the corrected proof (docs/errata.md), sum N, shape (N,).
-
-    Args:
-        now: what the loop is made of.
-    """
-    return compute_lyapunov_weights(now.alpha, np.array([site.gains.Kd for site in now.sites])).beta
+def compute_proof_weights(conditions: OperatingConditions) -> Array:
+    """Returns beta_i = pi_i / c_i of the corrected proof (docs/errata.md), sum N, shape (N,)."""
+    Kd = np.array([site.gains.Kd for site in conditions.sites])
+    return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
 class TwoPort(NamedTuple):
@@ -135,36 +108,37 @@ class TwoPort(NamedTuple):
 
     Attributes:
         sites: the two.
-        joint: which joint, from 1 on; no hand is at the other joints.
-        clamped: the third site, where it is clamped; "" where no hand is at it, or there is none.
-        dips: the parameter over frequency, and where it is below 1.
+        joint: the joint, from 1 on; no operator is at the other joints.
+        clamped: the third site if it is clamped; "" if it is free, or there is none.
+        minima: the parameter over frequency, and the bands where it is below 1.
     """
 
     sites: tuple[str, str]
     joint: int
     clamped: str
-    dips: Minima
+    minima: Minima
 
 
 class PortAnalysis(NamedTuple):
-    """What is said of the ports of a teleoperator: hands and environments are off.
+    """The ports of a teleoperator, operators and environments off.
 
     Attributes:
         sites: of the ports.
-        band_hz: what was looked at, Hz.
-        resolved_hz: up to where the phase of the delays was, Hz.
+        band_hz: the analysed band, Hz.
+        resolved_hz: the frequency up to which the grid follows the phase of the delays, Hz.
         verdict: of its roots: "stable", "unstable" or "at the edge".
-        pole: what the admittance does where the frequency goes to zero.
-        velocity: whether it is passive at all ports, hands being so with respect to qd.
-        joints: the same for each joint alone, no hand being at the others.
-        proof: whether it is passive with respect to r = qd + Lambda e; None where the law has no r.
+        pole: the pole of the admittance at zero frequency.
+        velocity: passivity at all ports with respect to qd.
+        joints: the same for each joint alone, no operator at the others.
+        proof: passivity with respect to r = qd + Lambda e; None if the law has no r.
         beta: the weights of the sites in that, shape (N,), sum N.
-        true: whether all estimates at the rest are the truth; where not, the proof counts what they store,
-            which a linear loop cannot show.
-        absolute: the least eigenvalue under the best weights; stable with any hands where not negative.
+        estimates_true: True if all estimates at the equilibrium are true; otherwise the proof counts the
+            energy that they store, which a linear loop cannot show.
+        absolute: the least eigenvalue under the best weights; stable with any passive operators where it is
+            not negative.
         two_ports: Llewellyn's criterion for every pair of sites.
-        felt: what a hand at each site feels of one other site.
-        clamped_verdict: of the roots where that other site is clamped.
+        transparency: at each site, with one other site free and clamped.
+        clamped_verdict: of the roots with that other site clamped.
     """
 
     sites: tuple[str, ...]
@@ -176,10 +150,10 @@ class PortAnalysis(NamedTuple):
     joints: dict[int, Passivity]
     proof: Passivity | None
     beta: Array
-    true: bool
+    estimates_true: bool
     absolute: Minima
     two_ports: tuple[TwoPort, ...]
-    felt: tuple[Transparency, ...]
+    transparency: tuple[Transparency, ...]
     clamped_verdict: str
 
 
@@ -189,34 +163,32 @@ def analyse_ports(
     of: str | None = None,
     band_hz: tuple[float, float] = (LOW_HZ, HIGH_HZ),
 ) -> PortAnalysis:
-    """Returns what there is to say of a scenario's ports at a rest.
+    """Returns the analysis of a scenario's ports at an equilibrium.
 
     Args:
         scenario: the experiment.
-        rest: where it is linearised.
-        of: the site that hands at the others feel; None: the slave, or the last one where there is none.
-        band_hz: what is looked at, Hz.
+        rest: the equilibrium.
+        of: the site that is free and clamped for the others' transparency; None: the slave, or the last.
+        band_hz: the analysed band, Hz.
 
     Raises:
         ScenarioError: the scenario has no linear loop.
         UsageError: no site of that name, or an empty band.
     """
-    if not 0.0 < band_hz[0] < band_hz[1]:
-        raise UsageError(
-            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
-        )
-    now = derive_operating_conditions(scenario)
-    loop = linearise_teleoperator(now, rest)
-    of = _slave(scenario) if of is None else of
+    check_band(band_hz)
+    conditions = derive_operating_conditions(scenario)
+    loop = linearise_teleoperator(conditions, rest)
+    slaves = [name for name, site in scenario.sites.items() if site.role == "slave"]
+    of = of or (*slaves, scenario.names[-1])[0]
+    sites, delay_s = list_port_sites(loop), find_longest_delay_s(loop)
     Y = build_admittance(loop)
-    w_rad_s = refine_frequencies(Y, build_frequency_grid(*band_hz, find_longest_delay_s(loop)))
+    w_rad_s = refine_frequencies(Y, build_frequency_grid(*band_hz, delay_s))
     Y = cache_response(Y, w_rad_s)
-    owner = np.array([list_port_sites(loop).index(parse_port_site(port)) for port in loop.inputs])
-    hands = [site for site in list_port_sites(loop) if site != of]
+    owner = np.array([sites.index(parse_port_site(port)) for port in loop.inputs])
     return PortAnalysis(
-        sites=list_port_sites(loop),
+        sites=sites,
         band_hz=band_hz,
-        resolved_hz=find_resolved_hz(*band_hz, find_longest_delay_s(loop)),
+        resolved_hz=find_resolved_hz(*band_hz, delay_s),
         verdict=compute_delay_spectrum(loop, 1).verdict,
         pole=find_pole_at_zero(loop),
         velocity=check_passivity(Y, w_rad_s),
@@ -224,100 +196,92 @@ def analyse_ports(
             joint: check_passivity(select_ports(Y, places), w_rad_s)
             for joint, places in group_ports_by_joint(loop).items()
         },
-        proof=_proof(now, loop, w_rad_s),
-        beta=compute_proof_weights(now),
-        true=all(np.allclose(own, site.theta) for own, site in zip(rest.theta_hat, now.sites, strict=True)),
+        proof=_check_proof(conditions, loop, w_rad_s),
+        beta=compute_proof_weights(conditions),
+        estimates_true=all(
+            np.allclose(own, site.theta) for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
+        ),
         absolute=find_minima(
             lambda w: find_best_weights(Y(w), owner).margin,
             w_rad_s,
             tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
         ),
-        two_ports=_two_ports(loop, Y, w_rad_s),
-        felt=tuple(one for site in hands for one in measure_transparency(loop, site, of)),
+        two_ports=_check_two_ports(loop, Y, w_rad_s),
+        transparency=tuple(
+            one for site in sites if site != of for one in measure_transparency(loop, site, of)
+        ),
         clamped_verdict=compute_delay_spectrum(apply_loads(loop, {of: CLAMPED}), 1).verdict,
     )
 
 
-def _slave(scenario: Scenario) -> str:
-    return next((name for name, site in scenario.sites.items() if site.role == "slave"), scenario.names[-1])
-
-
-def _proof(now: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
-    output = build_proof_output(now, loop)
-    beta = np.repeat(
-        compute_proof_weights(now), [len(find_site_ports(loop, site)) for site in list_port_sites(loop)]
-    )
+def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
+    output = build_proof_output(conditions, loop)
+    beta = np.repeat(compute_proof_weights(conditions), JOINTS)
     if output is None or not (beta > 0.0).all():
         return None
     return check_passivity(lambda w: evaluate_transfer(loop, to_imaginary_axis(w), output), w_rad_s, beta)
 
 
-def _two_ports(loop: LinearLoop, Y: PortResponse, w_rad_s: Array) -> tuple[TwoPort, ...]:
-    found = []
+def _check_two_ports(loop: LinearLoop, Y: PortResponse, w_rad_s: Array) -> tuple[TwoPort, ...]:
+    two_ports = []
     for pair in combinations(list_port_sites(loop), 2):
         others = [site for site in list_port_sites(loop) if site not in pair]
         for clamped in ("", *others) if len(others) == 1 else ("",):
-            places = find_site_ports(loop, clamped) if clamped else []
-            for joint, keep in group_ports_by_joint(loop).items():
-                kept = [port for port in keep if parse_port_site(loop.inputs[port]) in pair]
-                found.append(TwoPort(pair, joint, clamped, _llewellyn(Y, kept, places, w_rad_s)))
-    return tuple(found)
+            fixed = find_site_ports(loop, clamped) if clamped else []
+            for joint, places in group_ports_by_joint(loop).items():
+                keep = [port for port in places if parse_port_site(loop.inputs[port]) in pair]
+                two_ports.append(TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s)))
+    return tuple(two_ports)
 
 
-def _llewellyn(Y: PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array) -> Minima:
-    def left(w: Array) -> Complex:
-        return clamp_ports(Y(w), keep, clamped)
-
+def _check_llewellyn(Y: PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array) -> Minima:
     return find_minima(
-        lambda w: llewellyn_parameter(left(w)),
+        lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
         w_rad_s,
         level=1.0,
-        tolerance=lambda w: llewellyn_rounding(left(w)),
+        tolerance=lambda w: llewellyn_rounding(clamp_ports(Y(w), keep, clamped)),
     )
 
 
-def ports_to_json(section: PortAnalysis) -> dict[str, Any]:
-    """Returns the section as plain values, as for JSON; infinite numbers are None.
-
-    Args:
-        section: what there is to say.
-    """
+def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
+    """Returns a port analysis as plain values; infinite numbers are None."""
     return {
-        "sites": list(section.sites),
-        "band_hz": list(section.band_hz),
-        "resolved_hz": section.resolved_hz,
-        "roots": section.verdict,
-        "pole_at_zero": {"order": section.pole.order, "passive": section.pole.passive},
-        "passive_qd": _passivity_facts(section.velocity),
-        "passive_qd_of_joint": {str(joint): _passivity_facts(one) for joint, one in section.joints.items()},
-        "passive_r": None if section.proof is None else _passivity_facts(section.proof),
-        "beta": section.beta.tolist(),
-        "estimates_true": section.true,
-        "absolute": _dips_facts(section.absolute),
+        "sites": list(ports.sites),
+        "band_hz": list(ports.band_hz),
+        "resolved_hz": ports.resolved_hz,
+        "roots": ports.verdict,
+        "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
+        "passive_qd": _passivity_to_json(ports.velocity),
+        "passive_qd_of_joint": {str(joint): _passivity_to_json(one) for joint, one in ports.joints.items()},
+        "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
+        "beta": ports.beta.tolist(),
+        "estimates_true": ports.estimates_true,
+        "absolute": _minima_to_json(ports.absolute),
         "llewellyn": [
-            {"sites": list(one.sites), "joint": one.joint, "clamped": one.clamped, **_dips_facts(one.dips)}
-            for one in section.two_ports
+            {"sites": list(one.sites), "joint": one.joint, "clamped": one.clamped}
+            | _minima_to_json(one.minima)
+            for one in ports.two_ports
         ],
-        "roots_clamped": section.clamped_verdict,
-        "felt": [_felt_facts(one) for one in section.felt],
+        "roots_clamped": ports.clamped_verdict,
+        "felt": [_transparency_to_json(one) for one in ports.transparency],
     }
 
 
-def _passivity_facts(one: Passivity) -> dict[str, Any]:
+def _passivity_to_json(one: Passivity) -> dict[str, Any]:
     lacking = one.lacking_nm_s_rad
-    return {**_dips_facts(one.dips), "lacking_nm_s_rad": lacking if math.isfinite(lacking) else None}
+    return {**_minima_to_json(one.minima), "lacking_nm_s_rad": lacking if math.isfinite(lacking) else None}
 
 
-def _dips_facts(one: Minima) -> dict[str, Any]:
+def _minima_to_json(one: Minima) -> dict[str, Any]:
     return {
         "holds": not one.below,
         "least": one.least,
         "least_hz": one.least_hz,
-        "fails_hz": [list(span) for span in one.below],
+        "fails_hz": [list(band) for band in one.below],
     }
 
 
-def _felt_facts(one: Transparency) -> dict[str, Any]:
+def _transparency_to_json(one: Transparency) -> dict[str, Any]:
     free, clamped = one.size_at(QUOTED_AT_HZ)
     return {
         "at": one.at,

@@ -20,33 +20,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
+from .characteristic_roots import Complex
 from .frequency_search import Minima, find_minima
-from .port_response import Complex, PortResponse, invert_response
+from .port_response import PortResponse
 
 EIGENVALUE_ROUNDING = 1e-8
-"""Of the answer's size: eigenvalues that are negative by less are zero but for rounding."""
-_FURTHER = 4.0
+"""Negative eigenvalues smaller than this, relative to the response, are zero but for rounding."""
+MAX_LLEWELLYN = 1e6
+"""Largest value of Llewellyn's parameter."""
+_LOW_BAND = 4.0
+"""Ratio of frequencies over which a lack of damping that grows without bound would double."""
+_LOG_REACH = 12.0
+"""Logarithm of the largest ratio of two weights."""
+_MAX_ROUNDS = 400
+_WEIGHT_TOLERANCE = 1e-3
 
 
 class Passivity(NamedTuple):
-    """The outcome for one set of ports.
+    """Passivity at one set of ports.
 
     Attributes:
-        dips: the least eigenvalue over frequency, rad/s per N m, and where it is negative.
+        minima: the least eigenvalue of Y + Y^H over frequency, rad/s per N m, and the bands where it is
+            negative.
         size: the largest singular value of Y there, shape (F,), rad/s per N m: eigenvalues of Y + Y^H lie
             within twice that.
         lacking_nm_s_rad: the damping that, added at each of the joints, would make it passive, N m s/rad; inf
-            where what is lacking grows without end towards the lowest frequencies.
+            if it grows without bound towards the lowest frequencies.
     """
 
-    dips: Minima
+    minima: Minima
     size: Array
     lacking_nm_s_rad: float
 
     @property
     def passive(self) -> bool:
-        """True where no frequency of the grid has a negative eigenvalue."""
-        return not self.dips.below
+        """True if no frequency of the grid has a negative eigenvalue."""
+        return not self.minima.below
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
@@ -70,31 +79,31 @@ def find_least_eigenvalue(Y: Complex) -> Array:
 def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
     """Returns the least b >= 0 with which (Y^-1 + b)^-1 is passive, N m s/rad.
 
-    A damper b at every port adds b to the impedance Z = Y^-1, and Z + Z^H + 2 b >= 0 is the same question.
-    An integrator in the law can make Z ~ -K / w^2, a damping that is negative and without bound: then no b
-    will do.
+    A damper b at every port adds b to the impedance Z = Y^-1, and Z + Z^H + 2 b >= 0 is the same condition.
+    An integrator in the law can make Z ~ -K / w^2, a negative damping without bound: then no b suffices,
+    and the result is inf.
 
     Args:
         Y: shape (F, p, p), rad/s per N m.
         w_rad_s: rising frequencies, shape (F,).
     """
-    lacking = -0.5 * find_least_eigenvalue(invert_response(Y))
-    further = float(np.interp(_FURTHER * w_rad_s[0], w_rad_s, lacking))
+    lacking = -0.5 * find_least_eigenvalue(np.linalg.inv(Y).astype(np.complex128))
+    further = float(np.interp(_LOW_BAND * w_rad_s[0], w_rad_s, lacking))
     if lacking[0] > 0.0 and lacking[0] > 2.0 * further:
         return np.inf
     return max(0.0, float(lacking.max()))
 
 
 def check_passivity(response: PortResponse, w_rad_s: Array, weights: Array | None = None) -> Passivity:
-    """Returns whether a loop is passive at some ports, as far as a grid of frequencies can tell.
+    """Returns the passivity at some ports, as far as a grid of frequencies shows.
 
     Args:
         response: velocities per torque, or another output of as many entries.
-        w_rad_s: frequencies to begin with, shape (F,).
+        w_rad_s: first frequencies, shape (F,).
         weights: of the ports, positive, shape (p,); None: all one, which makes it energy.
     """
 
-    def scaled(w: Array) -> Complex:
+    def weighted(w: Array) -> Complex:
         Y = response(w)
         return Y if weights is None else weight_response(Y, weights)
 
@@ -102,56 +111,38 @@ def check_passivity(response: PortResponse, w_rad_s: Array, weights: Array | Non
         size: Array = EIGENVALUE_ROUNDING * np.linalg.norm(response(w), axis=(1, 2))
         return size
 
-    found = find_minima(lambda w: find_least_eigenvalue(scaled(w)), w_rad_s, tolerance=tolerance)
-    Y = scaled(found.w_rad_s)
+    minima = find_minima(lambda w: find_least_eigenvalue(weighted(w)), w_rad_s, tolerance=tolerance)
+    Y = weighted(minima.w_rad_s)
     size = np.asarray(np.linalg.norm(Y, 2, axis=(1, 2)), dtype=np.float64)
-    return Passivity(found, size, find_lacking_damping(Y, found.w_rad_s) if found.below else 0.0)
-
-
-MAX_LLEWELLYN = 1e6
-"""Greatest value of Llewellyn's parameter."""
-_REACH = 12.0
-"""Logarithm of the largest ratio of two weights."""
-_TURNS = 400
-_CLOSE = 1e-3
+    return Passivity(minima, size, find_lacking_damping(Y, minima.w_rad_s) if minima.below else 0.0)
 
 
 def llewellyn_parameter(Y: Complex) -> Array:
     """Returns Llewellyn's stability parameter, shape (F,); at least 1 where the criterion holds.
 
-    2 Re y11 Re y22 - Re(y12 y21) over abs(y12 y21), but at most `MOST`, which stands for a two-port through
-    which nothing passes, and at most -1 where Re y11 or Re y22 is negative.
+    2 Re y11 Re y22 - Re(y12 y21) over abs(y12 y21), but at most `MAX_LLEWELLYN`, which stands for a two-port
+    without transmission, and at most -1 where Re y11 or Re y22 is negative.
 
     Args:
         Y: admittance of two scalar ports, shape (F, 2, 2).
     """
     y11, y22, through = Y[:, 0, 0].real, Y[:, 1, 1].real, Y[:, 0, 1] * Y[:, 1, 0]
-    own = np.linalg.norm(Y, axis=(1, 2))
-    size = np.maximum(np.abs(through), 1e-30 * own**2)
+    norm = np.linalg.norm(Y, axis=(1, 2))
+    size = np.maximum(np.abs(through), 1e-30 * norm**2)
     parameter: Array = np.minimum((2.0 * y11 * y22 - through.real) / size, MAX_LLEWELLYN)
-    active = (y11 < -EIGENVALUE_ROUNDING * own) | (y22 < -EIGENVALUE_ROUNDING * own)
+    active = (y11 < -EIGENVALUE_ROUNDING * norm) | (y22 < -EIGENVALUE_ROUNDING * norm)
     return np.where(active, np.minimum(parameter, -1.0), parameter)
 
 
 def llewellyn_rounding(Y: Complex) -> Array:
-    """Returns by how much rounding may change the parameter, shape (F,): much where next to nothing passes.
-
-    Args:
-        Y: as of `llewellyn`.
-    """
-    through, own = np.abs(Y[:, 0, 1] * Y[:, 1, 0]), np.linalg.norm(Y, axis=(1, 2))
-    amount: Array = EIGENVALUE_ROUNDING + 1e-12 * own**2 / np.maximum(through, 1e-30 * own**2)
+    """Returns the rounding error of the parameter, shape (F,): large if there is next to no transmission."""
+    through, norm = np.abs(Y[:, 0, 1] * Y[:, 1, 0]), np.linalg.norm(Y, axis=(1, 2))
+    amount: Array = EIGENVALUE_ROUNDING + 1e-12 * norm**2 / np.maximum(through, 1e-30 * norm**2)
     return amount
 
 
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
-    """Returns the admittance at some ports while others are clamped, and hands are off the rest.
-
-    Args:
-        Y: shape (F, p, p).
-        keep: ports that hands hold.
-        clamped: ports that cannot move.
-    """
+    """Returns the admittance at the ports `keep` with others clamped and no operator at the rest."""
     kept: Complex = Y[:, keep][:, :, keep]
     if not clamped:
         return kept
@@ -161,11 +152,11 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
 
 
 class BestWeights(NamedTuple):
-    """The best that weights can do.
+    """The weights of the sites with the largest margin.
 
     Attributes:
         margin: least eigenvalue of Y + Y^H, each site's part scaled to size 1, with the best weights,
-            dimensionless, shape (F,); negative where no weights will do.
+            dimensionless, shape (F,); negative if no weights suffice.
         weights: those weights, of the first site 1, shape (F, N).
     """
 
@@ -183,39 +174,32 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
         Y: admittance, shape (F, p, p).
         owner: the site of each port, from 0 on, shape (p,).
     """
-    scaled = _sized(Y, owner)
+    scaled = _scale_sites(Y, owner)
     count, free = len(Y), int(owner.max())
     centre, best = np.zeros((count, free)), np.zeros((count, free))
-    shape = np.broadcast_to(_REACH**2 * free * np.eye(free), (count, free, free)).copy()
+    shape = np.broadcast_to(_LOG_REACH**2 * free * np.eye(free), (count, free, free)).copy()
     margin = np.full(count, -np.inf)
-    going = np.arange(count)
-    for _ in range(_TURNS):
-        value, slope = _value_and_slope(scaled[going], centre[going], owner)
-        better = value > margin[going]
-        margin[going[better]], best[going[better]] = value[better], centre[going[better]]
-        along = np.einsum("fij,fj->fi", shape[going], slope)
-        reach = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, along), 0.0))
-        # what is left to gain is at most `reach`
-        more = reach > _CLOSE * np.maximum(np.abs(margin[going]), 1e-6)
-        going, along = going[more], (along[more] / reach[more, np.newaxis])
-        if not len(going) or free == 0:
+    active = np.arange(count)
+    for _ in range(_MAX_ROUNDS):
+        value, slope = _value_and_slope(scaled[active], centre[active], owner)
+        better = value > margin[active]
+        margin[active[better]], best[active[better]] = value[better], centre[active[better]]
+        along = np.einsum("fij,fj->fi", shape[active], slope)
+        gain = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, along), 0.0))  # at most
+        more = gain > _WEIGHT_TOLERANCE * np.maximum(np.abs(margin[active]), 1e-6)
+        active, along = active[more], (along[more] / gain[more, np.newaxis])
+        if not len(active) or free == 0:
             break
-        centre[going] += along / (free + 1.0)
-        shape[going] = _halved(shape[going], along, free)
-    logs = np.concatenate([np.zeros((count, 1)), best], axis=1)
-    return BestWeights(margin, np.exp(logs))
+        centre[active] += along / (free + 1.0)
+        if free == 1:
+            shape[active] /= 4.0
+        else:
+            outer = along[:, :, np.newaxis] * along[:, np.newaxis, :]
+            shape[active] = free**2 / (free**2 - 1.0) * (shape[active] - 2.0 / (free + 1.0) * outer)
+    return BestWeights(margin, np.exp(np.concatenate([np.zeros((count, 1)), best], axis=1)))
 
 
-def _halved(shape: Array, along: Array, free: int) -> Array:
-    """Returns the least ellipsoids about the better halves of some."""
-    if free == 1:
-        return shape / 4.0
-    outer = along[:, :, np.newaxis] * along[:, np.newaxis, :]
-    grown: Array = free**2 / (free**2 - 1.0) * (shape - 2.0 / (free + 1.0) * outer)
-    return grown
-
-
-def _sized(Y: Complex, owner: NDArray[np.int64]) -> Complex:
+def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
     """Returns Y with each site's rows and columns divided by the root of the size of its own part."""
     size = np.ones(Y.shape[:2])
     for site in range(int(owner.max()) + 1):

@@ -1,4 +1,4 @@
-"""Transparency: the impedance that an operator at one site feels of a free and of a clamped other site.
+"""Transparency: the impedance at one site's ports with another site free and clamped.
 
 Invariant: an impedance is along one joint, torque over velocity, N m s/rad, with no torque of the operator on
 the other joints. Z-widths are ratios on a logarithmic frequency axis, in dB over a named band.
@@ -17,36 +17,28 @@ import numpy as np
 
 from ..core.vectors import Array
 from ..errors import UsageError
+from .characteristic_roots import Complex
 from .linear_loop import LinearLoop
-from .port_response import (
-    CLAMPED,
-    FREE,
-    Complex,
-    PortLoad,
-    apply_loads,
-    build_admittance,
-    find_site_ports,
-    invert_response,
-    list_port_sites,
-)
+from .port_response import CLAMPED, FREE, PortLoad, apply_loads, build_admittance, find_site_ports
 
 Z_WIDTH_BAND_HZ = (0.1, 10.0)
-"""The band of Z-widths: below it hands drift, above it they do not move on purpose."""
+"""The band of Z-widths: below it operators drift, above it they do not move deliberately."""
+QUOTED_AT_HZ = 1.0
 _SHOWN_HZ = (0.01, 100.0)
 _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """What a hand feels along one joint, the other site free and clamped.
+    """Impedance along one joint at an operator's site, another site free and clamped.
 
     Attributes:
-        at: the site of the hand.
+        at: the operator's site.
         of: the site that is free or clamped.
-        joint: which joint of the hand's site, from 1 on.
+        joint: the joint of the operator's site, from 1 on.
         w_rad_s: frequencies, shape (F,).
-        free: impedance with nothing at the other site, shape (F,), N m s/rad.
+        free: impedance with the other site free, shape (F,), N m s/rad.
         clamped: impedance with the other site clamped, shape (F,), N m s/rad.
-        band_hz: what the means are over, Hz.
+        band_hz: the band of the means, Hz.
     """
 
     at: str
@@ -59,12 +51,12 @@ class Transparency(NamedTuple):
 
     @property
     def softest_nm_s_rad(self) -> float:
-        """Mean of the free impedance's size over the band, both on logarithmic axes."""
+        """Mean size of the free impedance over the band, on logarithmic axes."""
         return self._mean(self.free)
 
     @property
     def stiffest_nm_s_rad(self) -> float:
-        """Mean of the clamped impedance's size over the band, both on logarithmic axes."""
+        """Mean size of the clamped impedance over the band, on logarithmic axes."""
         return self._mean(self.clamped)
 
     @property
@@ -74,8 +66,7 @@ class Transparency(NamedTuple):
 
     def size_at(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the sizes of the free and the clamped impedance at a frequency, N m s/rad."""
-        x = np.log(self.w_rad_s)
-        at = np.log(2.0 * np.pi * frequency_hz)
+        x, at = np.log(self.w_rad_s), np.log(2.0 * np.pi * frequency_hz)
         free, clamped = (
             float(np.exp(np.interp(at, x, np.log(np.abs(Z))))) for Z in (self.free, self.clamped)
         )
@@ -91,30 +82,23 @@ class Transparency(NamedTuple):
 def compute_transmitted_impedance(
     loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array
 ) -> Complex:
-    """Returns the impedance matrix that a hand at a site feels, shape (F, 2, 2), N m s/rad.
+    """Returns the impedance matrix at a site, shape (F, 2, 2), N m s/rad.
 
-    Z_t(j w) = Y_ii(j w)^{-1}, Y being that of the loop with the loads at the other sites.
-
-    Args:
-        loop: the teleoperator.
-        site: where the hand is.
-        loads: of the other sites; those that are not named are free.
-        w_rad_s: frequencies, shape (F,).
+    Z_t(j w) = Y_ii(j w)^{-1} with Y of the loop with loads at the other sites; sites without a load are free.
 
     Raises:
-        UsageError: no such site, or a load that cannot be.
+        UsageError: no such site, or a load that is not valid.
     """
-    return invert_response(_at_site(loop, site, loads, w_rad_s))
+    return np.linalg.inv(_site_admittance(loop, site, loads, w_rad_s)).astype(np.complex128)
 
 
-def _at_site(loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array) -> Complex:
-    if site not in list_port_sites(loop):
-        raise UsageError(f"no site {site!r} at the ports; there are {', '.join(list_port_sites(loop))}")
+def _site_admittance(loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array) -> Complex:
+    find_site_ports(loop, site)
     if site in loads:
-        raise UsageError(f"a load at {site} would stand where the hand is that feels")
-    held = apply_loads(loop, loads)
-    places = find_site_ports(held, site)
-    return build_admittance(held)(w_rad_s)[:, places][:, :, places]
+        raise UsageError(f"a load at {site} would be at the operator's own site")
+    loaded = apply_loads(loop, loads)
+    places = find_site_ports(loaded, site)
+    return build_admittance(loaded)(w_rad_s)[:, places][:, :, places]
 
 
 def measure_transparency(
@@ -124,26 +108,25 @@ def measure_transparency(
     others: Mapping[str, PortLoad] | None = None,
     band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ,
 ) -> tuple[Transparency, ...]:
-    """Returns what a hand feels along each joint of its site, another site being free and clamped.
+    """Returns the transparency along each joint of a site, with another site free and clamped.
 
     Args:
         loop: the teleoperator.
-        at: the site of the hand.
+        at: the operator's site.
         of: the site that is free or clamped.
-        others: what holds the rest; free where not named.
-        band_hz: what the means are over, Hz.
+        others: loads at the rest; free if not named.
+        band_hz: the band of the means, Hz.
 
     Raises:
         UsageError: no such site, both are one, or the band is empty.
     """
-    if not 0.0 < band_hz[0] < band_hz[1]:
-        raise UsageError(
-            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
-        )
+    check_band(band_hz)
     low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
     w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
-    free, clamped = (_at_site(loop, at, {**(others or {}), of: load}, w_rad_s) for load in (FREE, CLAMPED))
+    free, clamped = (
+        _site_admittance(loop, at, {**(others or {}), of: load}, w_rad_s) for load in (FREE, CLAMPED)
+    )
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in find_site_ports(loop, at)]
     return tuple(
         Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)
@@ -151,4 +134,9 @@ def measure_transparency(
     )
 
 
-QUOTED_AT_HZ = 1.0
+def check_band(band_hz: tuple[float, float]) -> None:
+    """Raises UsageError unless a band goes from a positive frequency to a higher one."""
+    if not 0.0 < band_hz[0] < band_hz[1]:
+        raise UsageError(
+            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
+        )

@@ -15,41 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 Numbers = NDArray[Any]
-"""Real numbers, or complex ones where a derivative is asked for."""
+"""Real numbers, or complex ones for a derivative by complex step."""
 
 
 def inertia_matrix(theta: Numbers, q: Numbers) -> Numbers:
-    """Returns M(q), shape (2, 2, ...), kg m^2.
-
-    Args:
-        theta: parameters, shape (5, ...).
-        q: joint angles, shape (2, ...), rad.
-    """
-    across = theta[2] + theta[1] * np.cos(q[1])
+    """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
+    coupling = theta[2] + theta[1] * np.cos(q[1])
     inner = theta[0] + 2.0 * theta[1] * np.cos(q[1])
-    return np.array([[inner, across], [across, theta[2] + 0.0 * across]])
+    return np.array([[inner, coupling], [coupling, theta[2] + 0.0 * coupling]])
 
 
 def coriolis_matrix(theta: Numbers, q: Numbers, qd: Numbers) -> Numbers:
-    """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s.
-
-    Args:
-        theta: parameters, shape (5, ...).
-        q: joint angles, shape (2, ...), rad.
-        qd: joint velocities, shape (2, ...), rad/s.
-    """
+    """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
     h = -theta[1] * np.sin(q[1])
     return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
 
 
 def gravity_torque(theta: Numbers, g: float, q: Numbers) -> Numbers:
-    """Returns G(q), shape (2, ...), N m.
-
-    Args:
-        theta: parameters, shape (5, ...).
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, shape (2, ...), rad.
-    """
+    """Returns G(q), shape (2, ...), N m."""
     outer = theta[4] * g * np.cos(q[0] + q[1])
     return np.array([theta[3] * g * np.cos(q[0]) + outer, outer])
 
@@ -72,32 +55,28 @@ def required_torque(theta: Numbers, g: float, q: Numbers, qd: Numbers, v: Number
 
 def regressor_matrix(g: float, q: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
     """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque that theta = e_p needs."""
-    ones = np.ones(q.shape[1:])
-    units = np.multiply.outer(np.eye(5), ones)
-    columns = [required_torque(unit, g, q, qd, v, a) for unit in units]
-    return np.stack(columns, axis=1)
+    units = np.multiply.outer(np.eye(5), np.ones(q.shape[1:]))
+    return np.stack([required_torque(unit, g, q, qd, v, a) for unit in units], axis=1)
 
 
 def joint_acceleration(theta: Numbers, g: float, q: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
     """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
-    rest = required_torque(theta, g, q, qd, qd, np.zeros_like(qd))
+    at_no_acceleration = required_torque(theta, g, q, qd, qd, np.zeros_like(qd))
     M = np.moveaxis(inertia_matrix(theta, q), (0, 1), (-2, -1))
-    force = np.moveaxis(torque - rest, 0, -1)[..., np.newaxis]
+    force = np.moveaxis(torque - at_no_acceleration, 0, -1)[..., np.newaxis]
     return np.moveaxis(np.linalg.solve(M, force)[..., 0], -1, 0)
 
 
 def end_effector_position(lengths_m: tuple[float, float], q: Numbers) -> Numbers:
-    """Returns where the tip is, shape (2, ...), m, the base at the origin."""
+    """Returns the position of the end effector, shape (2, ...), m, from the base."""
     l1_m, l2_m = lengths_m
-    turned = q[0] + q[1]
-    return np.array(
-        [l1_m * np.cos(q[0]) + l2_m * np.cos(turned), l1_m * np.sin(q[0]) + l2_m * np.sin(turned)]
-    )
+    q12 = q[0] + q[1]
+    return np.array([l1_m * np.cos(q[0]) + l2_m * np.cos(q12), l1_m * np.sin(q[0]) + l2_m * np.sin(q12)])
 
 
 def position_jacobian(lengths_m: tuple[float, float], q: Numbers) -> Numbers:
-    """Returns how the tip moves with the joints, shape (2, 2, ...), m/rad: rows x and y."""
+    """Returns the Jacobian of the end effector's position, shape (2, 2, ...), m/rad: rows x and y."""
     l1_m, l2_m = lengths_m
-    turned = q[0] + q[1]
-    s, c = l2_m * np.sin(turned), l2_m * np.cos(turned)
+    q12 = q[0] + q[1]
+    s, c = l2_m * np.sin(q12), l2_m * np.cos(q12)
     return np.array([[-l1_m * np.sin(q[0]) - s, -s], [l1_m * np.cos(q[0]) + c, c]])

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm
 
 from ..core.site_setup import Scheme, SiteSetup
 from ..core.two_link_arm import JOINTS, PARAMETERS
@@ -31,7 +32,7 @@ from .characteristic_roots import (
     select_moving_states,
     sort_root_guesses,
 )
-from .linear_loop import linearise_sites
+from .linear_loop import STATE_NAMES, linearise_sites
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
     ARGUMENT_COUNT,
@@ -45,60 +46,35 @@ from .site_dynamics import (
     has_estimate,
 )
 
-_ORDER = 13
-_LARGEST = 5.371920351148152
-"""Up to this 1-norm the approximant of order 13 is exact to rounding."""
-
-
-def matrix_exponential(matrix: Array) -> Array:
-    """Returns exp(matrix), shape (n, n)."""
-    size = float(np.abs(matrix).sum(axis=0).max()) if matrix.size else 0.0
-    halvings = max(0, math.ceil(math.log2(size / _LARGEST))) if size > _LARGEST else 0
-    scaled = matrix / 2.0**halvings
-    above, below = np.zeros_like(scaled), np.zeros_like(scaled)
-    power: Array = np.eye(len(scaled), dtype=np.float64)
-    for k in range(_ORDER + 1):
-        weight = math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER)
-        above += weight * power
-        below += (-1.0) ** k * weight * power
-        power = (power @ scaled).astype(np.float64)
-    found = np.linalg.solve(below, above)
-    for _ in range(halvings):
-        found = found @ found
-    return found.astype(np.float64)
+ARM_STATE = slice(Q.start, QD.stop)
+"""Angles and velocities, in a site's arguments and in its X alike."""
+PEER_INPUT = slice(Q_DES.start, PEER_TORQUE.stop)
+"""A site's inputs from its peers, among its arguments: q_id, its derivative, peer torque."""
+PEER_INPUT_SIZE = PEER_INPUT.stop - PEER_INPUT.start
+MAX_COMPANION_SIZE = 600
+"""The largest companion matrix whose eigenvalues are computed; beyond it Newton's method starts from the
+continuous roots."""
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
-    """Returns exp(A h) and int_0^h exp(A s) ds B: what x' = A x + B u comes to under a held u.
+    """Returns exp(A h) and int_0^h exp(A s) ds B: x' = A x + B u over a period h, s, with u held.
 
     Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23 (1978).
-
-    Args:
-        A: shape (n, n), 1/s.
-        B: shape (n, m).
-        h_s: the period, s.
     """
     n, m = B.shape
     whole = np.zeros((n + m, n + m))
     whole[:n, :n], whole[:n, n:] = A * h_s, B * h_s
-    found = matrix_exponential(whole)
-    return found[:n, :n], found[:n, n:]
-
-
-ARM_STATE = slice(Q.start, QD.stop)
-"""Angles and velocities, in a site's arguments and in its X alike."""
-PEER_INPUT = slice(Q_DES.start, PEER_TORQUE.stop)
-"""What a site hears of its peers, among its arguments: q_id, its derivative, felt."""
-PEER_INPUT_SIZE = PEER_INPUT.stop - PEER_INPUT.start
+    exponential = expm(whole)
+    return exponential[:n, :n], exponential[:n, n:]
 
 
 class SiteTickMap(NamedTuple):
-    """One site over a period: X' = P X + Q w, where w is what it hears of its peers.
+    """One site over a period: X' = P X + Q w with the input w from its peers.
 
     Attributes:
-        P: shape (n, n); X is q, qd, eta of its estimate, and, of `second_order`, the torque before.
+        P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque before.
         Q: shape (n, 6).
-        sent: what its peers hear of it, shape (6, n): q, qd, and the torque on its arm.
+        sent: its output to peers, shape (6, n): q, qd, and the torque on its arm.
         names: of its states.
     """
 
@@ -108,73 +84,40 @@ class SiteTickMap(NamedTuple):
     names: tuple[str, ...]
 
 
-class _Made(NamedTuple):
-    """What a controller makes of its arguments: torque on the arm, what it learns, the torque of its law."""
-
-    u: Array
-    learnt: Array
-    tau: Array
-
-
 def linearise_site_tick(site: SiteSetup, rates: SiteRates, h_s: float) -> SiteTickMap:
-    """Returns one site over a period.
-
-    Args:
-        site: what it is built from.
-        rates: the derivatives of its rates, see `field.jacobian`.
-        h_s: the period, s.
-    """
+    """Returns one site over a period, from the derivatives of its rates (`differentiate_site_rates`)."""
     second = site.scheme is Scheme.SECOND_ORDER
     memory = slice(QD.stop, QD.stop + (PARAMETERS if has_estimate(site) else 0))
+    count = memory.stop - memory.start
     n = memory.stop + (JOINTS if second else 0)
-    own, heard = np.zeros((ARGUMENT_COUNT, n)), np.zeros((ARGUMENT_COUNT, PEER_INPUT_SIZE))
+    own, peers = np.zeros((ARGUMENT_COUNT, n)), np.zeros((ARGUMENT_COUNT, PEER_INPUT_SIZE))
     own[ARM_STATE, ARM_STATE] = np.eye(QD.stop)
-    own[ESTIMATE, memory] = np.eye(PARAMETERS)[:, : memory.stop - memory.start]
-    heard[PEER_INPUT] = np.eye(PEER_INPUT_SIZE)
-    Phi, Gamma = _arm(rates, h_s)
-    P, Q = (
-        _stacked(_made(rates, by, h_s, second=second), Gamma, memory, second=second) for by in (own, heard)
+    own[ESTIMATE, memory] = np.eye(PARAMETERS)[:, :count]
+    peers[PEER_INPUT] = np.eye(PEER_INPUT_SIZE)
+    inverse_inertia = rates.qdd[:, EXTERNAL_TORQUE]
+    zero = np.zeros((JOINTS, JOINTS))
+    free = rates.qdd[:, ARM_STATE] - inverse_inertia @ (rates.tau + rates.held)[:, ARM_STATE]
+    Phi, Gamma = discretise_zero_order_hold(
+        np.block([[zero, np.eye(JOINTS)], [free]]), np.vstack([zero, inverse_inertia]), h_s
     )
+
+    def control(by: Array) -> Array:
+        """Returns the change of X by the controller, whose arguments are `by` times a vector."""
+        f = rates.estimate @ by
+        tau = rates.tau @ by + (0.5 * h_s * rates.tau[:, ESTIMATE] @ f if second else 0.0)
+        u = (1.5 if second else 1.0) * tau + rates.held @ by
+        return np.vstack([Gamma @ u, h_s * f[:count], *([tau] if second else [])])
+
+    P, Q = control(own), control(peers)
     P[ARM_STATE, ARM_STATE] += Phi
-    P[memory, memory] += np.eye(memory.stop - memory.start)
+    P[memory, memory] += np.eye(count)
     if second:
         P[ARM_STATE, memory.stop :] -= 0.5 * Gamma
     sent = np.zeros((PEER_INPUT_SIZE, n))
     sent[: QD.stop, ARM_STATE] = np.eye(QD.stop)
-    sent[QD.stop :, ARM_STATE] = (rates.acted + rates.held)[:, ARM_STATE]
-    states = ["q1", "q2", "qd1", "qd2", "theta1", "theta2", "theta3", "theta4", "theta5"][: memory.stop]
-    states += ["tau1", "tau2"] if second else []
+    sent[QD.stop :, ARM_STATE] = (rates.external + rates.held)[:, ARM_STATE]
+    states = (*STATE_NAMES[: memory.stop], *(("tau1", "tau2") if second else ()))
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
-
-
-def _arm(rates: SiteRates, h_s: float) -> tuple[Array, Array]:
-    """Returns what a period does to (q, qd), and what a torque held over it adds."""
-    inverse = rates.qdd[:, EXTERNAL_TORQUE]  # of M
-    still = np.zeros((JOINTS, JOINTS))
-    own = rates.qdd[:, ARM_STATE] - inverse @ (rates.tau + rates.held)[:, ARM_STATE]
-    A = np.block([[still, np.eye(JOINTS)], [own]])
-    return discretise_zero_order_hold(A, np.vstack([still, inverse]), h_s)
-
-
-def _made(rates: SiteRates, by: Array, h_s: float, *, second: bool) -> _Made:
-    """Returns what the controller makes of its arguments at a tick, which are `by` times something."""
-    f = rates.estimate @ by
-    if not second:
-        tau = rates.tau @ by
-        return _Made(tau + rates.held @ by, h_s * f, tau)
-    tau = rates.tau @ by + 0.5 * h_s * rates.tau[:, ESTIMATE] @ f
-    return _Made(1.5 * tau + rates.held @ by, h_s * f, tau)
-
-
-def _stacked(made: _Made, Gamma: Array, memory: slice, *, second: bool) -> Array:
-    """Returns what the controller adds to X."""
-    learnt = made.learnt[: memory.stop - memory.start]
-    return np.vstack([Gamma @ made.u, learnt, *([made.tau] if second else [])])
-
-
-MAX_COMPANION_SIZE = 600
-"""The largest companion matrix whose eigenvalues are computed; beyond it Newton begins from the continuous
-roots."""
 
 
 class TickPencil(NamedTuple):
@@ -193,121 +136,113 @@ class TickPencil(NamedTuple):
     Sd: Array
 
     def at(self, s: complex) -> tuple[Complex, Complex]:
-        """See `pencil.Pencil`."""
+        """See `Pencil`."""
         z = cmath.exp(s * self.h_s)
         eye = z * np.eye(len(self.S))
-        late = np.exp(-s * self.h_s * self.ticks)[:, np.newaxis, np.newaxis] * self.Sd
-        delta = (eye - self.S - late.sum(axis=0)) / self.h_s
-        return delta, eye + (self.ticks[:, np.newaxis, np.newaxis] * late).sum(axis=0)
+        delayed = np.exp(-s * self.h_s * self.ticks)[:, np.newaxis, np.newaxis] * self.Sd
+        delta = (eye - self.S - delayed.sum(axis=0)) / self.h_s
+        return delta, eye + (self.ticks[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
 
     def size(self, s: complex) -> float:
-        """See `pencil.Pencil`."""
-        late = np.exp(-s.real * self.h_s * self.ticks) @ np.linalg.norm(self.Sd, axis=(1, 2))
-        return float((math.exp(s.real * self.h_s) + np.linalg.norm(self.S) + late) / self.h_s)
+        """See `Pencil`."""
+        delayed = np.exp(-s.real * self.h_s * self.ticks) @ np.linalg.norm(self.Sd, axis=(1, 2))
+        return float((math.exp(s.real * self.h_s) + np.linalg.norm(self.S) + delayed) / self.h_s)
 
     def taylor(self, power: int) -> Array:
-        """See `pencil.Pencil`."""
+        """See `Pencil`."""
         factors = (-self.ticks.astype(np.float64)) ** power
         own = np.eye(len(self.S)) - (self.S if power == 0 else 0.0)
         scale = self.h_s ** (power - 1) / math.factorial(power)
-        found: Array = scale * (own - np.einsum("k,kab->ab", factors, self.Sd))
-        return found
+        coefficient: Array = scale * (own - np.einsum("k,kab->ab", factors, self.Sd))
+        return coefficient
 
     @property
-    def late(self) -> NDArray[np.intp]:
-        """Places of the states that come into the loop after a delay."""
+    def delayed_states(self) -> NDArray[np.intp]:
+        """Places of the states that act after a delay."""
         return np.flatnonzero(np.abs(self.Sd).sum(axis=(0, 1)))
 
 
-def find_common_rate_hz(now: OperatingConditions) -> int | None:
-    """Returns the tick rate that all sites have, Hz; None where they have several."""
-    rates = {site.rate_hz for site in now.sites}
+def find_common_rate_hz(conditions: OperatingConditions) -> int | None:
+    """Returns the tick rate of all sites, Hz; None if they have several."""
+    rates = {site.rate_hz for site in conditions.sites}
     return rates.pop() if len(rates) == 1 else None
 
 
 def compute_sampled_spectrum(
-    now: OperatingConditions, rest: Equilibrium, near: Complex, wanted: int = 6
+    conditions: OperatingConditions, rest: Equilibrium, near: Complex, wanted: int = 6
 ) -> Spectrum | None:
-    """Returns the rightmost roots s = ln(z) / h of the loop as it is computed.
+    """Returns the rightmost roots s = ln(z) / h of the sampled loop; None if the sites have several rates.
 
     Args:
-        now: what holds.
-        rest: where it rests.
-        near: roots of the continuous loop, which Newton begins from where the delays are long.
-        wanted: how many roots.
-
-    Returns:
-        The roots; None where the sites have different rates, because then no one period is there.
+        conditions: the numbers of the loop.
+        rest: the equilibrium.
+        near: roots of the continuous loop, from which Newton's method starts if the delays are long.
+        wanted: number of roots.
     """
-    if find_common_rate_hz(now) is None:
+    if find_common_rate_hz(conditions) is None:
         return None
-    pencil, names, constant = build_tick_pencil(now, rest)
+    pencil, names, constant = build_tick_pencil(conditions, rest)
+
+    def logarithms(matrix: Array) -> Complex:
+        """Returns ln(z) / h of the eigenvalues that are not next to zero, 1/s."""
+        z = np.linalg.eigvals(matrix).astype(np.complex128)
+        return (np.log(z[np.abs(z) > 1e-8]) / pencil.h_s).astype(np.complex128)
+
     with limit_blas_threads():
         zeros, drifting = count_zero_roots(pencil)
-        numbers = len(names) + int(pencil.ticks.max(initial=0)) * len(pencil.late)
-        if numbers <= MAX_COMPANION_SIZE:
-            z = _eigenvalues(build_companion_matrix(pencil))
-            guesses = sort_root_guesses(_logarithm(z, pencil.h_s), zeros)
+        size = len(names) + int(pencil.ticks.max(initial=0)) * len(pencil.delayed_states)
+        if size <= MAX_COMPANION_SIZE:
+            guesses = sort_root_guesses(logarithms(build_companion_matrix(pencil)), zeros)
             tries = wanted + 2
         else:
-            local = [_eigenvalues(matrix) for matrix in (pencil.S, pencil.S + pencil.Sd.sum(axis=0))]
-            guesses = np.concatenate([near, *(_logarithm(z, pencil.h_s) for z in local)])
+            guesses = np.concatenate(
+                [near, logarithms(pencil.S), logarithms(pencil.S + pencil.Sd.sum(axis=0))]
+            )
             guesses = sort_root_guesses(guesses[np.abs(guesses) > 1e-6], 0)
             tries = len(guesses)
         roots, dropped = refine_roots(pencil, guesses, names, wanted, tries, 2.0 * math.pi / pencil.h_s)
     return Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
 
 
-def _eigenvalues(matrix: Array) -> Complex:
-    return np.linalg.eigvals(matrix).astype(np.complex128)
-
-
-def _logarithm(z: Complex, h_s: float) -> Complex:
-    """Returns ln(z) / h of what is not next to zero, 1/s."""
-    kept = z[np.abs(z) > 1e-8]
-    return (np.log(kept) / h_s).astype(np.complex128)
-
-
 def build_companion_matrix(pencil: TickPencil) -> Array:
     """Returns the matrix that carries the state, and the past of its delayed part, from tick to tick."""
-    n, late = len(pencil.S), pencil.late
-    depth, c = int(pencil.ticks.max(initial=0)), len(pencil.late)
+    n, delayed = len(pencil.S), pencil.delayed_states
+    depth, c = int(pencil.ticks.max(initial=0)), len(delayed)
     whole = np.zeros((n + depth * c, n + depth * c))
     whole[:n, :n] = pencil.S
     for d, Sd in zip(pencil.ticks, pencil.Sd, strict=True):
-        whole[:n, n + (d - 1) * c : n + d * c] += Sd[:, late]
+        whole[:n, n + (d - 1) * c : n + d * c] += Sd[:, delayed]
     if depth:
-        whole[n + np.arange(c), late] = 1.0
+        whole[n + np.arange(c), delayed] = 1.0
         whole[n + c :, n : n + (depth - 1) * c] = np.eye((depth - 1) * c)
     return whole
 
 
-def build_tick_pencil(now: OperatingConditions, rest: Equilibrium) -> tuple[TickPencil, tuple[str, ...], int]:
-    """Returns the characteristic equation of the moving part, its names, and how many states do not move.
+def build_tick_pencil(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> tuple[TickPencil, tuple[str, ...], int]:
+    """Returns the characteristic equation of the moving part, its names, and the number of constant states.
 
-    Args:
-        now: what holds; all sites have one rate.
-        rest: where it rests.
+    All sites must have one rate.
     """
-    h_s = 1.0 / now.sites[0].rate_hz
-    sites = [
-        linearise_site_tick(site, row.rates, h_s)
-        for site, row in zip(now.sites, linearise_sites(now, rest), strict=True)
+    h_s = 1.0 / conditions.sites[0].rate_hz
+    linear_sites = linearise_sites(conditions, rest)
+    maps = [
+        linearise_site_tick(site, linear.rates, h_s)
+        for site, linear in zip(conditions.sites, linear_sites, strict=True)
     ]
-    ends = np.cumsum([0, *(len(site.P) for site in sites)])
+    ends = np.cumsum([0, *(len(one.P) for one in maps)])
     at = [slice(a, b) for a, b in itertools.pairwise(ends)]
-    S = np.zeros((ends[-1], ends[-1]))
+    S = block_diag(*(one.P for one in maps))
     Sd: dict[int, Array] = {}
-    for i, site in enumerate(sites):
-        S[at[i], at[i]] = site.P
-    for i, j in zip(*np.nonzero(now.alpha), strict=True):
-        d = max(1, round(float(now.age_s[i, j]) / h_s))
+    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
+        d = max(1, round(float(conditions.age_s[i, j]) / h_s))
         S_d = Sd.setdefault(d, np.zeros_like(S))
-        S_d[at[i], at[j]] += now.alpha[i, j] * sites[i].Q @ sites[j].sent
+        S_d[at[i], at[j]] += conditions.alpha[i, j] * maps[i].Q @ maps[j].sent
     ticks = np.array(sorted(Sd), dtype=np.int64)
-    late = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
-    kept = select_moving_states(np.abs(S - np.eye(len(S))) + np.abs(late).sum(axis=0))
+    delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
+    kept = select_moving_states(np.abs(S - np.eye(len(S))) + np.abs(delayed).sum(axis=0))
     rows, columns = np.ix_(kept, kept)
-    names = [name for site in sites for name in site.names]
-    pencil = TickPencil(h_s, S[rows, columns], ticks, late[:, rows, columns])
+    names = [name for one in maps for name in one.names]
+    pencil = TickPencil(h_s, S[rows, columns], ticks, delayed[:, rows, columns])
     return pencil, tuple(names[place] for place in kept), len(S) - len(kept)

@@ -15,7 +15,8 @@ from trilat_net.studies.sweep.stability_map import (
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.studies.sweep.theory_lines import compute_growth_rates, trace_linear_analysis
+from trilat_net.studies.sweep.theory_lines import trace_linear_analysis
+from trilat_net.theory import compute_growth_rates
 
 from .maps import KEYS, rows
 

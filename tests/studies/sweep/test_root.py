@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.theory_lines import LEARNING_REMARK, compute_growth_rates, find_root_crossings
 from trilat_net.theory import analyse_linear_loop, find_linear_edge
+from trilat_net.theory.linear_edge import (
+    ASSUMED_EQUILIBRIUM_REMARK,
+    compute_growth_rates,
+    find_root_crossings,
+)
 
 
 def damped(d: float) -> Scenario:
@@ -40,7 +44,7 @@ def test_the_scheme_decides_which_loop_counts() -> None:
         [load_scenario("free", slow), load_scenario("free", {**slow, "scheme": "digital"})]
     )
     assert continuous < 0.0 < digital
-    assert remarks == [LEARNING_REMARK]
+    assert remarks == [ASSUMED_EQUILIBRIUM_REMARK]
 
 
 def test_what_has_no_linear_loop_is_told_and_not_known() -> None:

@@ -19,54 +19,29 @@ _HEIGHT_IN = 3.0
 _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
 
 
-def draw_root_map(found: LinearAnalysis) -> Figure:
-    """Returns the map of continuous and sampled roots.
-
-    Args:
-        found: the analysis.
-    """
+def draw_root_map(analysis: LinearAnalysis) -> Figure:
+    """Returns the map of continuous and sampled roots."""
     with style.figure_style():
         figure = style.new_figure(_HEIGHT_IN, WIDTH_IN)
         axes = figure.add_subplot()
-        _draw(axes, found.continuous, "o", style.SITE_COLOURS[0], "continuous")
-        if found.sampled is not None:
-            _draw(axes, found.sampled, "x", style.SITE_COLOURS[1], "as computed")
-        if found.judged.zeros:
-            axes.plot(
-                [0.0],
-                [0.0],
-                linestyle="",
-                marker="s",
-                markersize=4.0,
-                fillstyle="none",
-                color=style.FAINT,
-                label=f"zero by structure ({found.judged.zeros})",
-            )
-        _frame(axes)
+        _plot_roots(axes, analysis.continuous, "o", style.SITE_COLOURS[0], "continuous")
+        if analysis.sampled is not None:
+            _plot_roots(axes, analysis.sampled, "x", style.SITE_COLOURS[1], "as computed")
+        if zeros := analysis.decisive.zeros:
+            label = f"zero by structure ({zeros})"
+            axes.plot([0.0], [0.0], "s", markersize=4.0, fillstyle="none", color=style.FAINT, label=label)
+        low, high = axes.get_xlim()
+        high = max(high, 0.06 * (high - low), 0.0)
+        axes.axvline(0.0, **style.LIMIT_LINE)
+        axes.axvspan(0.0, high, **_UNSTABLE)
+        axes.set_xlim(low, high)
+        axes.set_xlabel("real part (1/s)")
+        axes.set_ylabel("imaginary part (rad/s)")
         figure.legend(loc="outside upper center", ncols=3, handlelength=1.0, columnspacing=1.0)
     return figure
 
 
-def _draw(axes: Axes, found: Spectrum, mark: str, colour: str, label: str) -> None:
-    roots = [root.s for root in found.roots]
+def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
+    roots = [root.s for root in spectrum.roots]
     both = np.array([*roots, *(s.conjugate() for s in roots if s.imag)])
-    axes.plot(
-        both.real,
-        both.imag,
-        linestyle="",
-        marker=mark,
-        markersize=4.5,
-        fillstyle="none",
-        color=colour,
-        label=label,
-    )
-
-
-def _frame(axes: Axes) -> None:
-    low, high = axes.get_xlim()
-    high = max(high, 0.06 * (high - low), 0.0)
-    axes.axvline(0.0, **style.LIMIT_LINE)
-    axes.axvspan(0.0, high, **_UNSTABLE)
-    axes.set_xlim(low, high)
-    axes.set_xlabel("real part (1/s)")
-    axes.set_ylabel("imaginary part (rad/s)")
+    axes.plot(both.real, both.imag, mark, markersize=4.5, fillstyle="none", color=colour, label=label)

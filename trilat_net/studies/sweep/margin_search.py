@@ -17,13 +17,14 @@ import numpy as np
 from ...errors import ScenarioError, UsageError
 from ...reporting.text_table import TextTable
 from ...scenario import Scenario
+from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import cell_result
 from .map_plane import label_axis
 from .stability_map import build_sweep_command, format_override, format_override_value
 from .sweep_cell import SweepCell, SweepSource
 from .sweep_plan import SweepPlan
-from .theory_lines import evaluate_criterion, find_criterion_edge, find_root_crossings
+from .theory_lines import evaluate_criterion, find_criterion_edge
 
 SCAN_POINTS = 9
 """Values of the scan: islands that are wider than an eighth of the range are seen."""

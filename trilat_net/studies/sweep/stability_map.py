@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 from ...scenario import Scenario
 from ...scenario.fields import is_number
+from ...theory import compute_growth_rates
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .map_plane import MapPanel, MapPlane, build_plane
 from .sweep_cell import SweepSource
 from .sweep_plan import MAX_EXTENSION, MAX_SCENARIO_S, SweepPlan
 from .sweep_results import SweepResults
-from .theory_lines import TheoryLine, compute_growth_rates, trace_closed_form, trace_linear_analysis
+from .theory_lines import TheoryLine, trace_closed_form, trace_linear_analysis
 
 LAW_AXIS = "law"
 

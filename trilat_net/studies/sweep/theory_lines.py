@@ -18,11 +18,6 @@ from ...errors import ScenarioError
 from ...scenario import Scenario
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.laws import Adaptive, ProportionalDamped
-from ...theory import Equilibrium, find_equilibrium, iterate_linear_edges
-from ...theory.equilibrium import follow_equilibrium, holds_any_shared_pose, predict_equilibrium
-from ...theory.linear_edge import find_rightmost_root, is_digital
-from ...theory.operating_point import derive_operating_conditions
-from ...theory.site_dynamics import has_estimate
 from .map_plane import PlaneAxis
 
 _GRAVITY = slice(3, 5)
@@ -109,74 +104,6 @@ def _delays_s(scenario: Scenario) -> list[float] | None:
                 return None
             delays_s.append(max(link.moments().mean_ms, link.playout_ms) / 1e3)
     return delays_s
-
-
-LEARNING_REMARK = (
-    "the linear analysis of a law that learns is about the mean start pose, with estimates that are the "
-    "truth: where a run rests follows from all that happened before"
-)
-
-
-def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:
-    """Returns the real part of the rightmost root of some scenarios beside each other, 1/s.
-
-    Args:
-        scenarios: each a small step from the one before.
-
-    Returns:
-        The real parts, NaN where there is no linear loop; and what is to be known of them, once each.
-    """
-    rest: Equilibrium | None = None
-    found: list[float] = []
-    remarks: dict[str, None] = {}
-    for scenario in scenarios:
-        try:
-            rest, remark = _equilibrium(scenario, rest)
-            conditions = derive_operating_conditions(scenario)
-            root = find_rightmost_root(conditions, rest, sampled=is_digital(scenario))
-            found.append(-np.inf if root is None else root.s.real)  # -inf: nothing moves
-        except ScenarioError as error:
-            remark = f"no linear analysis: {error.problem}"
-            found.append(float("nan"))
-        if remark:
-            remarks[remark] = None
-    return found, list(remarks)
-
-
-def _equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple[Equilibrium, str]:
-    """Returns what a scenario is linearised about, and what is to be known of it.
-
-    The first of some scenarios: where it comes to rest by its linear loop, or where a run of it ends if
-    somebody is at the arms. The others: at the equilibrium next to that of the one before.
-    """
-    now = derive_operating_conditions(scenario)
-    if any(map(has_estimate, now.sites)) and not any(site.actors for site in now.sites):
-        first, second = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0).tolist()
-        return find_equilibrium(scenario, (first, second)), LEARNING_REMARK
-    if before is not None:
-        return follow_equilibrium(scenario, before), ""
-    return (predict_equilibrium(scenario) if holds_any_shared_pose(now) else find_equilibrium(scenario)), ""
-
-
-def find_root_crossings(
-    scenario: Scenario, key: str, low: float, high: float
-) -> tuple[tuple[float, ...], str]:
-    """Returns the values of a key at which the rightmost root crosses the imaginary axis, from below.
-
-    Args:
-        scenario: the experiment; the key's own value says what is linearised about.
-        key: dotted, of a number.
-        low: from.
-        high: to.
-
-    Returns:
-        The values, none where the linear analysis says nothing; and what is to be known of them, or "".
-    """
-    try:
-        rest, remark = _equilibrium(scenario, None)
-        return tuple(one.value for one in iterate_linear_edges(scenario, key, low, high, rest)), remark
-    except ScenarioError as error:
-        return (), f"no linear analysis: {error.problem}"
 
 
 ScenarioAt = Callable[[float, float], Scenario]
