@@ -16,7 +16,7 @@ from trilat_net.theory.port_passivity import (
     llewellyn_rounding,
     weight_response,
 )
-from trilat_net.theory.port_response import build_admittance, invert_response
+from trilat_net.theory.port_response import build_admittance
 
 POSITIVE = st.floats(0.1, 10.0)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -62,7 +62,7 @@ def test_with_a_delay_p_d_fails_up_to_where_its_sine_says(d: float) -> None:
 def test_the_criterion_is_that_of_its_three_inequalities_in_admittance_and_in_impedance(seed: int) -> None:
     Y = drawn(seed, 2)
     Y[::3, 0, 0] -= 0.4
-    for parameters in (Y, invert_response(Y)):
+    for parameters in Y(Y):
         a, b, through = (
             parameters[:, 0, 0].real,
             parameters[:, 1, 1].real,
@@ -155,9 +155,9 @@ def test_what_is_left_at_some_ports_is_a_part_of_the_admittance_or_of_the_impeda
     """Hands off: rows and columns of Y fall away. Clamped: those of Z."""
     Y = drawn(seed, 3)
     np.testing.assert_array_equal(clamp_ports(Y, [0, 2], []), Y[:, [0, 2]][:, :, [0, 2]])
-    Z = invert_response(Y)
+    Z = np.linalg.inv(Y)
     np.testing.assert_allclose(
-        invert_response(clamp_ports(Y, [0, 2], [1])), Z[:, [0, 2]][:, :, [0, 2]], rtol=1e-6
+        np.linalg.inv(clamp_ports(Y, [0, 2], [1])), Z[:, [0, 2]][:, :, [0, 2]], rtol=1e-6
     )
 
 

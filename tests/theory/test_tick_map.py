@@ -15,7 +15,12 @@ from trilat_net.theory.characteristic_roots import Spectrum
 from trilat_net.theory.delay_roots import compute_delay_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
-from trilat_net.theory.tick_map import build_companion_matrix, build_tick_pencil, compute_sampled_spectrum
+from trilat_net.theory.tick_map import (
+    build_companion_matrix,
+    build_tick_pencil,
+    compute_sampled_spectrum,
+    discretise_zero_order_hold,
+)
 
 POSE = (-0.1729, 0.0874)
 NOTHING = np.zeros(0, dtype=np.complex128)
@@ -164,3 +169,9 @@ def test_several_rates_have_no_one_period() -> None:
     scenario = load_scenario("two_sites", {"sites.s.rate_hz": 500})
     rest = Equilibrium(np.tile(POSE, (2, 1)), np.tile(scenario.sites["s"].arm.theta, (2, 1)), "", 0.0)
     assert compute_sampled_spectrum(derive_operating_conditions(scenario), rest, NOTHING) is None
+
+
+def test_a_held_push_moves_a_mass_by_half_h_squared() -> None:
+    Phi, Gamma = discretise_zero_order_hold(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [2.0]]), 0.1)
+    assert Phi == pytest.approx(np.array([[1.0, 0.1], [0.0, 1.0]]), abs=1e-15)
+    assert Gamma == pytest.approx(np.array([[0.01], [0.2]]), abs=1e-15)

@@ -15,7 +15,6 @@ from trilat_net.theory.port_response import (
     PortLoad,
     apply_loads,
     build_admittance,
-    invert_response,
 )
 
 W = np.geomspace(1e-2, 1e2, 41)
@@ -52,7 +51,7 @@ def test_a_free_load_changes_nothing() -> None:
 def test_the_impedance_of_a_load_adds_at_its_port_and_what_it_pushes_is_reflected(K: float, B: float) -> None:
     Y = build_admittance(REFLECTING.loop)(W)
     load = np.diag([0.0, 1.0, 0.0]) * (B + K / (1j * W))[:, np.newaxis, np.newaxis]
-    expected = np.linalg.inv(invert_response(Y) + load)
+    expected = np.linalg.inv(np.linalg.inv(Y) + load)
     np.testing.assert_allclose(
         build_admittance(apply_loads(REFLECTING.loop, {"b": PortLoad(K, B)}))(W), expected, rtol=1e-8
     )

@@ -14,7 +14,7 @@ def test_shares_and_links_are_those_at_the_end() -> None:
     assert found.alpha.sum(axis=1) == pytest.approx(1.0)
     row = dict(zip(found.names, found.alpha[found.names.index("s")], strict=True))
     assert row["m1"] == pytest.approx(0.1)
-    assert any("the shares of s change during the run" in note for note in found.notes)
+    assert any("the dominance factors of s change during the run" in note for note in found.notes)
     half = derive_operating_conditions(load_scenario("training", {"duration_s": 11.0}))
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
 
@@ -39,9 +39,9 @@ def test_what_varies_is_said_with_its_mean() -> None:
 @pytest.mark.parametrize(
     ("overrides", "facts"),
     [
-        ({"link.model": "measured"}, ["links.", ".model", "nobody knows its delay"]),
+        ({"link.model": "measured"}, ["links.", ".model", "its delay is not known"]),
         ({"sites.s.plant": "external"}, ["sites.s.plant", "plant = 'simulated'"]),
-        ({"control.law": "tests.laws:Adaptive"}, [".control.law", "a law from outside", "p_d"]),
+        ({"control.law": "tests.laws:Adaptive"}, [".control.law", "an imported law", "p_d"]),
     ],
 )
 def test_what_has_no_linear_loop_is_refused(overrides: dict[str, object], facts: list[str]) -> None:

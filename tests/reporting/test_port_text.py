@@ -1,15 +1,15 @@
 import json
 
-from tests.theory.test_section import section_of
+from tests.theory.test_port_analysis import section_of
 from trilat_net.reporting.port_text import describe_ports
 from trilat_net.theory.port_analysis import ports_to_json
 
 
 def test_what_is_passive_is_said_in_a_word_each() -> None:
     lines = describe_ports(section_of("p_d_margin_two"))
-    assert lines[0].startswith("Ports of m, s, hands and environments off, 0.001-100 Hz")
+    assert lines[0].startswith("Ports of m, s, operators and environments off, 0.001-100 Hz")
     assert "evidence, no proof" in lines[0]
-    assert "  hands passive in qd: passive" in lines
+    assert "  operators passive in qd: passive" in lines
     assert "    Llewellyn, every pair and joint: holds (2 two-ports)" in lines
     assert not any(" r = " in line for line in lines)
     assert sum("Z-width" in line for line in lines) == 2
@@ -22,19 +22,19 @@ def test_what_is_not_passive_says_where_and_by_how_much() -> None:
     assert f"not passive at 0.001-{span.to_hz:.3g} Hz" in text
     assert f"least eigenvalue {section.velocity.minima.least:.3g} at" in text
     assert "no damping at the joints would make it so" in text
-    assert "as the proof asks: passive; sites weighted 1, 1" in text
+    assert "the proof's premise: passive; sites weighted 1, 1" in text
     assert "some make it unstable at" in text
 
 
 def test_an_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
     lines = describe_ports(section_of("p_d_margin_two", (("control.d", 1.8),)))
     assert len(lines) == 2
-    assert "the loop without hands is unstable" in lines[1]
+    assert "the loop without operators is unstable" in lines[1]
 
 
 def test_a_clamp_that_makes_it_unstable_leaves_nothing_to_feel() -> None:
     lines = describe_ports(section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ()))))
-    assert lines[-1] == "  with s clamped the loop is unstable: nothing steady is felt of it"
+    assert lines[-1] == "  with s clamped the loop is unstable: it has no steady impedance"
     assert any("ranges more" in line for line in lines)
 
 

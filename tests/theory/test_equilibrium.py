@@ -76,7 +76,7 @@ def test_a_pose_of_ones_own_is_taken_as_it_is() -> None:
 
 def test_a_pose_that_is_no_rest_is_said_to_be_none() -> None:
     (note,) = find_equilibrium(load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)).notes
-    assert "the pose is no rest" in note
+    assert "the pose is no equilibrium" in note
 
 
 def test_a_torque_beyond_the_clamp_is_said() -> None:
