@@ -45,7 +45,10 @@ def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None
     assert np.abs(halves.solve(5.0).at(times) - paper.at(times)).max() < 1e-8
 
 
-@pytest.mark.parametrize(("name", "bound"), [("paper", 1e-5), ("paper_rods", 1e-5), ("free", 1.1e-5)])
+@pytest.mark.parametrize(
+    ("name", "bound"),
+    [("paper", 1e-5), pytest.param("paper_rods", 1e-5, marks=pytest.mark.long), ("free", 1.1e-5)],
+)
 def test_second_order_is_within_1e_5_rad_of_the_exact_solution(name: str, bound: float) -> None:
     assert distance(name, "second_order", 1000) <= bound
 
@@ -58,7 +61,7 @@ def test_a_delay_one_tick_off_is_not_what_this_comparison_can_show() -> None:
         assert np.abs(slipped - right).max() == pytest.approx(4.9e-4, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["paper", "free"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("free", marks=pytest.mark.long)])
 def test_second_order_converges_with_order_two(name: str) -> None:
     assert order(name, "second_order") == pytest.approx([2.0, 2.0], abs=0.1)
 

@@ -26,7 +26,7 @@ def test_the_balance_closes_to_2e_5_of_the_largest_v(name: str) -> None:
     assert booked(name).residual <= 2e-5
 
 
-@pytest.mark.parametrize("name", ["paper", "asymmetric"])
+@pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.long), "asymmetric"])
 def test_its_error_is_of_second_order(name: str) -> None:
     assert order(name, "second_order") == pytest.approx([2.0, 2.0], abs=0.1)
 

@@ -129,5 +129,5 @@ def test_what_cannot_be_asked_is_refused() -> None:
     with pytest.raises(UsageError, match="to a higher one"):
         analyse_ports(scenario, rest, band_hz=(1.0, 1.0))
     measured = load_scenario("p_d_margin_two", {"link": {"model": "measured"}})
-    with pytest.raises(ScenarioError, match="nobody knows"):
+    with pytest.raises(ScenarioError, match="is not known beforehand"):
         analyse_ports(measured, rest)

@@ -73,7 +73,7 @@ def test_two_sites_that_do_not_know_each_other_feel_nothing_of_each_other() -> N
     [
         ("z", "b", (0.1, 1.0), "no site 'z'"),
         ("a", "z", (0.1, 1.0), "no site 'z'"),
-        ("a", "a", (0.1, 1.0), "where the hand is"),
+        ("a", "a", (0.1, 1.0), "the operator's own site"),
         ("a", "b", (1.0, 0.1), "to a higher one"),
         ("a", "b", (0.0, 0.1), "to a higher one"),
     ],

@@ -58,7 +58,7 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
         "qdd": qdd,
         "estimate": estimate,
         "tau": np.array(tau),
-        "acted": acted + x[EXTERNAL_TORQUE],
+        "external": acted + x[EXTERNAL_TORQUE],
         "held": held,
     }
 
@@ -70,7 +70,7 @@ def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
     x = rng.uniform(-2, 2, ARGUMENT_COUNT)
     found, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
     for name, value in wanted.items():
-        scale = 1.0 + max(np.abs(value).max(), np.abs(wanted["acted"]).max(), np.abs(wanted["tau"]).max())
+        scale = 1.0 + max(np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max())
         inverse = (
             np.abs(differentiate_site_rates(one, x).qdd[:, EXTERNAL_TORQUE]).max() if name == "qdd" else 1.0
         )
