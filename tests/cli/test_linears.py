@@ -59,7 +59,7 @@ REFUSED = {
     "a key that is none": (["free", *AT, "--over", "control.Kq=1:5"], ["control.Kq", "did you mean"]),
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),
-    "a measured link": (["free", "--set", "link.model=measured"], ["links.", "nobody knows its delay"]),
+    "a measured link": (["free", "--set", "link.model=measured"], ["links.", "its delay is not known"]),
     "an arm outside": (["free", "--set", "sites.s.plant=external"], ["sites.s.plant", "simulated"]),
 }
 
