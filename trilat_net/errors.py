@@ -6,17 +6,17 @@ command line prints that sentence and nothing else; `exit_code` is the code that
 
 
 class TrilatError(Exception):
-    """Base of all errors that a person can act on; `exit_code` is what a command ends with."""
+    """Base of all errors that a user can act on; a command ends with `exit_code`."""
 
     exit_code = 1
 
 
 class ScenarioError(TrilatError):
-    """The author's: a scenario, an override or an argument that cannot be right.
+    """An invalid scenario, override or argument: its author must act.
 
     Args:
-        problem: what is wrong and what would be right.
-        path: the key, dotted, or "".
+        problem: the error and its remedy.
+        path: the dotted key, or "".
         source: the file or the name of the scenario, or "".
     """
 
@@ -30,13 +30,13 @@ class ScenarioError(TrilatError):
 
 
 class UsageError(TrilatError):
-    """The caller's: arguments that contradict each other or the machine (a busy port, an existing file)."""
+    """Arguments that contradict each other or the machine (a busy port, an existing file)."""
 
     exit_code = 2
 
 
 class WireError(TrilatError):
-    """A peer's: a payload that is no message of ours. `reason` is the word it is counted under."""
+    """A payload from a peer that is no message of this program; it is counted under `reason`."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
@@ -44,41 +44,41 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A session that cannot begin: a peer that never came, another scenario, a session that is running."""
+    """A session that cannot begin: a missing peer, another scenario, a session that is running."""
 
     exit_code = 2
 
 
 class LogError(TrilatError):
-    """The file's: a log that is missing, torn, or not one of ours."""
+    """A log that is missing, torn, or not written by this program."""
 
     exit_code = 2
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """The machine's: a log that could not be written on, as on a full disk; what was before is kept."""
+    """A log that the machine refused to continue, as on a full disk; everything before is kept."""
 
     exit_code = 5
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
-    """The file's: there is nothing in it that could be recovered."""
+    """A file without anything that could be recovered."""
 
     exit_code = 1
 
 
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
-    """A run or a comparison that ended badly: diverged, a site died, records that differ."""
+    """A run or a comparison that failed: divergence, a dead site, records that differ."""
 
 
 class LawFailed(RunFailed):
-    """A control law of somebody's own that raised, was too slow, or returned what is no torque.
+    """A user's control law that raised, was too slow, or returned no torque.
 
     Args:
-        problem: what it did.
-        site: whose law it is.
+        problem: its failure.
+        site: its site.
         law: the law, as in "package.module:Law".
-        tick: at which tick; None where it was resumed.
+        tick: the tick of the failure; None if it was being resumed.
     """
 
     def __init__(self, problem: str, *, site: str, law: str, tick: int | None) -> None:
@@ -87,7 +87,7 @@ class LawFailed(RunFailed):
         self.problem, self.site, self.law, self.tick = problem, site, law, tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Makes it again where another process raised it."""
+        """Restores the error of another process."""
         return _law_failed, (self.problem, self.site, self.law, self.tick)
 
 
@@ -96,4 +96,4 @@ def _law_failed(problem: str, site: str, law: str, tick: int | None) -> LawFaile
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
-    """Ours: a state that the program itself must never reach."""
+    """A state that the program must never reach: a bug."""

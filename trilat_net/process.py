@@ -22,7 +22,7 @@ _PARENT_POLL_S = 0.5
 
 @contextmanager
 def pause_gc() -> Iterator[None]:
-    """Keeps the collector from running inside the block."""
+    """Pauses the garbage collector inside the block."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -33,26 +33,22 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Puts all that exists out of the collector's sight: from now on a round looks at what is new alone.
+    """Collects once and exempts all existing objects: later rounds visit new objects alone.
 
-    A full round over all that a program has imported takes a quarter of a second.
+    A full round over everything that a program has imported takes a quarter of a second.
     """
     gc.collect()
     gc.freeze()
 
 
 def disable_gc() -> None:
-    """Puts all that exists out of the collector's sight and stops it: for a loop that must not pause."""
+    """Freezes and stops the collector, for a loop that must not pause."""
     freeze_gc()
     gc.disable()
 
 
 class Interrupt:
-    """Remembers the first SIGINT or SIGTERM; a context, which puts things back as they were.
-
-    Attributes:
-        number: that signal, or 0.
-    """
+    """A context that records the first SIGINT or SIGTERM, as `number` (else 0), and restores the handlers."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -77,9 +73,9 @@ class Interrupt:
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Lets a signal break off the block at once: for long work that looks at nothing.
+        """Lets a signal interrupt the block at once, for long work that polls nothing.
 
-        Python passes over what is raised inside a `__del__`; then the block is left at its end.
+        Python swallows an exception raised inside a `__del__`; then the block is left at its end.
         """
         self._raises = True
         try:
@@ -90,17 +86,17 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def requested(self) -> bool:
-        """True once a signal has come."""
+        """True once a signal has arrived."""
         return self.number != 0
 
     @property
     def exit_code(self) -> int:
-        """What a process ends with that was ended by the signal, by the shell's custom."""
+        """Exit code of a process that the signal ended, by the shell's convention."""
         return 128 + self.number
 
 
 def count_cores() -> int:
-    """Returns how many processors this process may use."""
+    """Returns the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -131,7 +131,7 @@ def test_virtual_time_has_no_arm_outside(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
-    from tests.execution.test_outside import external_log
+    from tests.execution.test_user_laws import external_log
 
     (tmp_path / "outside.mcap").write_bytes(external_log())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses("sites.s.plant", "as in --replace m")

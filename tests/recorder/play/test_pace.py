@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.pace import SPIN_NS, Pace, parse_rate, wait_until
+from recorder.play.pace import LATENESS_LIMIT_US, SPIN_NS, LatenessHistogram, Pace, parse_rate, wait_until
 from trilat_net.errors import UsageError
 
 from .clocks import LookedAt
@@ -64,3 +65,33 @@ def test_rates(text: str, rate: float) -> None:
 def test_what_is_no_rate_is_refused_with_what_would_be(text: str) -> None:
     with pytest.raises(UsageError, match=r"--rate is how much faster than it was, from 0\.001 to 1000, or"):
         parse_rate(text)
+
+
+@given(st.lists(st.integers(0, (LATENESS_LIMIT_US - 1) * 1000), min_size=1, max_size=50))
+def test_quantiles_are_those_of_the_whole_microseconds(late_ns: list[int]) -> None:
+    counted = LatenessHistogram()
+    for late in late_ns:
+        counted.add(late)
+    whole = [late // 1000 for late in late_ns]
+    summary = counted.summary()
+    assert summary is not None
+    quantiles = np.percentile(whole, (50, 99), method="inverted_cdf").tolist()
+    assert [summary.p50_us, summary.p99_us] == quantiles
+    assert summary.max_us == counted.max_us == max(whole)
+
+
+def test_what_is_very_late_is_still_known_at_its_worst() -> None:
+    counted = LatenessHistogram()
+    for late_us in (5, 3 * LATENESS_LIMIT_US, 2 * LATENESS_LIMIT_US):
+        counted.add(late_us * 1000)
+    summary = counted.summary()
+    assert summary is not None
+    assert (summary.p50_us, summary.p99_us, summary.max_us) == (
+        3 * LATENESS_LIMIT_US,
+        3 * LATENESS_LIMIT_US,
+        3 * LATENESS_LIMIT_US,
+    )
+
+
+def test_where_nothing_was_published_nothing_was_late() -> None:
+    assert LatenessHistogram().summary() is None
