@@ -196,3 +196,13 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
         return lost, (r * pushed).sum((0, 2))
 
     return tuple(_gauss(lambda s, n=n: powers(s)[n], 0.0, t, _panels()) for n in (0, 1))  # type: ignore[return-value]
+
+
+def test_a_closed_group_is_balanced_by_itself() -> None:
+    """m1 and m2 follow each other alone; s follows both and has no part in their balance."""
+    pair = {"dominance.m1.m2": 1.0, "dominance.m1.s": 0.0, "dominance.m2.m1": 1.0, "dominance.m2.s": 0.0}
+    energies = runs.booked("free", {**pair, "duration_s": 3.0, "rate_hz": 500})
+    group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
+    assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
+    assert group.relative <= 1e-4
+    assert group.transfer == pytest.approx(np.zeros(len(group.t_s)), abs=1e-9 * group.scale)
