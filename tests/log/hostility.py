@@ -223,8 +223,8 @@ def told_otherwise(data: bytes, draws: Draws) -> bytes:
         "sites",
         "fingerprint",
         "seed",
+        "rerun_executed",
     ]
-    keys.append("rerun_executed")
     try:
         return edited(data, session={one_of(draws, keys): one_of(draws, TEXTS)})
     except Exception:

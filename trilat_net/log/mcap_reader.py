@@ -32,6 +32,10 @@ from .mcap_records import (
 )
 
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+_READ = frozenset(
+    {Opcode.CHUNK, Opcode.MESSAGE, *_DEFINITIONS, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.HEADER}
+)
+"""Records that are read; indexes are of no use to a reader of the whole file."""
 
 KEPT_BYTES = 64 << 20
 KEPT_RATIO = 300
@@ -161,10 +165,11 @@ class McapReader:
             raise LogError(f"{self._source}: is no MCAP file: it {empty}")
         for frame in scanner.frames():
             self.offset = frame.offset
-            try:
-                yield from self._read_records(self._unpack(frame), frame)
-            except UnreadableRecord as error:
-                scanner.damaged.append(Damage(frame.offset, frame.size, str(error)))
+            if frame.opcode in _READ:
+                try:
+                    yield from self._read_records(self._unpack(frame), frame)
+                except UnreadableRecord as error:
+                    scanner.damaged.append(Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
         self.complete = scanner.finished
@@ -194,12 +199,8 @@ class McapReader:
         return b""
 
     def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
-        topics_by_id, ours, parse_head, head_bytes = (
-            self._topics,
-            self._ours,
-            MESSAGE_HEAD.unpack_from,
-            MESSAGE_HEAD.size,
-        )
+        find_topic, ours = self._topics.get, self._ours
+        parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
         memory = 0
         for opcode, begin, end in iterate_records(data):
             if opcode == OP_MESSAGE:
@@ -213,13 +214,8 @@ class McapReader:
                         memory += (length - _LONG_BYTES) * _LONG_RATIO
                 else:
                     memory += 100 + length
-                yield McapMessage(
-                    topics_by_id.get(channel, ""),
-                    data[begin + head_bytes : end],
-                    log_time_ns,
-                    publish_time_ns,
-                    sequence,
-                )
+                payload = data[begin + head_bytes : end]
+                yield McapMessage(find_topic(channel, ""), payload, log_time_ns, publish_time_ns, sequence)
             elif opcode in _DEFINITIONS:
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
