@@ -1,4 +1,4 @@
-"""Asking a site of a running session for a change, over real connections."""
+"""Members of a session are found and connected to, and asked for changes over real connections."""
 
 import threading
 from collections.abc import Iterator
@@ -10,14 +10,19 @@ import pytest
 from sites.change_server import ChangeServer
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
-from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, find_free_endpoints
-from trilat_net.net.discovery import request_change
-from trilat_net.net.membership import EventPublisher
-from trilat_net.net.messages import Info
+from trilat_net.net.bus import LocalNetwork
+from trilat_net.net.clock import ManualClock, SystemClock
+from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
+from trilat_net.net.discovery import connect_to_session, find_members, request_change
+from trilat_net.net.membership import EventPublisher, liveliness_token
+from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
+from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
+
+from .parties import told
+from .waiting import until
 
 SESSION = "o"
 CLOCK = SystemClock()
@@ -97,3 +102,48 @@ def test_a_session_that_has_not_begun_takes_no_changes() -> None:
 def test_whoever_gives_no_answer_is_named() -> None:
     with closing(Answering(running=True, deaf=True)) as site, pytest.raises(SessionError, match="no answer"):
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
+
+
+def find(*payloads: bytes) -> list[Info]:
+    """The members found in half a second, of which each gives one of these answers."""
+    network, clock = LocalNetwork(), ManualClock()
+    for n, payload in enumerate(payloads):
+        network.join().respond(topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent)
+    asker = network.join()
+    return list(find_members(asker, clock, SESSION, stopped=lambda: False, timeout_s=0.5))
+
+
+def test_members_are_found_again_and_again_beside_unreadable_answers() -> None:
+    found = find(encode(told("m0", 1)), b"garbage")
+    assert {info.member for info in found} == {"m0"}
+    assert len(found) >= 2
+    assert find() == []
+
+
+def test_answers_of_another_version_alone_are_an_error_that_names_the_member() -> None:
+    with pytest.raises(SessionError, match=f"the answer of m0 cannot be read: .* version {VERSION + 1}"):
+        find(encode(told("m0", 1, v=VERSION + 1)))
+
+
+def test_a_recorder_announces_itself_while_it_asks_the_first_site_for_the_others() -> None:
+    session = f"discovery-{CLOCK.monotonic_ns()}"
+    first = ZenohBus([default_endpoint(session, 0)])
+    presence = first.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+    scenario = load_scenario("two_sites")
+    info = told("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
+    first.respond(topics.key(session, "m", topics.INFO), lambda _: encode(info))
+    with (
+        closing(first),
+        connect_to_session(
+            Connection(connect=None),
+            CLOCK,
+            session,
+            lambda text: parse_scenario(text).names,
+            stopped=lambda: False,
+            timeout_s=10.0,
+            recorder_boot=7,
+        ) as bus,
+    ):
+        assert bus is not None
+        assert until(presence.poll) == (liveliness_token(session, topics.RECORDER, 7), True)
+        assert presence.poll() is None  # it stays announced

@@ -101,19 +101,6 @@ def test_sites_that_run_say_how_their_links_are() -> None:
     assert visit.look().links == {"m": stats}
 
 
-def test_an_answer_under_the_key_of_another_is_nobodys() -> None:
-    party = Party(("m", "s"))
-    party.start("m")
-    questions = party.stranger.questions(topics.key(SESSION, "nobody", topics.INFO))
-    visit = Visit(party)
-    for _ in range(20):
-        visit.probe.poll()
-        while (question := questions.poll()) is not None:
-            question.answer(encode(told("s", 9)))
-        party.clock.sleep_until(party.clock.monotonic_ns() + S // 100)
-    assert [reach.info.member for reach in visit.look().reached()] == ["m"]
-
-
 def test_it_waits_a_little_for_the_others() -> None:
     party = Party(("m", "s"))
     party.start("m")

@@ -18,7 +18,7 @@ from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info
-from .pinging import QUERY_EVERY_NS, Pinger, RepeatedQuery
+from .pinging import Pinger, RepeatedQuery
 from .wire import decode, encode
 
 
@@ -82,9 +82,6 @@ class EventPublisher:
         """Answers every query for the identity that waits."""
         while (query := self._queries.poll()) is not None:
             query.answer(encode(self.info))
-
-
-ASK_EVERY_NS = QUERY_EVERY_NS
 
 
 class MemberQuery:
