@@ -101,7 +101,7 @@ def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path
         (["--tune", "free", "--gravity", "5"], ["--gravity is from 50 to 150 %"]),
         (["--tune", "free", "--set", "link.model=measured"], ["links.m2->m1", "is measured"]),
         (["--tune", "free", "--set", "sites.s.plant=external"], ["sites.s.plant", "outside of the program"]),
-        (["--tune", "training"], ["keep one of the hands"]),
+        (["--tune", "training"], ["keep one of the operators"]),
     ],
 )
 def test_bad_input_is_refused_in_one_line(logs: Path, arguments: list[str], facts: list[str]) -> None:

@@ -89,7 +89,9 @@ def test_the_twin_has_no_torque_without_a_target_and_no_wall() -> None:
 
 
 def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
-    with pytest.raises(ScenarioError, match=r"training: sites\.m1\.hands: at 0 s .* keep one of the hands"):
+    with pytest.raises(
+        ScenarioError, match=r"training: sites\.m1\.hands: at 0 s .* keep one of the operators"
+    ):
         check_comparable(load_scenario("training"))
 
 

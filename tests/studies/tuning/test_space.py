@@ -67,8 +67,8 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
         ("", ["no law ''", "tuned are adaptive, adaptive_box, p_d, pd_d, p_f, known"]),
-        ("my.file:Law", ["nobody has said where a law from outside is to be searched"]),
-        ("own", ["a law from outside"]),
+        ("my.file:Law", ["a law of your own has no search ranges"]),
+        ("own", ["a law of your own"]),
     ],
 )
 def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:

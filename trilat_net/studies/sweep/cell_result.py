@@ -19,7 +19,7 @@ from ...scenario import Scenario, parse_scenario
 
 
 class CellClass(StrEnum):
-    """What a cell is; the text is the word for people and in results."""
+    """Class of a cell; the text is the word for people and in results."""
 
     CONVERGED = "converged"
     BOUNDED = "bounded oscillation"
@@ -28,7 +28,7 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """True where errors die away, False where they stay or grow; None where nobody knows."""
+        """True if errors die away, False if they stay or grow; None if undecided."""
         return None if self is CellClass.UNDECIDED else self is CellClass.CONVERGED
 
 
@@ -44,10 +44,10 @@ CLASS_OF_MOTION = {
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """One cell, run and judged.
+    """Result of one cell.
 
     Attributes:
-        verdict: what it is.
+        verdict: its class.
         motion: the word of the certificate, which tells growing from diverged and decaying from converged.
         ran_s: how long it ran in the end, extensions and an early stop included, s.
         extended: how often its time was doubled because it had not been decided.

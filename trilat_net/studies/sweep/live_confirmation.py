@@ -67,7 +67,7 @@ class ConfirmedCell(NamedTuple):
 def choose_cells_near_edges(
     rows: Sequence[CellRow], axes: Sequence[str], count: int, longest_s: float = MAX_SESSION_S
 ) -> list[CellRow]:
-    """Returns cells beside edges: so many on the stable side and so many on the other.
+    """Returns cells next to edges, as many on the stable side as on the other.
 
     How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
     other way. The nearest are taken whose runs were short enough; of more than are asked for, those that are
@@ -80,7 +80,7 @@ def choose_cells_near_edges(
         longest_s: cells that ran longer are passed over, s.
 
     Raises:
-        UsageError: there is no edge, or no cell beside one that ran short enough.
+        UsageError: there is no edge, or no cell next to one that ran short enough.
     """
     if count < 1:
         raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")

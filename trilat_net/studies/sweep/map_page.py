@@ -48,7 +48,7 @@ CLASS_COLOURS = {
     CellClass.DIVERGED: "#a23b53",
     CellClass.UNDECIDED: "#ffffff",
 }
-"""Light, middle, dark; white and hatched is what nobody knows."""
+"""Light, middle, dark; undecided is white and hatched."""
 _HATCH = "/////"
 _HATCHED: Any = {"facecolor": "none", "edgecolor": "#8a8a8a", "linewidth": 0.0, "hatch": _HATCH}
 _LINE_STYLES: tuple[dict[str, Any], ...] = (
@@ -59,7 +59,7 @@ _LINE_STYLES: tuple[dict[str, Any], ...] = (
 _HALO_PT = 2.6
 _COUNT_PT = 5.0
 _LETTERS_PER_IN = 13
-"""Of titles: those of panels beside each other stay apart."""
+"""Of titles: those of neighbouring panels stay apart."""
 _LETTER = 0.62
 """Width of a digit over its size."""
 _FULL_IN = 2.3
@@ -169,7 +169,7 @@ def _entitle(axes: Axes, text: str, letters: int) -> None:
 
 
 def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
-    """Hatches cells: those beside each other in a row as one, so that the hatch goes through."""
+    """Hatches cells, neighbours in a row as one, so that the hatch is continuous."""
     for i, row in enumerate(where):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
         for start, end in zip(edges[::2], edges[1::2], strict=True):
@@ -314,7 +314,7 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
 
 
 def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> TextTable:
-    """Returns the measured edges beside the lines, a row each; none where only one axis was swept.
+    """Returns the measured edges next to the lines, a row each; none if only one axis was swept.
 
     The difference is that of a line from the middle of the measured edge; "within" where the line lies in the
     measured edge, as well as its grid can tell.
@@ -344,8 +344,8 @@ def _compare_with_line(plane: MapPlane, edge: MapEdge, line: TheoryLine) -> list
 
 def _meanings(chart: StabilityMap) -> list[str]:
     """Returns what the lines are, each once, and the remarks."""
-    told = {line.text: line.about for lines in chart.lines for line in lines}
-    return [f"{text}: {about}" for text, about in told.items()] + list(chart.remarks)
+    meanings = {line.text: line.about for lines in chart.lines for line in lines}
+    return [f"{text}: {about}" for text, about in meanings.items()] + list(chart.remarks)
 
 
 def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:

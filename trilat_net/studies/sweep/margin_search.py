@@ -32,17 +32,17 @@ MARGIN_TOLERANCE = 0.005
 _MOST = 60
 
 StabilityTest = Callable[[float], bool | None]
-"""Whether a run at a value is stable; None where nobody knows."""
+"""Returns True if a run at a value is stable, None if undecided."""
 
 
 class StableInterval(NamedTuple):
-    """Where an edge lies.
+    """Location of an edge.
 
     Attributes:
         low: the last value below it that was decided.
         high: the first one above it.
         stable_below: whether what lies below is the stable side.
-        sharp: whether the two are as close as was asked; else what is between them was undecided.
+        sharp: True if the two are within the tolerance; else values between them were undecided.
     """
 
     low: float
@@ -62,7 +62,7 @@ class StableInterval(NamedTuple):
 
 
 class KeyMargin(NamedTuple):
-    """What was found along one key.
+    """Edges along one key.
 
     Attributes:
         spans: the edges, from below; none where nothing changes, more than one where the scan saw islands.

@@ -110,7 +110,7 @@ class SweepCell(NamedTuple):
 
 
 class CellTask(NamedTuple):
-    """One run to be made: picklable, and all that a process needs.
+    """One run to be made: picklable, with all that a worker needs.
 
     Attributes:
         written: the experiment.
@@ -131,7 +131,7 @@ class CellTask(NamedTuple):
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """One run that was made.
+    """One finished run.
 
     Attributes:
         cell: its number.
@@ -140,7 +140,7 @@ class CellRun(msgspec.Struct, frozen=True):
         law: the laws of its sites, each once.
         sha256: names its scenario.
         scenario: its canonical text, as what differs from that of the experiment.
-        outcome: what became of it.
+        outcome: its result.
     """
 
     cell: int

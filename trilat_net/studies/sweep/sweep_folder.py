@@ -117,7 +117,7 @@ _DIFFERENCES = {
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
-"""What two sweeps may differ in, in words, in the order in which it is said."""
+"""What two sweeps may differ in, in words, in the order of messages."""
 
 
 class SweepFolder(NamedTuple):

@@ -173,11 +173,11 @@ def _read(text: str) -> Any:
 
 MAX_SEEDS = 100_000
 MAX_EXTENSION = 8.0
-"""A cell that is undecided runs at most so many times as long as the scenario does, unless told otherwise."""
+"""Default limit of an undecided cell's duration, in durations of the scenario."""
 MAX_SCENARIO_S = 86_400.0
 """No scenario is longer, s."""
 _CHECKED_VALUES = 32
-"""So many values of an axis are tried before anything runs."""
+"""Values of an axis that are tried before anything runs."""
 
 
 class SweepPlan(NamedTuple):

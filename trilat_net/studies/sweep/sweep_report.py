@@ -21,11 +21,11 @@ from .sweep_results import GridPoint, ResultRow, SweepResults, collect_grid_poin
 from .sweep_run import SweepSpeed, format_wall_time
 
 _MAX_DOUBTFUL_SHOWN = 8
-"""So many doubtful places are told; all stand in the file."""
+"""Most doubtful grid points printed; all stand in the file."""
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns what will be run, before it is."""
+    """Returns the plan in lines, before it runs."""
     sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
     count = len(plan.seeds)
@@ -43,7 +43,7 @@ def _values(texts: Sequence[str]) -> str:
 
 
 def summarize_sweep(results: SweepResults) -> Iterator[str]:
-    """Yields what came of it: verdicts, extensions, seeds."""
+    """Yields a summary: verdicts, extensions, seeds."""
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
     words = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
@@ -88,7 +88,7 @@ def _describe_grid_point(plan: SweepPlan, place: GridPoint) -> str:
 
 
 def describe_sweep_speed(speed: SweepSpeed) -> str:
-    """Returns how fast it went."""
+    """Returns the speed in words."""
     on = "1 process" if speed.jobs == 1 else f"{speed.jobs} processes"
     return (
         f"{speed.runs} runs, {speed.simulated_s:.4g} s simulated, "
@@ -98,7 +98,7 @@ def describe_sweep_speed(speed: SweepSpeed) -> str:
 
 
 def list_next_commands(folder: Path) -> list[str]:
-    """Returns what can be done with the results."""
+    """Returns commands that use the results."""
     where = shlex.quote(str(folder))
     return [
         f"trilat sweep {where} --cell 0      # the command that makes a log of a cell",
@@ -107,7 +107,7 @@ def list_next_commands(folder: Path) -> list[str]:
 
 
 class ReproduceCommand(NamedTuple):
-    """How to run a row again.
+    """The command that repeats a row.
 
     Attributes:
         command: the command.
@@ -119,7 +119,7 @@ class ReproduceCommand(NamedTuple):
 
 
 def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> ReproduceCommand:
-    """Returns how to run a row again."""
+    """Returns the command that repeats a row."""
     if _source_unchanged(results.plan.written, results.plan.cell(row["cell"]).overrides, row):
         return ReproduceCommand(row["command"])
     name = f"cell-{row['cell']}-seed-{row['seed']}"
@@ -134,7 +134,7 @@ def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path)
 
 
 def _source_unchanged(written: SweepSource, overrides: tuple[str, ...], row: ResultRow) -> bool:
-    """Returns whether the name that the row's command has still means what was swept."""
+    """Returns True if the source that the row's command names is still the swept one."""
     try:
         text, folder = read_source(written.source)
         now = written._replace(text=text, folder=str(folder))

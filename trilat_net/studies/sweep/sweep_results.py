@@ -24,7 +24,7 @@ from .sweep_plan import SweepPlan, plan_from_json
 
 
 class ShareInterval(NamedTuple):
-    """From where to where a share may lie."""
+    """Interval of a share."""
 
     low: float
     high: float
@@ -70,10 +70,10 @@ def require_polars() -> Any:
 
 
 class SweepResults(NamedTuple):
-    """A sweep that was run.
+    """Results of a sweep.
 
     Attributes:
-        plan: what was asked.
+        plan: the sweep.
         rows: its runs, by cell and then in the order of the seeds.
     """
 
@@ -90,7 +90,7 @@ class SweepResults(NamedTuple):
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Returns what became of a run."""
+        """Returns the result of a run."""
         return msgspec.convert({field: row[field] for field in CellResult.__struct_fields__}, CellResult)
 
 

@@ -29,19 +29,19 @@ from .sweep_results import (
 
 MAX_RUNS = 1_000_000
 MAX_SWEEP_S = 86_400.0
-"""A sweep of more, or one that would take longer, is asked about first."""
+"""A sweep of more runs, or one that would take longer, needs a confirmation."""
 _PROBES = 7
 _PROBING_S = 3.0
-"""So many runs tell how long all will take; fewer, once that has taken so long."""
+"""Runs of an estimate; fewer, once they have taken so long."""
 _RESUME_HINT = "; what is done is kept: go on with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """How long a sweep will take, by a few of its runs, which are done then.
+    """Duration of a sweep, estimated by a few of its runs, which are done then.
 
     Attributes:
         runs: how many there are at most, those that are done left out.
-        seconds: how long they will take on the processes that were asked for.
+        seconds: how long they will take on the requested processes.
         entries: the runs that were made.
     """
 
@@ -51,7 +51,7 @@ class DurationEstimate(NamedTuple):
 
 
 class SweepSpeed(NamedTuple):
-    """How fast a sweep went, this time.
+    """Speed of a sweep, this time.
 
     Attributes:
         runs: how many were made.
@@ -72,7 +72,7 @@ class SweepSpeed(NamedTuple):
 
 
 class FinishedSweep(NamedTuple):
-    """A sweep that has come to its end.
+    """A finished sweep.
 
     Attributes:
         results: what came of it.
@@ -131,7 +131,7 @@ def refuse_oversized_sweep(plan: SweepPlan, expected: DurationEstimate, jobs: in
 
 
 def format_wall_time(seconds: float) -> str:
-    """Returns a time as people say it."""
+    """Returns a duration for people."""
     for unit, size, from_s in (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0)):
         if seconds >= from_s:
             return f"{seconds / size:.3g} {unit}"
@@ -150,13 +150,13 @@ def run_sweep(
     Args:
         folder: of the sweep; what its journal has is not run again.
         jobs: in how many processes; None for one per core.
-        progress: told how many runs are done, and how many there are as far as is known.
+        progress: called with the runs that are done, and their number as far as it is known.
         known: runs that were made already, for an estimate.
         on: what runs the cells instead: a Dask scheduler's address or an executor.
 
     Raises:
         ScenarioError: a cell cannot run; says which. What is done is kept.
-        RunFailed: a process was ended by somebody. What is done is kept.
+        RunFailed: a cell ended its workers, or the cluster is gone. What is done is kept.
         UsageError: polars is not installed.
     """
     require_polars()

@@ -180,7 +180,7 @@ def _end_spread_rad(tallies: list[SiteStats], end_ns: int) -> float | None:
 
 
 BATCH_RECORDS = 1000
-"""How many records of a site are held before its tally takes them in."""
+"""Records of a site that are collected before its statistics take them in."""
 
 
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
@@ -244,7 +244,7 @@ def _site_stats(scenario: Scenario, site: str) -> SiteStats:
 
 
 class _PendingRecords:
-    """One site's records that its tally has not taken in yet."""
+    """One site's records that its statistics have not taken in yet."""
 
     def __init__(self, site: Site, tally: SiteStats) -> None:
         self.site, self.tally = site, tally
@@ -265,7 +265,7 @@ class _PendingRecords:
             self.flush()
 
     def flush(self) -> None:
-        """Hands over what is held."""
+        """Passes the pending records on."""
         t_ns = np.array(self._t_ns, dtype=np.int64)
         used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), len(self.site.peers))
         q, qd, q_des, tau, tau_x = np.array(self._floats).reshape(len(t_ns), 5, JOINTS).transpose(1, 0, 2)

@@ -24,7 +24,7 @@ from .measure_run import RunMetrics, measure_log, measure_virtual_run
 
 
 class TrialResult(NamedTuple):
-    """How a trial came out.
+    """Result of a trial.
 
     Attributes:
         trial: what was run.
@@ -44,12 +44,12 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True where the run came to its end and showed all that was expected."""
+        """True if the run reached its end and met all expectations."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
     def failures(self) -> list[str]:
-        """What did not hold, a sentence each."""
+        """Unmet expectations, a sentence each."""
         words = [
             f"{outcome.key}: {outcome.measured}, asked {outcome.limit}"
             for outcome in self.outcomes

@@ -16,7 +16,7 @@ from .expectations import ExpectationResult
 from .trial import TrialResult
 
 MAX_FAILURES_SHOWN = 5
-"""So many failed runs of a scenario are told in full; of the others the seeds."""
+"""Failed runs of a scenario that are printed in full; of the others the seeds."""
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 

@@ -23,7 +23,7 @@ from ...scenario.operators import JointSpring, Wall
 from ...scenario.scenario_types import SiteSpec
 
 CONFLICT_RAD = 0.02
-"""Hands whose targets are further from the consensus than this hold the arms apart."""
+"""Operators whose targets are further from the consensus than this hold the arms apart."""
 _LOOK_HZ = 100.0
 
 
@@ -50,7 +50,7 @@ def check_comparable(scenario: Scenario) -> None:
     if len(groups) > 1:
         words = " and ".join(", ".join(scenario.names[site] for site in group) for group in groups)
         raise ScenarioError(
-            f"these groups follow nobody else: {words}; there is no pose that all would come to",
+            f"these groups follow no other site: {words}; there is no pose that all would reach",
             path="dominance",
             source=scenario.name,
         )
@@ -67,7 +67,7 @@ def _measured_link_error(scenario: Scenario, path: str) -> ScenarioError:
 
 
 def _refuse_conflict(scenario: Scenario) -> None:
-    """Refuses hands that want different poses at one time: no law can bring such arms together."""
+    """Refuses operators that hold different poses at one time: no law can bring such arms together."""
     t_s = np.arange(0.0, scenario.duration_s, 1.0 / _LOOK_HZ)
     pose = compute_consensus_pose(scenario, t_s)
     for name, hand in _springs(scenario):
@@ -77,7 +77,7 @@ def _refuse_conflict(scenario: Scenario) -> None:
             at_s = t_s[apart.max(axis=1).argmax()]
             raise ScenarioError(
                 f"at {at_s:g} s this hand wants another pose than others do: no law can bring the arms "
-                "together, and their distance says nothing of the law; keep one of the hands",
+                "together, and their distance says nothing of the law; keep one of the operators",
                 path=f"sites.{name}.hands",
                 source=scenario.name,
             )

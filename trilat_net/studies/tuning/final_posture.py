@@ -119,7 +119,7 @@ def _warn_truncated(log: Log, sites: Iterable[str]) -> list[str]:
 
 
 def _warn_hanging(log: Log, ends: dict[str, Array]) -> list[str]:
-    """Says so where arms hang, or are where nobody can have pushed them."""
+    """Warns if arms hang, or are where no operator can have pushed them."""
     hanging = [site for site, q in ends.items() if _down(q) and not _down(log[site].q[0])]
     if hanging:
         return [

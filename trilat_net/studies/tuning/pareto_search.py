@@ -82,7 +82,7 @@ def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
 REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
 """Deviation of the refinements, round by round, as a share of the logarithm of a gain's range."""
 GAIN_DIGITS = 4
-"""Gains are rounded to so many significant digits before they are tried, so that they can be told."""
+"""Gains are rounded to so many significant digits before they are tried, so that a command can name them."""
 
 CandidateGains = dict[str, float]
 
@@ -115,7 +115,7 @@ class CandidateSearch:
         self.rounds = [first, *(share + (n < more) for n in range(count))]
 
     def ask(self, number: int) -> list[CandidateGains]:
-        """Returns the candidates of a round, all earlier ones of which were told."""
+        """Returns the candidates of a round; `tell` has taken all earlier ones."""
         count = self.rounds[number]
         places = self._hypercube(count) if number == 0 else self._refined(count, REFINEMENT_STEPS[number - 1])
         return [self._gains(place) for place in places]
@@ -132,7 +132,7 @@ class CandidateSearch:
         return points
 
     def _refined(self, count: int, step: float) -> Array:
-        """Returns points beside the parents, shape (count, knobs), within the ranges."""
+        """Returns points near the parents, shape (count, knobs), within the ranges."""
         parents = self._parents(count).reshape(count, len(self.space.knobs))
         moved: Array = np.clip(parents + step * self._rng.standard_normal(parents.shape), 0.0, 1.0)
         return moved

@@ -18,28 +18,28 @@ from ...scenario.fields import MAX_QUANTITY, suggest_nearest
 GRAVITY_PARAMETERS = slice(3, PARAMETERS)
 """Where the gravity parameters stand in theta, Eq. (24)."""
 MIN_BOX = 0.1
-"""A box of estimates is at least so wide to either side of what is told, as a share of it."""
+"""Least half width of a box of estimates, as a share of the given parameters."""
 
 
 class ModelInformation(NamedTuple):
-    """What is told.
+    """Model information that every law gets.
 
     Attributes:
-        gravity: what is told of gravity, as a share of the truth; 1: exactly.
+        gravity: the given gravity parameters as a share of the true ones; 1: exactly.
     """
 
     gravity: float = 1.0
 
     @property
     def box(self) -> float:
-        """Half the width of a box of estimates, as a share of what is told: twice the error, or 10 %."""
+        """Half width of a box of estimates, a share of the given parameters: twice the error, or 10 %."""
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the first estimate of theta, shape (5,): gravity as told, inertia unknown."""
-        told = scenario.sites[site].arm.theta * self.gravity
-        told[: GRAVITY_PARAMETERS.start] = 0.0
-        return [float(f"{value:.12g}") for value in told]
+        """Returns the first estimate of theta, shape (5,): gravity as given, inertia unknown."""
+        theta = scenario.sites[site].arm.theta * self.gravity
+        theta[: GRAVITY_PARAMETERS.start] = 0.0
+        return [float(f"{value:.12g}") for value in theta]
 
     def low(self, scenario: Scenario, site: str) -> list[float]:
         """Returns the lower sides of the box, shape (5,)."""
@@ -63,7 +63,7 @@ class ModelInformation(NamedTuple):
 
 
 def build_model_information(gravity_percent: float) -> ModelInformation:
-    """Returns what a person says all laws are to be told.
+    """Returns the model information with a share of the true gravity, in per cent.
 
     Raises:
         UsageError: it is none that an arm could be built with.
@@ -102,7 +102,7 @@ class SearchSpace(NamedTuple):
     Attributes:
         law: what the law is called here.
         knobs: its gains.
-        told: what of the common knowledge it can use, in words.
+        told: what it uses of the common model information, in words.
         controls: writes a choice of gains out as the control of every site.
     """
 
@@ -212,8 +212,7 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
     for name in names:
         if ":" in name or name == "own":
             raise UsageError(
-                f"--law {name}: nobody has said where a law from outside is to be searched; "
-                f"tuned are {', '.join(SEARCH_SPACES)}"
+                f"--law {name}: a law of your own has no search ranges; tuned are {', '.join(SEARCH_SPACES)}"
             )
         if name not in SEARCH_SPACES:
             raise UsageError(

@@ -77,7 +77,7 @@ class TuningPlan(NamedTuple):
         budget: candidates per law.
         seed: of the search.
         objective: what is weighed against effort.
-        knowledge: what every law is told.
+        knowledge: the model information that every law gets.
     """
 
     base: TuningScenario
@@ -94,16 +94,16 @@ class TuningPlan(NamedTuple):
 
     @property
     def informed(self) -> bool:
-        """True where one of the laws is told more than the others."""
+        """True if one of the laws gets more information than the others."""
         return any(space.law == "known" for space in self.spaces)
 
     @property
     def twin(self) -> bool:
-        """True where the pose is judged on a twin: then every candidate is two runs."""
+        """True if the pose is measured on a twin: then every candidate is two runs."""
         return build_twin(self.base.scenario) is not None
 
     def printed(self) -> dict[str, TuningScenario]:
-        """Returns the gains that the paper prints, by name: told what all are told, and told nothing."""
+        """Returns the gains that the paper prints, by name, with the common information and without."""
         names = self.base.scenario.names
         table = {"law": "adaptive", **PAPER_GAINS}
         prior = {name: self.knowledge.prior(self.base.scenario, name) for name in names}
@@ -141,7 +141,7 @@ class TuningPlan(NamedTuple):
         """Searches every law and returns what was found.
 
         Raises:
-            RunFailed: a process was ended by somebody.
+            RunFailed: a candidate ended its workers, or the cluster is gone.
         """
         searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
         printed = self.printed()
@@ -244,7 +244,7 @@ def plan_tuning(
         budget: candidates per law.
         seed: of the search; the seed of the scenario is the scenario's own.
         objective: "error" or "settling".
-        gravity_percent: what all laws are told of gravity, in per cent of the truth.
+        gravity_percent: gravity that all laws get, in per cent of the truth.
 
     Raises:
         ScenarioError: the scenario is none, or laws cannot be compared in it.

@@ -44,7 +44,7 @@ def _law_row(tuned: TuningResult, found: SearchResult) -> tuple[str, ...]:
 
 
 def tabulate_search(plan: TuningPlan) -> TextTable:
-    """Returns a row per law and gain: where it was searched, and what the law is told."""
+    """Returns a row per law and gain: its range, and the information the law gets."""
     return TextTable(
         ("law", "gain", "unit", "from", "to", "told"),
         [
@@ -112,7 +112,7 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         f"refined; seed {plan.seed}",
         f"{scenario.duration_s:g} s of {scenario.name}, its seed {scenario.seed}, "
         f"torques clamped at {clamp} N m",
-        plan.knowledge.text + ("; known is told inertia exactly as well" if plan.informed else ""),
+        plan.knowledge.text + ("; known gets inertia exactly as well" if plan.informed else ""),
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS of tau - G(q)",
     ]
     if plan.objective is Objective.SETTLING:
