@@ -52,8 +52,8 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (("done", "--map", "--confirm", "1"), "--map and --confirm are two things"),
-        (("done", "--map", "--cell", "1"), "--map and --cell are two things"),
+        (("done", "--map", "--confirm", "1"), "--map and --confirm exclude each other"),
+        (("done", "--map", "--cell", "1"), "--map and --cell exclude each other"),
         (("done", "--width", "7"), "--width is of a map"),
         (("done", "--map", "--width", "5"), "a figure is 3.5 or 7 in wide, not 5"),
         (("done", "--margin", "control.Kd=1:4"), "--margin is of a scenario"),

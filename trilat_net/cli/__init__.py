@@ -10,16 +10,16 @@ import sys
 from typing import Any
 
 import typer
-from rich.markup import escape
 from typer.core import TyperGroup
 
 from ..errors import TrilatError
 from ..process import Interrupt
-from ..reporting.terminal_output import err
+from ..reporting.terminal_output import err, print_error
 from . import (
     certify,
     compare,
     demo,
+    figure,
     linear,
     log,
     metrics,
@@ -28,6 +28,7 @@ from . import (
     replay,
     report,
     rerun,
+    router,
     scenario,
     sim,
     site,
@@ -41,8 +42,7 @@ from . import set as set_command
 class _Commands(TyperGroup):
     """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1.
 
-    The framework's way is an exception, which Python drops where it is raised inside a `__del__`;
-    `Interrupt` remembers the signal all the same.
+    Its exception gets lost where Python raises it inside a `__del__`; `Interrupt` remembers the signal.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -65,22 +65,26 @@ app = typer.Typer(
     help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
     epilog="Begin with: trilat demo paper",
 )
-app.add_typer(demo.app)
-app.add_typer(site.app)
-app.add_typer(record.app)
-app.add_typer(ping.app)
-app.add_typer(sim.app)
-app.add_typer(verify.app)
-app.add_typer(certify.app)
-app.add_typer(metrics.app)
-app.add_typer(compare.app)
-app.add_typer(report.app)
-app.add_typer(replay.app)
-app.add_typer(rerun.app)
+for _module in (
+    demo,
+    site,
+    record,
+    ping,
+    router,
+    sim,
+    verify,
+    certify,
+    metrics,
+    compare,
+    figure,
+    report,
+    replay,
+    rerun,
+):
+    app.add_typer(_module.app)
 app.add_typer(log.app, name="log")
-app.add_typer(test.app)
-app.add_typer(sweep.app)
-app.add_typer(linear.app)
+for _module in (test, sweep, linear):
+    app.add_typer(_module.app)
 app.add_typer(scenario.app, name="scenario")
 app.add_typer(set_command.app, name="set")
 
@@ -90,20 +94,20 @@ def main() -> None:
     try:
         _run()
     finally:
-        gc.freeze()  # the end of the process need not look through every record again
+        gc.freeze()  # at exit, Python need not traverse every record
 
 
 def _run() -> None:
     try:
         app()
     except TrilatError as error:
-        err.print(f"error: {escape(str(error))}", soft_wrap=True)
+        err.print(f"error: {error}", markup=False, soft_wrap=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # the reader of a pipe had enough
+    except BrokenPipeError:  # the reader of a pipe has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
-    except OSError as error:  # a full disk, a folder that vanished: the machine's, and told in one line
-        err.print(f"error: {escape(f'{error.filename}: ' if error.filename else '')}{error.strerror}")
+    except OSError as error:  # a full disk, a folder that vanished
+        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror}")
         sys.exit(1)

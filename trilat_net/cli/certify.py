@@ -1,12 +1,11 @@
 """`trilat certify`: the Lyapunov certificate of a run: V, its energy balance, premises, growth."""
 
-import json
 from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
 
-from ..reporting.terminal_output import open_with_progress, out, print_table
+from ..reporting.terminal_output import open_with_progress, out, print_json, print_table
 from ..reporting.text_table import TextTable
 from .options import JsonOption, LogsArgument
 
@@ -27,7 +26,7 @@ _MARKS = {
 
 @app.command("certify", epilog="Example: trilat certify run.mcap")
 def certify_command(files: LogsArgument, as_json: JsonOption = False) -> None:
-    """Says whether a run was stable, and why: V and its energy balance, the theorem's premises, growth.
+    """Judges the stability of a run: V and its energy balance, the theorem's premises, growth.
 
     Nothing is executed; docs/certificate.md defines every word and every key of the JSON.
 
@@ -40,7 +39,7 @@ def certify_command(files: LogsArgument, as_json: JsonOption = False) -> None:
 
     found = certified(open_with_progress(*files))
     if as_json:
-        typer.echo(json.dumps(certificate_to_json(found), indent=2, ensure_ascii=False, allow_nan=False))
+        print_json(certificate_to_json(found))
     else:
         _show(found)
     if not found.passed:

@@ -3,7 +3,6 @@
 Invariant: numbers are printed and nothing is ranked.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -16,13 +15,15 @@ from ..errors import UsageError
 from ..reporting.terminal_output import (
     open_with_progress,
     out,
-    print_line,
+    print_json,
+    print_paths,
     print_table,
+    print_text,
     progress_bar,
     sanitize,
 )
 from ..reporting.text_table import TextTable
-from .options import DurationOption, ForceOption, JsonOption, OnOption, SetOption
+from .options import DurationOption, ForceOption, JobsOption, JsonOption, OnOption, SetOption, list_overrides
 
 if TYPE_CHECKING:
     from ..analysis.metrics.log_metrics import MetricComparison
@@ -39,20 +40,14 @@ def print_log_comparison(
     found: "MetricComparison",
     remarks: Mapping[str, Sequence[str]],
 ) -> None:
-    """Prints a comparison of logs.
-
-    Args:
-        logs: the logs.
-        different: in what their experiments differ.
-        found: their quantities.
-        remarks: per log what its figures do not tell.
-    """
+    """Prints the differences of the experiments, the quantities of the logs, and remarks per log."""
     names = {log.scenario.name for log in logs}
     if len(names) > 1:
-        out.print(escape(f"logs of different scenarios: {', '.join(sorted(map(sanitize, names)))}"))
+        print_text(f"logs of different scenarios: {', '.join(sorted(names))}")
     if different:
         out.print()
-        print_table(_tabulate_differences(different, found.columns))
+        rows = [(str(one), *one.values) for one in different]
+        print_table(TextTable(("differs", *found.columns), rows))
     else:
         out.print("one and the same experiment")
     out.print()
@@ -62,10 +57,6 @@ def print_log_comparison(
         for line in lines:
             out.print(f"[bold]note[/bold] {escape(sanitize(f'{name}: {line}'))}", soft_wrap=True)
     _print_reasons(found)
-
-
-def _tabulate_differences(different: Sequence["ScenarioDifference"], columns: Sequence[str]) -> TextTable:
-    return TextTable(("differs", *columns), [(str(one), *one.values) for one in different])
 
 
 def _tabulate_quantities(found: "MetricComparison") -> TextTable:
@@ -80,7 +71,7 @@ def _tabulate_quantities(found: "MetricComparison") -> TextTable:
 
 
 def _print_reasons(found: "MetricComparison") -> None:
-    """Says why numbers are missing, of very many the first."""
+    """Prints why numbers are missing; of very many the first."""
     reasons = [
         f"{name}: no {row.quantity.name}: {entry.why}"
         for row in found.rows
@@ -88,34 +79,25 @@ def _print_reasons(found: "MetricComparison") -> None:
         if entry.value is None and entry.applies
     ]
     for line in reasons[:_MOST_REASONS]:
-        out.print(escape(sanitize(line)), soft_wrap=True)
+        print_text(line)
     if len(reasons) > _MOST_REASONS:
         out.print(f"and {len(reasons) - _MOST_REASONS} more, which --json names")
 
 
 _MAX_FRONT_ROWS = 8
-"""So many points of a front are printed; all stand in the files."""
+"""Points of a front that are printed; the files hold all."""
 
 
-def run_tuning(
+def _run_tuning(
     asked: "TuningPlan",
     folder: Path | None,
     jobs: int | None,
     *,
-    on: str | None = None,
+    on: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Runs a comparison, writes it into a folder, and prints it.
-
-    Args:
-        asked: the comparison.
-        folder: where it goes; None for the next free one below runs.
-        jobs: in how many processes; None for one per core.
-        on: the address of a Dask scheduler; None for processes of this machine.
-        force: whether a folder that holds something may be used.
-        as_json: whether to print it as JSON.
-    """
+    """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
     from ..files import make_results_folder
     from ..studies.executor import count_workers
     from ..studies.tuning.tuning_figure import write_tuning
@@ -129,26 +111,23 @@ def run_tuning(
         found = asked.run(jobs, progress, on)
     paths = write_tuning(found, chosen)
     if as_json:
-        print_line(json.dumps(tuning_to_json(found), indent=2, ensure_ascii=False, allow_nan=False))
+        print_json(tuning_to_json(found))
     else:
         _print_tuned(found)
-        for path in paths:
-            out.print(f"  {escape(str(path))}", soft_wrap=True)
+        print_paths(paths)
 
 
-def _print_procedure(asked: "TuningPlan", used: int) -> None:
-    """Prints what is the same for all laws, and how long the search will take."""
+def _print_procedure(asked: "TuningPlan", workers: int) -> None:
+    """Prints the conditions that all laws share, and the expected duration of the search."""
     from ..studies.tuning.tuning_tables import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
-    out.print(escape(f"{asked.base.scenario.name}, laws {laws}; the same for all:"), soft_wrap=True)
+    print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
     for line in describe_procedure(asked):
-        out.print(escape(f"  {line}"), soft_wrap=True)
-    time = _format_duration(asked.estimate_s(used))
-    on = "1 core" if used == 1 else f"{used} cores"
-    out.print(
-        f"{asked.runs} runs on {on}: about {time} at the speed that this machine has now", soft_wrap=True
-    )
+        print_text(f"  {line}")
+    cores = "1 core" if workers == 1 else f"{workers} cores"
+    duration = _format_duration(asked.estimate_s(workers))
+    print_text(f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine")
 
 
 def _format_duration(seconds: float) -> str:
@@ -158,7 +137,7 @@ def _format_duration(seconds: float) -> str:
 
 
 def _print_tuned(found: "TuningResult") -> None:
-    """Prints the laws, every front, the gains as printed, and the commands of the best points."""
+    """Prints the laws, every front, the gains of the paper, and the commands of the best points."""
     from ..studies.tuning.tuning_tables import (
         list_class_meanings,
         tabulate_front,
@@ -169,7 +148,7 @@ def _print_tuned(found: "TuningResult") -> None:
     out.print()
     print_table(tabulate_laws(found))
     for line in list_class_meanings():
-        out.print(escape(f"  {line}"), soft_wrap=True)
+        print_text(f"  {line}")
     for law in found.found:
         if law.front:
             out.print()
@@ -181,18 +160,14 @@ def _print_tuned(found: "TuningResult") -> None:
     print_table(tabulate_paper_gains(found))
     for law in found.found:
         for gain in found.at_edge(law):
-            out.print(
-                f"note: {law.space.law} has its least at the edge of what is searched of {gain}; "
-                "it may lie beyond",
-                soft_wrap=True,
-            )
+            print_text(f"note: {law.space.law} is best at the edge of the range of {gain}; widen the search")
     if not any(law.front for law in found.found):
         out.print("\nno candidate of any law settled: a longer --duration or a larger --budget may show more")
         return
-    out.print("\nthe last of each front, to run; the others stand in front.md:")
+    out.print("\nthe last of each front, to run; front.md has the others:")
     for law in found.found:
         for place in law.front[-1:]:
-            out.print(f"  {escape(found.candidate(law, place).command)}", soft_wrap=True)
+            print_text(f"  {found.candidate(law, place).command}")
 
 
 app = typer.Typer()
@@ -234,14 +209,14 @@ def compare_command(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", metavar="S", help="Of the search; default: 1.", rich_help_panel=_TUNING),
+        typer.Option("--seed", metavar="S", help="Seed of the search; default: 1.", rich_help_panel=_TUNING),
     ] = None,
     objective: Annotated[
         str | None,
         typer.Option(
             "--objective",
             metavar="error|settling",
-            help="What is weighed against effort; default: error.",
+            help="The objective besides effort; default: error.",
             rich_help_panel=_TUNING,
         ),
     ] = None,
@@ -250,38 +225,29 @@ def compare_command(
         typer.Option(
             "--gravity",
             metavar="PERCENT",
-            help="What all laws are told of gravity, in % of the truth; default: 100.",
+            help="Gravity that all laws assume, in % of the truth; default: 100.",
             rich_help_panel=_TUNING,
         ),
     ] = None,
     duration: DurationOption = None,
     overrides: SetOption = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs",
-            metavar="N",
-            min=1,
-            help="Processes; default: one per core.",
-            rich_help_panel=_TUNING,
-        ),
-    ] = None,
+    jobs: JobsOption = None,
     on: OnOption = None,
     output: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Where the front goes; default: the next free runs/tune-...",
+            help="Folder of the results; default: the next free runs/tune-...",
             rich_help_panel=_TUNING,
         ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compares logs side by side, with what differs in their experiments; or laws, each tuned alike.
+    """Compares logs side by side, with the differences of their experiments; or laws, each tuned alike.
 
-    Nothing is ranked: arms that hang, or were never pushed, have small errors too.
+    Nothing is ranked: arms that hang, or that nobody pushed, have small errors too.
     """
     if tune is None:
         of_tuning = {
@@ -297,7 +263,9 @@ def compare_command(
             "--out": output,
             "--force": force or None,
         }
-        _refuse_tuning_options(of_tuning)
+        for name, value in of_tuning.items():
+            if value is not None:
+                raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
         _compare_logs(files or [], as_json=as_json)
         return
     if files:
@@ -307,29 +275,21 @@ def compare_command(
 
     asked = plan_tuning(
         tune,
-        [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])],
+        list_overrides(overrides, duration),
         laws=[name.strip() for name in law.split(",")] if law is not None else (),
         budget=DEFAULT_BUDGET if budget is None else budget,
         seed=1 if seed is None else seed,
         objective="error" if objective is None else objective,
         gravity_percent=100.0 if gravity is None else gravity,
     )
-    run_tuning(asked, output, jobs, on=on, force=force, as_json=as_json)
-
-
-def _refuse_tuning_options(options: Mapping[str, object]) -> None:
-    """Refuses options of a search where none was asked for."""
-    for name, value in options.items():
-        if value is not None:
-            raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
+    _run_tuning(asked, output, jobs, on=on, force=force, as_json=as_json)
 
 
 def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     """Compares logs, side by side."""
     if len(files) < 2:
         raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
-    from ..analysis.metrics.log_metrics import compare_metrics as compared
-    from ..analysis.metrics.log_metrics import comparison_to_json
+    from ..analysis.metrics.log_metrics import compare_metrics, comparison_to_json
     from ..scenario.describe import compare_scenarios
     from ..studies.tuning.final_posture import check_final_posture
 
@@ -337,7 +297,7 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     names = name_columns(files)
     different = compare_scenarios([log.scenario for log in logs])
     remarks = {name: check_final_posture(log) for name, log in zip(names, logs, strict=True)}
-    found = compared(logs, names)
+    found = compare_metrics(logs, names)
     if not as_json:
         print_log_comparison(logs, different, found, remarks)
         return
@@ -351,11 +311,11 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
         "remarks": remarks,
         **comparison_to_json(found),
     }
-    print_line(json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False))
+    print_json(facts)
 
 
 def name_columns(files: list[Path]) -> list[str]:
-    """Returns what logs are called: the file's name, or as much of its path as tells them apart."""
+    """Returns a column name per log: the file's name, with as much of its path as tells them apart."""
     for depth in range(1, max(len(file.parts) for file in files) + 1):
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
         if len(set(names)) == len(names):

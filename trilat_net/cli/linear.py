@@ -1,6 +1,5 @@
 """`trilat linear`: roots, margins and haptic ports of the loop linearised about its equilibrium."""
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out, print_table
-from .options import ForceOption, ScenarioArgument, SetOption
+from ..reporting.terminal_output import out, print_json, print_paths, print_table, print_text
+from .options import ForceOption, JsonOption, ScenarioArgument, SetOption
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
@@ -42,28 +41,28 @@ def linear_command(
             "--pose", metavar="Q1,Q2", help="All sites here, rad, estimates true; default: a run's end."
         ),
     ] = None,
-    roots: Annotated[int, typer.Option("--roots", metavar="N", help="How many roots are shown.")] = 6,
+    roots: Annotated[int, typer.Option("--roots", metavar="N", help="Number of roots to print.")] = 6,
     over: Annotated[
         list[str] | None,
-        typer.Option("--over", metavar="KEY=LOW:HIGH", help="Say where stability changes; repeatable."),
+        typer.Option("--over", metavar="KEY=LOW:HIGH", help="Find where stability changes; repeatable."),
     ] = None,
     ports: Annotated[
-        bool, typer.Option("--ports/--no-ports", help="What hands feel, and whether it is passive there.")
+        bool, typer.Option("--ports/--no-ports", help="Impedances that operators feel, and passivity.")
     ] = True,
     picture: Annotated[
         Path | None, typer.Option("--figure", metavar="FILE", help="Draw it: .png, .svg or .pdf.")
     ] = None,
     what: Annotated[
-        LinearFigure, typer.Option("--draw", help="What is drawn: roots, what hands feel, or passivity.")
+        LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
     ] = LinearFigure.ROOTS,
     force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Says how small motions about the resting pose grow or die, and what hands feel of each other.
+    """Linearises the loop about its equilibrium: stability of small motions, and the operators' impedances.
 
-    The loop is linearised with its delays: roots, delay margin, edges of stability (docs/linear.md); then,
-    with hands and environments off, passivity, Llewellyn's criterion, impedance and Z-width (docs/ports.md).
-    Exit code 0 whatever the verdict.
+    With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators and
+    environments off, passivity, Llewellyn's criterion, impedance and Z-width (docs/ports.md). Exit code 0 for
+    any verdict.
     """
     if picture is not None:
         _check_picture(picture, force=force)
@@ -85,11 +84,14 @@ def linear_command(
         return
     _show(found)
     if ports and section is not None:
-        _show_ports(section)
+        from ..reporting.port_text import describe_ports
+
+        for text in describe_ports(section):
+            print_text(text)
     for (key, low, high), line in zip(spans, lines.values(), strict=True):
-        out.print(escape(_edge_words(key, low, high, line, found.scenario)), soft_wrap=True)
+        print_text(_edge_words(key, low, high, line, found.scenario))
     if picture is not None:
-        out.print(f"  {escape(str(picture))}", soft_wrap=True)
+        print_paths([picture])
 
 
 def _pose(text: str | None) -> tuple[float, float] | None:
@@ -146,10 +148,9 @@ def _print_json(
     from ..theory.linear_analysis import linear_to_json
     from ..theory.port_analysis import ports_to_json
 
-    told = linear_to_json(found)
-    told["ports"] = None if section is None else ports_to_json(section)
-    told["edges"] = {key: [one._asdict() for one in line] for key, line in lines.items()}
-    typer.echo(json.dumps(told, indent=2, ensure_ascii=False, allow_nan=False))
+    ports = None if section is None else ports_to_json(section)
+    edges = {key: [one._asdict() for one in line] for key, line in lines.items()}
+    print_json({**linear_to_json(found), "ports": ports, "edges": edges})
 
 
 def _show(found: "LinearAnalysis") -> None:
@@ -157,32 +158,24 @@ def _show(found: "LinearAnalysis") -> None:
     from ..reporting import linear_text
 
     for line in (*linear_text.describe_equilibrium(found), *linear_text.describe_effective_delays(found)):
-        out.print(escape(line), soft_wrap=True)
+        print_text(line)
     out.print()
     print_table(linear_text.tabulate_roots(found))
-    out.print(linear_text.describe_zero_roots(found), soft_wrap=True)
+    print_text(linear_text.describe_zero_roots(found))
     verdict, _, rest = linear_text.describe_linear_verdict(found).partition(":")
     out.print(f"[{_COLOURS[verdict]}]{verdict}[/]:{escape(rest)}", soft_wrap=True)
-    out.print(escape(linear_text.describe_delay_margin(found)), soft_wrap=True)
+    print_text(linear_text.describe_delay_margin(found))
     for note in found.notes:
-        out.print(f"note: {escape(note)}", soft_wrap=True)
-
-
-def _show_ports(section: "PortAnalysis") -> None:
-    """Prints what there is to say of the ports."""
-    from ..reporting.port_text import describe_ports
-
-    for line in describe_ports(section):
-        out.print(escape(line), soft_wrap=True)
+        print_text(f"note: {note}")
 
 
 def _edge_words(key: str, low: float, high: float, line: "list[LinearEdge]", scenario: "Scenario") -> str:
-    """Returns where stability changes over a key, in words."""
+    """Returns the values of a key at which stability changes, in words."""
     if not line:
         return f"{key} from {low:g} to {high:g}: stability of {scenario.name} does not change"
-    told = [
+    edges = [
         f"{'stable' if one.stable_above else 'unstable'} from {one.value:.6g} on "
         f"({one.omega_rad_s:.4g} rad/s)"
         for one in line
     ]
-    return f"{key} from {low:g} to {high:g}: {', '.join(told)}"
+    return f"{key} from {low:g} to {high:g}: {', '.join(edges)}"

@@ -1,20 +1,20 @@
 """`trilat log`: info, check, recover, export, view. None of them executes the log."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from ..reporting.overview_tables import print_overview
 from ..reporting.terminal_output import (
-    err,
     open_with_progress,
     out,
+    print_check,
+    print_json,
+    print_note,
     print_table,
+    print_text,
     progress_bar,
-    sanitize,
     warn_if_unfinished,
 )
 from ..reporting.text_table import TextTable
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from ..log.session_check import LogCheckResult
 
 
-app = typer.Typer(no_args_is_help=True, help="Looks into a log, mends it, takes it to other tools.")
+app = typer.Typer(no_args_is_help=True, help="Inspects, checks, recovers, exports or shows a log.")
 
 _MAX_PLACES = 10
-"""Places that a failed check names; all of them are in the JSON."""
+"""Places of a failed check that are printed; the JSON has all."""
 
 
 @app.command("info", epilog="Example: trilat log info run.mcap")
 def log_info_command(files: LogsArgument, as_json: JsonOption = False) -> None:
-    """Tells what is in a log: its session, sites, links and channels, with what is missing."""
+    """Prints the contents of a log: session, sites, links and channels, and missing records."""
     from ..analysis.file_overview import describe_files
 
     with progress_bar(f"reading {files[0]}") as progress:
         facts = describe_files(files, progress)
     if as_json:
-        _print_json(facts)
+        print_json(facts)
         return
     print_overview(facts)
     for path in files:
@@ -48,16 +48,16 @@ def log_info_command(files: LogsArgument, as_json: JsonOption = False) -> None:
 
 @app.command("check", epilog="Example: trilat log check run.mcap")
 def log_check_command(files: LogsArgument, as_json: JsonOption = False) -> None:
-    """Checks how a log is built and whether all of it is there and right; executes nothing.
+    """Checks that a log is well-formed, complete and consistent; executes nothing.
 
-    Exit code 0: sound; 1: not; 2: no such file. Of an MCAP file of others only how it is built is checked.
+    Exit code 0: sound; 1: not; 2: no such file. Files of other programs: structure only.
     """
     from ..log.session_check import check_log
 
     with progress_bar(f"checking {files[0]}") as progress:
         found = check_log(files, progress)
     if as_json:
-        _print_json(_check_json(files, found))
+        print_json(_check_json(files, found))
     else:
         _print_check(files, found)
     if not found.passed:
@@ -77,29 +77,24 @@ def _check_json(files: list[Path], found: "LogCheckResult") -> dict[str, Any]:
 
 
 def _print_check(files: list[Path], found: "LogCheckResult") -> None:
-    """Prints a line per check, and where it failed."""
+    """Prints a line per check, and the places where it failed."""
     for finding in found.findings:
-        mark = "[green]ok[/green]  " if finding.passed else "[red]FAIL[/red]"
-        out.print(f"{mark} {finding.check:<9}  {escape(sanitize(finding.text))}", soft_wrap=True)
+        print_check(finding.passed, f"{finding.check:<9}  {finding.text}")
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
         for place in finding.places[:_MAX_PLACES]:
             where = f"{place.file}: " if len(files) > 1 and place.file else ""
-            out.print(f"       {escape(sanitize(f'{where}{place}'))}", soft_wrap=True)
+            print_text(f"       {where}{place}")
         if finding.wrong > _MAX_PLACES:
             out.print(f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}")
     if not found.ours:
-        err.print("note: this is no log of trilat-net: only how it is built was checked", soft_wrap=True)
+        print_note("this is no log of trilat-net: only its structure was checked")
     for path in files:
         warn_if_unfinished(path)
 
 
-def _print_json(facts: dict[str, Any]) -> None:
-    typer.echo(json.dumps(facts, indent=2, allow_nan=False))
-
-
 LOSSY_EXIT_CODE = 3
-"""Exit code where something was lost."""
+"""Exit code after a loss."""
 
 
 @app.command("recover", epilog="Example: trilat log recover run.mcap.active")
@@ -112,19 +107,19 @@ def log_recover_command(
         ),
     ] = None,
     force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what came of it as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Makes a whole file of one that is torn or damaged; that one stays as it is.
+    """Makes a whole file of a torn or damaged one, which stays as it is.
 
-    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was, and it says what; 1: there was
-    nothing to save.
+    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is listed; 1: nothing
+    could be recovered.
     """
-    from ..log.recover import recover_log as make_whole
+    from ..log.recover import recover_log
 
     with progress_bar(f"reading {file}") as progress:
-        result = make_whole(file, output, force=force, progress=progress)
+        result = recover_log(file, output, force=force, progress=progress)
     if as_json:
-        out.print_json(json.dumps(_recovery_json(result)))
+        print_json(_recovery_json(result))
     else:
         _print_recovery(result)
     if not result.lossless:
@@ -149,7 +144,7 @@ def _recovery_json(result: "Recovery") -> dict[str, object]:
 
 def _print_recovery(result: "Recovery") -> None:
     how = "was finished" if result.finished else "was not finished"
-    out.print(f"{escape(f'{result.output}: made of {result.path}')}, which {how}", soft_wrap=True)
+    print_text(f"{result.output}: made of {result.path}, which {how}")
     rows = []
     if result.sites:
         rows.append(("records", ", ".join(f"{site} {count}" for site, count in result.sites.items())))
@@ -157,7 +152,7 @@ def _print_recovery(result: "Recovery") -> None:
     for name, lines in (("lost", result.lost), ("missing", result.missing)):
         rows += [("" if n else name, text) for n, text in enumerate(lines[:MAX_LOSSES] or ["nothing"])]
         if len(lines) > MAX_LOSSES:
-            rows.append(("", f"and {len(lines) - MAX_LOSSES} more; --json tells all"))
+            rows.append(("", f"and {len(lines) - MAX_LOSSES} more; --json lists all"))
     print_table(TextTable(("", ""), [(f"  {name}", text) for name, text in rows]))
 
 
@@ -168,9 +163,7 @@ _FORMATS = ("ros2", "parquet", "csv", "npz", "mat")
 
 @app.command("export", epilog="Example: trilat log export run.mcap --to parquet")
 def log_export_command(
-    files: Annotated[
-        list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
-    ],
+    files: LogsArgument,
     form: Annotated[
         str,
         typer.Option(
@@ -182,11 +175,13 @@ def log_export_command(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="OUT", help="File or folder. Default: beside FILE, by its name."),
+        typer.Option(
+            "-o", "--out", metavar="OUT", help="File or folder; default: next to FILE, named after it."
+        ),
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Makes files for other tools of a log: names end in their units, numbers are exact."""
+    """Exports a log to files for other tools: names end in their units, numbers are exact."""
     from ..errors import UsageError
     from ..reporting.export import Exporter, ExportFormat, default_export_path
 
@@ -199,30 +194,28 @@ def log_export_command(
     with progress_bar(f"writing {path}") as progress:
         exporter.export(log, progress)
     records = sum(len(log[site]) for site in log.sites)
-    out.print(f"{escape(str(path))}: {records} records of {', '.join(log.sites)}", soft_wrap=True)
+    print_text(f"{path}: {records} records of {', '.join(log.sites)}")
 
 
 @app.command("view", epilog="Example: trilat log view run.mcap")
 def log_view_command(
-    files: Annotated[
-        list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
-    ],
+    files: LogsArgument,
     full: Annotated[
-        bool, typer.Option("--full", help="Every record, not the decimated channels beside them.")
+        bool, typer.Option("--full", help="Show every record, not the decimated channels.")
     ] = False,
     web: Annotated[
-        bool, typer.Option("--web", help="In a browser: serves the viewer on this machine.")
+        bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")
     ] = False,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="OUT.rrd", help="Do not open it; write what Rerun would show."),
+        typer.Option("--save", metavar="OUT.rrd", help="Write a recording for Rerun instead of opening it."),
     ] = None,
     force: ForceOption = False,
 ) -> None:
     """Opens a log in Rerun: every curve with its name, a column per site.
 
-    Of a log without standard channels (--views off), of one that was not finished and of parts it makes them
-    first, in a temporary file.
+    If a log lacks standard channels (--views off), was not finished or has parts, they are made first, in a
+    temporary file.
     """
     from ..files import refuse_existing
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
@@ -233,7 +226,7 @@ def log_view_command(
         files,
         lambda: open_with_progress(*files),
         ViewerOptions(full=full, web=web, save=save),
-        lambda text: out.print(escape(text), soft_wrap=True),
+        print_text,
     )
     if save is not None:
-        out.print(f"{escape(str(save))}: open it with: rerun {escape(str(save))}", soft_wrap=True)
+        print_text(f"{save}: open it with: rerun {save}")

@@ -1,6 +1,5 @@
 """`trilat metrics`: the metrics of a run, by group, with statics and rendered impedance."""
 
-import json
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from ..reporting.terminal_output import open_with_progress, out, print_table, sanitize
+from ..reporting.terminal_output import open_with_progress, out, print_json, print_table, sanitize
 from ..reporting.text_table import TextTable
 from .options import JsonOption, LogArgument
 
@@ -24,23 +23,23 @@ _NO_NUMBER = "–"
 
 @app.command("metrics", epilog="Example: trilat metrics run.mcap")
 def metrics_command(file: LogArgument, as_json: JsonOption = False) -> None:
-    """Measures a run: tracking, effort, energies, force sharing, what hands feel, walls, learning, network.
+    """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
 
-    Sites, links and walls are columns. A dash is a number that there is none of; where there could be one,
-    the reason stands below. Every formula is in docs/metrics.md.
+    Sites, links and walls are columns. A dash stands for a missing number; if there could be one, the reason
+    is given below. docs/metrics.md has every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
 
     log = open_with_progress(file)
     found = compute_log_metrics(log)
     if as_json:
-        typer.echo(json.dumps(metrics_to_json(log, found), indent=2, ensure_ascii=False, allow_nan=False))
+        print_json(metrics_to_json(log, found))
     else:
         _show(found)
 
 
 def _show(found: "LogMetrics") -> None:
-    """Prints a table per group and kind of place, then statics, what is felt, and what is missing."""
+    """Prints a table per group and kind of place, statics, impedances, and reasons of missing numbers."""
     from ..analysis.metrics.metric_catalogue import QUANTITIES
 
     reasons: dict[str, list[str]] = {}
@@ -55,7 +54,7 @@ def _show(found: "LogMetrics") -> None:
 def _print_group(
     group: str, quantities: "Sequence[Quantity]", found: "LogMetrics", reasons: dict[str, list[str]]
 ) -> None:
-    """Prints a row per quantity and a column per place, of what could be; notes why numbers are missing."""
+    """Prints a row per quantity and a column per place that apply; collects reasons of missing numbers."""
     rows = {quantity: found.places(quantity) for quantity in quantities}
     could = {q: places for q, places in rows.items() if any(one.applies for one in places.values())}
     names = [
@@ -79,7 +78,7 @@ def _print_group(
 
 
 def _print_statics(found: "LogMetrics") -> None:
-    """Prints who felt what in the windows at rest, and the stiffness between them."""
+    """Prints the reflected torques of the windows at rest, and the stiffness between them."""
     if found.sharing_ratios:
         _print(
             ["at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off"],
@@ -120,19 +119,19 @@ def _print_statics(found: "LogMetrics") -> None:
 
 
 def _print_impedance(found: "LogMetrics") -> None:
-    """Prints what hands feel over frequency, decided or not."""
+    """Prints the impedance that operators feel over frequency, decided or not."""
     if not found.responses:
         return
     rows = []
     for one in found.responses:
-        told = one.ratio
+        ratio = one.ratio
         what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, joint {one.joint}"
-        if told.gain is None:
-            rows.append([what, one.unit, "", "", "", "", told.why])
+        if ratio.gain is None:
+            rows.append([what, one.unit, "", "", "", "", ratio.why])
             continue
-        numbers = (told.frequency_hz, told.gain, told.phase_rad, told.coherence)
+        numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
         rows.append(
-            [what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {_percent(told.error)}"]
+            [what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {_percent(ratio.error)}"]
         )
     _print(["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2)
 

@@ -20,7 +20,7 @@ SetOption = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
 DurationOption = Annotated[
-    float | None, typer.Option("--duration", metavar="S", help="Override how long it runs, s.")
+    float | None, typer.Option("--duration", metavar="S", help="Override the duration of the run, s.")
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what exists.")]
 ListenOption = Annotated[
@@ -37,7 +37,7 @@ RouterOption = Annotated[
         "--router",
         metavar="EP",
         help="Endpoint of a router to go through instead, as in tcp/192.0.2.1:7447; repeatable: the first "
-        "that answers.",
+        "one that answers is used.",
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -47,28 +47,28 @@ ZenohConfigOption = Annotated[
 
 
 def check_session_name(name: str) -> str:
-    """Refuses what cannot stand in a key."""
+    """Refuses a session name that cannot be part of a key."""
     if not name or not all(c.isalnum() or c in "_-." for c in name):
         raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
     return name
 
 
 def check_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
-    """Refuses what is no time to wait."""
+    """Refuses a waiting time out of range."""
     if value is not None and not 0.0 <= value <= 86_400.0:
         raise UsageError(f"{param.opts[0]} is a number of seconds from 0 to 86400, not {value:g}")
     return value
 
 
 def check_clock_offset(value: float) -> float:
-    """Refuses what no clock can be ahead by."""
+    """Refuses an offset that no clock can have."""
     if not -1e6 <= value <= 1e6:
         raise UsageError(f"--clock-offset-s is a number of seconds from -1e6 to 1e6, not {value:g}")
     return value
 
 
 def check_clock_drift(value: float) -> float:
-    """Refuses a drift that nobody follows."""
+    """Refuses a drift beyond the rate of slewing."""
     if not -200.0 <= value <= 200.0:
         raise UsageError(f"--clock-drift-ppm is a number from -200 to 200, not {value:g}")
     return value
@@ -79,7 +79,7 @@ ClockOffsetOption = Annotated[
     typer.Option(
         "--clock-offset-s",
         metavar="S",
-        help="For tests: a clock that is ahead of the machine's by this, s.",
+        help="For tests: use a clock this far ahead of the machine's, s.",
         callback=check_clock_offset,
     ),
 ]
@@ -88,7 +88,7 @@ ClockDriftOption = Annotated[
     typer.Option(
         "--clock-drift-ppm",
         metavar="PPM",
-        help="For tests: a clock that runs faster than the machine's by this, ppm.",
+        help="For tests: use a clock that runs faster than the machine's by this, ppm.",
         callback=check_clock_drift,
     ),
 ]
@@ -98,15 +98,18 @@ ViewsOption = Annotated[
     typer.Option(
         "--views",
         metavar="off|full|HZ",
-        help="Standard channels for other viewers beside the log's own: messages a second, extremes kept.",
+        help="Rate of additional standard channels for other viewers, Hz; extremes are kept.",
     ),
 ]
 
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
+]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="For a machine: everything, as JSON.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 
 def load_chosen_scenario(
@@ -115,12 +118,15 @@ def load_chosen_scenario(
     """Returns the scenario that a command's options describe."""
     from ..scenario import load_scenario
 
-    given = list(overrides or [])
-    if duration is not None:
-        given.append(f"duration_s={duration!r}")
+    given = list_overrides(overrides, duration)
     if seed is not None:
         given.append(f"seed={seed}")
     return load_scenario(source, given)
+
+
+def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
+    """Returns the overrides of --set and --duration, in this order."""
+    return [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])]
 
 
 def resolve_connection(

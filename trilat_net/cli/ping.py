@@ -1,13 +1,11 @@
-"""`trilat ping` and `trilat router`: round trips, clock offsets, links of a session; a router."""
+"""`trilat ping`: round trips, clock offsets and links of a session."""
 
-import json
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out, print_line, print_table
+from ..reporting.terminal_output import out, print_json, print_table, print_text
 from ..reporting.text_table import TextTable
 from .options import (
     ClockDriftOption,
@@ -26,58 +24,9 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-ANY_ADDRESS = "tcp/0.0.0.0:7447"
-
-
-@app.command("router", epilog=f"Example: trilat router --listen {ANY_ADDRESS}")
-def router_command(
-    listen: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--listen", metavar="EP", help=f"Endpoint to listen at; repeatable; default: {ANY_ADDRESS}."
-        ),
-    ] = None,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    until_idle: Annotated[
-        float | None,
-        typer.Option(
-            "--until-idle",
-            metavar="S",
-            help="End once all members have left for so long, s; default: stay.",
-            callback=check_seconds,
-        ),
-    ] = None,
-) -> None:
-    """Lets sites meet that cannot reach each other directly, as behind NAT.
-
-    Sites and recorder name it with --router, in any order of starts. It runs until Ctrl-C; a session goes on
-    when it is started again. Several routers that --connect to each other are one.
-    """
-    from ..net.clock import SystemClock
-    from ..net.connection import open_bus, resolve_router_connection, run_router
-    from ..net.zenoh_bus import read_zenoh_file
-    from ..process import Interrupt
-
-    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    connection = resolve_router_connection(listen, connect, file, [ANY_ADDRESS])
-    clock = SystemClock()
-    with Interrupt() as interrupt:
-        bus = open_bus(connection, clock, interrupt.requested, None, print_line)
-        if bus is None:
-            raise typer.Exit(interrupt.exit_code)
-        try:
-            print_line(f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
-            run_router(
-                bus, clock, interrupt.requested, lambda text: print_line(f"router: {text}"), until_idle
-            )
-        finally:
-            bus.close()
-        raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
-
 
 def _check_count(value: int) -> int:
-    """Refuses what is no number of round trips."""
+    """Refuses a number of round trips out of range."""
     if not 5 <= value <= 10_000:
         raise UsageError(f"--count is a number from 5 to 10000, not {value}")
     return value
@@ -85,7 +34,7 @@ def _check_count(value: int) -> int:
 
 @app.command("ping", epilog="Example: trilat ping --session paper")
 def ping_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session.")] = "paper",
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to measure.")] = "paper",
     connect: ConnectOption = None,
     router: RouterOption = None,
     zenoh_config: ZenohConfigOption = None,
@@ -97,7 +46,7 @@ def ping_command(
         typer.Option(
             "--timeout",
             metavar="S",
-            help="How long to wait for the first answer, s.",
+            help="Longest wait for the first answer, s.",
             callback=check_seconds,
         ),
     ] = 3.0,
@@ -107,8 +56,8 @@ def ping_command(
 ) -> None:
     """Shows round trip, clock offset and jitter between here and every member of a session.
 
-    The session may wait for its members or run; of one that runs it also shows what its sites say of their
-    links to each other. Without endpoints it asks the first site, at its loopback port, who the others are.
+    The session may be waiting for members or running; then the links that its sites measure are shown too.
+    Without endpoints it asks the first site, at its loopback port, for the others.
     """
     from sites.session_ping import ping_session
 
@@ -125,7 +74,7 @@ def ping_command(
             raise typer.Exit(interrupt.exit_code)
     members, links = [_member(reach) for reach in probe.reached()], _links(probe)
     if as_json:
-        print_line(json.dumps({"session": session, "members": members, "links": links}, indent=2))
+        print_json({"session": session, "members": members, "links": links})
     else:
         _show(session, members, links)
     if not any(member["answers"] for member in members):
@@ -133,7 +82,7 @@ def ping_command(
 
 
 def _member(reach: "PingResult") -> dict[str, Any]:
-    """Returns what a table and JSON say of a member; times in us."""
+    """Returns the measurements of a member; times in us."""
     info, rtts = reach.info, sorted(reach.rtts_ns)
     facts: dict[str, Any] = {
         "member": info.member,
@@ -159,7 +108,7 @@ def _member(reach: "PingResult") -> dict[str, Any]:
 
 
 def _links(probe: "SessionPing") -> list[dict[str, Any]]:
-    """Returns what the sites that run say of their links; times in us."""
+    """Returns the links as running sites measure them; times in us."""
     return [
         {
             "from": peer,
@@ -177,10 +126,7 @@ def _links(probe: "SessionPing") -> list[dict[str, Any]]:
 
 def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any]]) -> None:
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
-    out.print(
-        f"session {escape(session)} {state}; times in us; a clock is the one there minus the one here",
-        soft_wrap=True,
-    )
+    print_text(f"session {session} {state}; times in us; a clock is the one there minus the one here")
     rows = []
     for member in members:
         rtt = member.get("rtt_us", {})

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from ..errors import RunFailed, UsageError
-from ..reporting.terminal_output import open_with_progress, out, print_conclusion, print_line, progress_bar
+from ..reporting.terminal_output import conclude_files, print_line
 from .options import (
     ClockDriftOption,
     ClockOffsetOption,
@@ -27,7 +27,7 @@ app = typer.Typer()
 
 @app.command("record", epilog="Example: trilat record --session paper -o run.mcap --split-duration 600")
 def record_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Which session to record.")],
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to record.")],
     listen: ListenOption = None,
     connect: ConnectOption = None,
     router: RouterOption = None,
@@ -40,14 +40,15 @@ def record_command(
         typer.Option(
             "--join-timeout",
             metavar="S",
-            help="How long to wait for it to begin, s; default: for ever.",
+            help="Longest wait for its start, s; default: no limit.",
             callback=check_seconds,
         ),
     ] = None,
     clock_offset: ClockOffsetOption = 0.0,
     clock_drift: ClockDriftOption = 0.0,
     concluded: Annotated[
-        bool, typer.Option("--conclude", help="Verify and report it afterwards, in the folder of the log.")
+        bool,
+        typer.Option("--conclude", help="Verify the log afterwards and write its report into its folder."),
     ] = False,
     include: Annotated[
         list[str] | None,
@@ -66,18 +67,18 @@ def record_command(
         float | None, typer.Option("--split-duration", metavar="S", help="Parts of this duration, s.")
     ] = None,
     carry_on: Annotated[
-        bool, typer.Option("--continue", help="Where the log exists, write the part that follows it.")
+        bool, typer.Option("--continue", help="If the log exists, write its next part.")
     ] = False,
     durable: Annotated[
-        bool, typer.Option("--durable", help="Put every 100 ms onto the disk, not every second.")
+        bool, typer.Option("--durable", help="Sync to the disk every 100 ms instead of every second.")
     ] = False,
     views: ViewsOption = "100",
     force: ForceOption = False,
 ) -> None:
     """Records one session, from its epoch to its end or to Ctrl-C.
 
-    Without endpoints it asks the first site, at its loopback port, who the others are. Parts are called
-    FILE-001.mcap and so on. A file bears .active at its end until it is finished.
+    Without endpoints it asks the first site, at its loopback port, for the others. Parts are named
+    FILE-001.mcap and so on. The name of a file ends in .active until it is finished.
     """
     from recorder.record_process import record_session
 
@@ -99,9 +100,9 @@ def record_command(
         durable=durable,
         views_hz=parse_viz_rate(views),
     )
-    place.first()  # a name that is taken is refused before anybody waits
+    place.first()  # refuses a taken name before anything waits
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"{path}: cannot be written: {path.parent} is no folder that takes files")
+        raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
     page = path.parent / "report.html"
     if concluded:
         refuse_existing(page, force=force)
@@ -115,15 +116,8 @@ def record_command(
 
 def _conclude(parts: list[Path]) -> None:
     """Verifies and reports a log, into its own folder."""
-    from ..reporting.conclude import conclude
-
-    out.print("checking the log and drawing ...")
-    path = parts[0]
-    log = open_with_progress(*parts)
-    with progress_bar("executing and drawing") as progress:
-        conclusion = conclude(log, path.parent, progress)
-    print_conclusion(conclusion)
+    log, conclusion = conclude_files(parts, parts[0].parent)
     if not conclusion.passed:
-        raise RunFailed(f"{path}: failed a check")
+        raise RunFailed(f"{parts[0]}: failed a check")
     if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
-        raise RunFailed(f"{path}: {ended.text}")
+        raise RunFailed(f"{parts[0]}: {ended.text}")

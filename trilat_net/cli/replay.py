@@ -1,16 +1,24 @@
 """`trilat replay`: publishes a log over Zenoh with its original timing, as a session of its own."""
 
-import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import err, out, print_line, print_table, progress_bar
+from ..reporting.terminal_output import (
+    err,
+    out,
+    print_error,
+    print_json,
+    print_note,
+    print_table,
+    print_text,
+    progress_bar,
+)
 from ..reporting.text_table import TextTable
 from .options import (
     ConnectOption,
@@ -40,48 +48,57 @@ def replay_command(
         list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
     ],
     rate: Annotated[
-        str, typer.Option("--rate", metavar="X", help="How much faster than it was; max: as fast as can be.")
+        str,
+        typer.Option(
+            "--rate", metavar="X", help="Speed relative to the recording; max: as fast as possible."
+        ),
     ] = "1",
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[
-        float | None, typer.Option("--start", metavar="S", help="From when on, s since tick 0.")
+        float | None, typer.Option("--start", metavar="S", help="Start of the part to play, s since tick 0.")
     ] = None,
-    stop: Annotated[float | None, typer.Option("--stop", metavar="S", help="Until when.")] = None,
+    stop: Annotated[
+        float | None, typer.Option("--stop", metavar="S", help="End of the part to play, s since tick 0.")
+    ] = None,
     duration: Annotated[
-        float | None, typer.Option("--duration", metavar="S", help="How long, instead of --stop.")
+        float | None,
+        typer.Option("--duration", metavar="S", help="Duration of the part to play, s, instead of --stop."),
     ] = None,
     include: Annotated[
         list[str] | None,
         typer.Option(
             "--include",
             metavar="KEYEXPR",
-            help="Only these channels, as in '**/m1/*'; repeatable. Default: all that the sites published.",
+            help="Play these channels alone, as in '**/m1/*'; repeatable. Default: all of the sites.",
         ),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        typer.Option("--exclude", metavar="KEYEXPR", help="Not these, as in '**/link'; repeatable."),
+        typer.Option(
+            "--exclude", metavar="KEYEXPR", help="Leave these channels out, as in '**/link'; repeatable."
+        ),
     ] = None,
     prefix: Annotated[
         str,
         typer.Option("--prefix", metavar="WORD", help="The session is WORD-NAME; '': NAME, as recorded."),
     ] = "replay",
     session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Name the session so, without a prefix.")
+        str | None, typer.Option("--session", metavar="ID", help="Name of the session, without a prefix.")
     ] = None,
     time: Annotated[
-        str, typer.Option("--time", metavar="publish|log", help="As it was sent, or as it arrived.")
+        str,
+        typer.Option("--time", metavar="publish|log", help="Time by the stamps of sending or of arrival."),
     ] = "publish",
     low_cpu: Annotated[
-        bool, typer.Option("--low-cpu", help="Sleep to every deadline: some 0.1 ms less exact.")
+        bool, typer.Option("--low-cpu", help="Sleep until every deadline: about 0.1 ms less exact.")
     ] = False,
-    needs_recorder: Annotated[
-        bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
-    ] = False,
+    needs_recorder: Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")] = False,
     preload: Annotated[
         int,
         typer.Option(
-            "--preload", metavar="MIB", help="Most to hold in memory; more is read by a process meanwhile."
+            "--preload",
+            metavar="MIB",
+            help="Largest log held in memory; a process reads larger ones meanwhile.",
         ),
     ] = 256,
     listen: ListenOption = None,
@@ -114,10 +131,11 @@ def replay_command(
     place = [default_endpoint(name, 0)]
     connection = resolve_connection(listen, connect, router, zenoh_config, place, [])
     options = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
-    tell = err if as_json else out
+    console = err if as_json else out
+    tell = partial(console.print, markup=False, soft_wrap=True)
     for line in _opening_lines(facts, name, speed):
-        tell.print(escape(line), soft_wrap=True)
-    told = set(facts.torn)
+        tell(line)
+    reported = set(facts.torn)
     _warn_torn(facts.torn)
     clock = SystemClock()
     with Interrupt() as interrupt:
@@ -129,16 +147,16 @@ def replay_command(
             connection,
             clock,
             interrupt.requested,
-            lambda text: tell.print(escape(text), soft_wrap=True),
+            tell,
             _line(clock),
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
     if as_json:
-        print_line(json.dumps({"session": name, **_facts(outcome, speed)}, indent=2))
+        print_json({"session": name, **_facts(outcome, speed)})
     else:
         _show(outcome)
-    _warn_torn({path: text for path, text in outcome.torn.items() if path not in told})
+    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     _warn_undelivered(outcome)
     if interrupt.requested():
         err.print("interrupted")
@@ -154,10 +172,10 @@ def _time(text: str) -> Literal["publish", "log"]:
 
 
 def _opening_lines(facts: "SessionHeader", name: str, rate: float) -> list[str]:
-    """Says what is going to be played."""
+    """Returns the sites, session and speed that will be played."""
     from ..net.messages import VERSION
 
-    speed = "as fast as can be" if math.isinf(rate) else f"at {rate:g} times its speed"
+    speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
     lines = [f"playing {', '.join(facts.boots)} as session {name}, {speed}; Ctrl-C ends it"]
     if facts.version != VERSION:
         lines.append(
@@ -168,7 +186,7 @@ def _opening_lines(facts: "SessionHeader", name: str, rate: float) -> list[str]:
 
 
 def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
-    """Returns what shows where the play is: one line, on a terminal."""
+    """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 
     def show(progress: "PlayProgress") -> None:
@@ -187,7 +205,7 @@ def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
 
 
 def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
-    """Returns the summary as JSON says it."""
+    """Returns the summary for JSON."""
     late = outcome.lateness
     return {
         "messages": outcome.counts,
@@ -207,7 +225,7 @@ def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
 
 
 def _show(outcome: "PlaybackSummary") -> None:
-    """Prints the summary for people."""
+    """Prints the summary."""
     if err.is_interactive:
         err.file.write("\r" + " " * 72 + "\r")
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
@@ -216,33 +234,32 @@ def _show(outcome: "PlaybackSummary") -> None:
     total = f"{sum(outcome.counts.values())} messages in {outcome.took_s:.2f} s"
     rounds = f", {outcome.rounds} rounds" if outcome.rounds > 1 else ""
     how = f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us" if late else ""
-    held = f"; waited {outcome.held_s:.2f} s for who did not keep up" if outcome.held_s > 0.1 else ""
+    held = f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
     dropped = "" if outcome.cut else "; none dropped"
-    out.print(f"{total}{rounds}{how}{held}{dropped}", soft_wrap=True)
+    print_text(f"{total}{rounds}{how}{held}{dropped}")
     if outcome.recorders:
-        has = "has everything" if outcome.stored else "has not said that it has everything"
-        given = f"; it was given {outcome.refilled} messages that it had missed" if outcome.refilled else ""
-        out.print(f"the recorder {has}{given}", soft_wrap=True)
+        has = "has everything" if outcome.stored else "has not confirmed that it has everything"
+        given = (
+            f"; {outcome.refilled} messages that it had missed were sent again" if outcome.refilled else ""
+        )
+        print_text(f"the recorder {has}{given}")
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Says which files are not whole, and what mends them."""
+    """Warns of torn files, with the command that mends them."""
     for path, text in torn.items():
-        note = f"{path}: {text}; what is whole is played; make it whole with: trilat log recover {path}"
-        err.print(f"note: {escape(note)}", soft_wrap=True)
+        print_note(f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}")
 
 
 def _warn_undelivered(outcome: "PlaybackSummary") -> None:
-    """Says what did not come where it should have, or when."""
+    """Reports messages that did not arrive, or arrived late."""
     if outcome.cut:
-        err.print(
-            f"error: somebody took nothing for 5 s and was cut off, {outcome.cut} times: what was played "
-            "then did not come there",
-            soft_wrap=True,
+        print_error(
+            f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "
+            "that were played then"
         )
     if outcome.strays:
-        err.print(
-            f"error: {outcome.strays} messages stand more than a minute from their place in the file, and "
-            "were played late; with a larger --preload they are played in order",
-            soft_wrap=True,
+        print_error(
+            f"{outcome.strays} messages lie more than a minute from their place in the file, and were "
+            "played late; with a larger --preload they are played in order"
         )

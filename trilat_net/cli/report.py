@@ -1,94 +1,19 @@
-"""`trilat report` and `trilat figure`: figures, page and summary of a log; single figures for a paper."""
+"""`trilat report`: figures, page and summary of a log."""
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from ..errors import UsageError
 from ..reporting.terminal_output import (
     open_with_progress,
-    out,
     print_conclusion,
-    print_table,
     progress_bar,
     warn_user_laws,
 )
-from ..reporting.text_table import TextTable
-from .options import ForceOption, LogArgument, LogsArgument
-
-if TYPE_CHECKING:
-    from ..log.log_reader import Log
-
+from .options import ForceOption, LogsArgument
 
 app = typer.Typer()
-
-
-@app.command(
-    "figure", epilog="Example: trilat figure run.mcap positions settling --width 3.5 --format pdf --out paper"
-)
-def figure_command(
-    file: LogArgument,
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(help="Which figures, see --list; none: all that FILE has.", metavar="NAME"),
-    ] = None,
-    width_in: Annotated[
-        float, typer.Option("--width", metavar="3.5|7", help="One column of a paper or two, in.")
-    ] = 3.5,
-    formats: Annotated[
-        str, typer.Option("--format", metavar="pdf,png,svg", help="One or more of them.")
-    ] = "pdf,png",
-    folder: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Default: FILE without .mcap, -figures.")
-    ] = None,
-    listed: Annotated[bool, typer.Option("--list", help="Only say which figures there are.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
-    force: ForceOption = False,
-) -> None:
-    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
-    log = open_with_progress(file)
-    if listed:
-        _list_figures(log, as_json=as_json)
-        return
-    from ..reporting.figures.registry import write_figures
-
-    place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
-    kinds = _formats(formats)
-    with progress_bar("drawing") as progress:
-        paths = write_figures(
-            log, place, names or (), width_in=width_in, formats=kinds, force=force, progress=progress
-        )
-    if as_json:
-        typer.echo(json.dumps([str(path) for path in paths], indent=2))
-        return
-    for path in paths:
-        out.print(f"  {escape(str(path))}", soft_wrap=True)
-
-
-def _formats(text: str) -> list[str]:
-    kinds = [kind.strip().lower() for kind in text.split(",") if kind.strip()]
-    if not kinds:
-        raise UsageError("--format names no format, as in --format pdf,png")
-    return kinds
-
-
-def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints every figure, and for which of them a log has nothing to show."""
-    from ..reporting.figures.registry import FIGURES
-
-    absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
-    if as_json:
-        rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
-        typer.echo(json.dumps(rows, indent=2, ensure_ascii=False))
-        return
-    drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
-    print_table(TextTable(("figure", "shows"), drawable))
-    for name, why in absent.items():
-        if why:
-            out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)
 
 
 @app.command("report", epilog="Example: trilat report run.mcap -o report")
@@ -99,11 +24,11 @@ def report_command(
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Makes the figures, the page and the summary of a log."""
+    """Writes the figures, the page and the summary of a log."""
     from ..files import make_results_folder
     from ..reporting.conclude import conclude
 
-    log = open_with_progress(*files)  # before a folder is made for it
+    log = open_with_progress(*files)  # before its folder is made
     warn_user_laws(log, needed=False)
     results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
     with progress_bar("drawing") as progress:

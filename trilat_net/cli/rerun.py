@@ -1,20 +1,18 @@
 """`trilat rerun`: executes sites of a log again with changed settings and prints the effect."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
 from ..reporting.terminal_output import (
     open_with_progress,
-    out,
-    print_line,
+    print_json,
+    print_paths,
     print_table,
+    print_text,
     progress_bar,
-    sanitize,
     warn_user_laws,
 )
 from ..reporting.text_table import TextTable
@@ -32,34 +30,34 @@ def rerun_command(
     files: LogsArgument,
     replace: Annotated[
         list[str] | None,
-        typer.Option("--replace", metavar="SITE", help="Execute this site afresh; repeatable."),
+        typer.Option("--replace", metavar="SITE", help="Execute this site again; repeatable."),
     ] = None,
     closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="Execute all of them, over the network of the log.")
+        bool, typer.Option("--closed-loop", help="Execute all sites, over the network of the log.")
     ] = False,
     overrides: SetOption = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the outcome as a log.")
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result as a log.")
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Asks a log what if: executes sites afresh, with something changed, and compares them with it.
+    """Executes sites of a log again with changed settings, and compares the result with the log.
 
-    Without --closed-loop the other sites stand as recorded and do not react.
+    Without --closed-loop the other sites stay as recorded and do not react.
     """
-    from ..execution.rerun import rerun as executed
+    from ..execution.rerun import rerun
 
     if output is not None:
         _check_output(output, files, force=force)
     log = open_with_progress(*files)
     warn_user_laws(log, needed=False)  # another law may take its place
     with progress_bar("executing") as progress:
-        again = executed(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
+        again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
     if output is not None:
         again.save(output, force=force)
     if as_json:
-        print_line(json.dumps({**again.to_json(), "file": str(output) if output else None}, indent=2))
+        print_json({**again.to_json(), "file": str(output) if output else None})
     else:
         _show(again, output)
     if again.diverged or again.broken:
@@ -77,21 +75,21 @@ def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
 
 
 def _show(again: "Rerun", output: Path | None) -> None:
-    """Prints what was asked, what became of it, and what limits the answer."""
-    from ..execution.rerun_request import describe_rerun_changes as wording
+    """Prints the request, its effects, and their limits."""
+    from ..execution.rerun_request import describe_rerun_changes
 
     asked = again.request
     others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
-    out.print(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}", soft_wrap=True)
-    for line in wording(asked) or ["nothing is changed: this is the experiment of the log"]:
-        out.print(f"  {escape(sanitize(line))}", soft_wrap=True)
+    print_text(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}")
+    for line in describe_rerun_changes(asked) or ["nothing is changed: this is the experiment of the log"]:
+        print_text(f"  {line}")
     print_table(_tabulate_sites(again))
     for line in _lines(again):
-        out.print(escape(sanitize(line)), soft_wrap=True)
+        print_text(line)
     for note in again.notes:
-        out.print(f"note: {escape(sanitize(note))}", soft_wrap=True)
+        print_text(f"note: {note}")
     if output is not None:
-        out.print(f"  {escape(str(output))}", soft_wrap=True)
+        print_paths([output])
 
 
 def _tabulate_sites(again: "Rerun") -> TextTable:
@@ -110,7 +108,7 @@ def _cells(pair: "LogAndRerun | None") -> list[str]:
 
 
 def _lines(again: "Rerun") -> list[str]:
-    """Returns what else became of sites and links, a sentence each."""
+    """Returns the other effects on sites and links, a sentence each."""
     lines = []
     for effect in again.sites.values():
         if effect.q_max_rad:

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from ..reporting.terminal_output import out, print_table
+from ..reporting.terminal_output import print_table, print_text
 from ..reporting.text_table import TextTable
 from .options import (
     DurationOption,
@@ -47,20 +46,20 @@ def scenario_check_command(
     file: ScenarioArgument,
     overrides: SetOption = None,
 ) -> None:
-    """Says whether a scenario is valid, and what follows from it."""
+    """Checks a scenario, and prints its consequences."""
     from ..scenario.describe import describe_scenario
 
     for line in describe_scenario(load_chosen_scenario(file, overrides, None, None)):
-        out.print(escape(line), soft_wrap=True)
+        print_text(line)
 
 
 @app.command("new", epilog="Example: trilat scenario new mine.toml")
 def scenario_new_command(
-    file: Annotated[Path, typer.Argument(help="The file to make.")], force: ForceOption = False
+    file: Annotated[Path, typer.Argument(help="File to write.")], force: ForceOption = False
 ) -> None:
     """Writes a commented template, with the unit of every key."""
     from ..files import write_whole
     from ..scenario import read_template
 
     write_whole(file, read_template(), force=force)
-    out.print(f"{escape(str(file))}: a template; check it with: trilat scenario check {escape(str(file))}")
+    print_text(f"{file}: a template; check it with: trilat scenario check {file}")

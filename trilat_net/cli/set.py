@@ -5,10 +5,9 @@ import tomllib
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out
+from ..reporting.terminal_output import print_text
 from .options import ConnectOption, RouterOption, ZenohConfigOption, resolve_connection
 
 app = typer.Typer(no_args_is_help=True)
@@ -54,7 +53,7 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
 def set_command(
     context: typer.Context,
     session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Which session; required.")
+        str | None, typer.Option("--session", metavar="ID", help="Session to change; required.")
     ] = None,
     connect: ConnectOption = None,
     router: RouterOption = None,
@@ -62,7 +61,7 @@ def set_command(
 ) -> None:
     """Changes a link, or a site's shares in its peers, while a session runs.
 
-    Without endpoints it asks the first site, at its loopback port, who the others are.
+    Without endpoints it asks the first site, at its loopback port, for the others.
     """
     context.obj = session, resolve_connection(None, connect, router, zenoh_config, [], None)
 
@@ -71,15 +70,15 @@ def set_command(
 def set_link_command(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
-    delay: Annotated[str | None, typer.Option("--delay", help="Its delay, as in 350ms.")] = None,
-    loss: Annotated[str | None, typer.Option("--loss", help="Its loss, as in 5%.")] = None,
+    delay: Annotated[str | None, typer.Option("--delay", help="New delay, as in 350ms.")] = None,
+    loss: Annotated[str | None, typer.Option("--loss", help="New loss, as in 5%.")] = None,
     preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
     to: Annotated[
         list[str] | None,
         typer.Option("--to", metavar="KEY=VALUE", help="Any key of a link, as in model=gamma; repeatable."),
     ] = None,
 ) -> None:
-    """Changes one directed link; what is not named stays, and a model or preset replaces all."""
+    """Changes the given keys of a directed link; a model or a preset replaces all of them."""
     table = parse_pairs(to or [], "deviation_ms=20")
     if preset is not None:
         table["preset"] = preset
@@ -88,7 +87,7 @@ def set_link_command(
     if loss is not None:
         table["loss"] = parse_share(loss)
     if not table:
-        raise UsageError("what is to change? give --delay, --loss, --preset or --to KEY=VALUE")
+        raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
     _, arrow, receiver = name.partition("->")
     if not arrow:
         raise UsageError(f"a link is FROM->TO in quotes, as in 'm1->s', not {name!r}")
@@ -98,17 +97,17 @@ def set_link_command(
 @app.command("dominance", epilog="Example: trilat set --session paper dominance s m1=0.9 m2=0.1")
 def set_dominance_command(
     context: typer.Context,
-    site: Annotated[str, typer.Argument(help="Whose shares.")],
+    site: Annotated[str, typer.Argument(help="Site whose shares change.")],
     shares: Annotated[list[str], typer.Argument(metavar="PEER=SHARE...", help="They sum to 1.")],
-    ramp: Annotated[str, typer.Option("--ramp", help="How long the change takes, as in 2s.")] = "1s",
+    ramp: Annotated[str, typer.Option("--ramp", help="Duration of the change, as in 2s.")] = "1s",
 ) -> None:
-    """Changes one row of the dominance matrix, linearly over a time, so that it sums to 1 all the while."""
+    """Changes one row of the dominance matrix linearly over a time; it sums to 1 throughout."""
     table = {peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()}
     _send_change(context, site, {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3})
 
 
 def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
-    """Asks the site and prints its answer."""
+    """Sends a change to a site and prints its reply."""
     from ..net.clock import SystemClock
     from ..net.discovery import request_change
     from ..net.requests import ChangeRequest
@@ -116,7 +115,7 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
 
     session, connection = context.obj
     if session is None:
-        raise UsageError("which session? say trilat set --session ID ...")
+        raise UsageError("the session is missing: trilat set --session ID ...")
     reply = request_change(
         connection,
         SystemClock(),
@@ -127,4 +126,4 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     )
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
-    out.print(escape(reply.text), soft_wrap=True)
+    print_text(reply.text)

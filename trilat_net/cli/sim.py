@@ -1,13 +1,12 @@
 """`trilat sim`: runs a scenario in virtual time into a log."""
 
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from ..process import Interrupt
-from ..reporting.terminal_output import err, out
+from ..reporting.terminal_output import err, print_error, print_text
 from .options import (
     DurationOption,
     ForceOption,
@@ -43,13 +42,9 @@ def sim_command(
     with Interrupt() as interrupt:
         within = record_virtual(chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz)
     if interrupt.requested():
-        err.print(f"interrupted; {escape(str(path))} holds what there was", soft_wrap=True)
+        err.print(f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True)
         raise typer.Exit(interrupt.exit_code)
-    out.print(f"{escape(str(path))}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+    print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
     if not within:
-        _fail(f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there")
-
-
-def _fail(text: str) -> NoReturn:
-    err.print(f"error: {escape(text)}", soft_wrap=True)
-    raise typer.Exit(1)
+        print_error(f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there")
+        raise typer.Exit(1)

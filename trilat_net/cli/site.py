@@ -26,8 +26,10 @@ app = typer.Typer()
 
 @app.command("site", epilog="Example: trilat site m1 --scenario paper")
 def site_command(
-    name: Annotated[str, typer.Argument(help="Which site of the scenario this is.")],
-    scenario: Annotated[str, typer.Option("--scenario", "-s", help="Shipped name or path.")],
+    name: Annotated[str, typer.Argument(help="Name of the site in the scenario.")],
+    scenario: Annotated[
+        str, typer.Option("--scenario", "-s", help="Name of a shipped scenario, or path of a TOML file.")
+    ],
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Default: the scenario's name.")
     ] = None,
@@ -38,17 +40,18 @@ def site_command(
     join_timeout: Annotated[
         float,
         typer.Option(
-            "--join-timeout", metavar="S", help="How long to wait for the others, s.", callback=check_seconds
+            "--join-timeout", metavar="S", help="Longest wait for the others, s.", callback=check_seconds
         ),
     ] = 60.0,
-    needs_recorder: Annotated[
-        bool, typer.Option("--needs-recorder", help="Do not begin without a recorder.")
-    ] = False,
-    cpu: Annotated[int | None, typer.Option("--cpu", help="Stay on this processor.")] = None,
+    needs_recorder: Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")] = False,
+    cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
     stay: Annotated[
         float,
         typer.Option(
-            "--stay", metavar="S", help="Let the recorder leave first: s at most.", callback=check_seconds
+            "--stay",
+            metavar="S",
+            help="Wait at the end until the recorder has left, s at most.",
+            callback=check_seconds,
         ),
     ] = 0.0,
     clock_offset: ClockOffsetOption = 0.0,
@@ -60,7 +63,7 @@ def site_command(
     """Runs one site as one process: for separate terminals or machines.
 
     Without endpoints, sites of a session find each other on this machine: each listens at a loopback port
-    that follows from session and site, and connects to the sites before it in the scenario.
+    derived from session and site, and connects to the sites before it in the scenario.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site

@@ -6,17 +6,26 @@ interrupted prints the command that resumes it.
 
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import err, out, print_line, print_table, progress_bar
-from .options import DurationOption, OnOption, SetOption
+from ..reporting.terminal_output import (
+    err,
+    out,
+    print_line,
+    print_note,
+    print_paths,
+    print_table,
+    print_text,
+    progress_bar,
+)
+from .options import DurationOption, JobsOption, OnOption, SetOption, list_overrides
 from .test import parse_seeds
 
 if TYPE_CHECKING:
@@ -34,12 +43,12 @@ _WIDTH_IN = 3.5
 
 MapOption = Annotated[
     bool,
-    typer.Option("--map", help="Draw the map, and the lines of theory on it.", rich_help_panel=_PANEL),
+    typer.Option("--map", help="Draw the stability map with the lines of theory.", rich_help_panel=_PANEL),
 ]
 WidthOption = Annotated[
     float | None,
     typer.Option(
-        "--width", metavar="3.5|7", help="Of the map, in; default: one column.", rich_help_panel=_PANEL
+        "--width", metavar="3.5|7", help="Width of the map, in; default: one column.", rich_help_panel=_PANEL
     ),
 ]
 MarginOption = Annotated[
@@ -47,7 +56,7 @@ MarginOption = Annotated[
     typer.Option(
         "--margin",
         metavar="KEY=FROM:TO",
-        help="Search the edge along a key instead, at every place of the axes.",
+        help="Search the edge of stability along a key instead, at every point of the grid.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -56,7 +65,7 @@ ToleranceOption = Annotated[
     typer.Option(
         "--tolerance",
         metavar="SHARE",
-        help="How wide an edge may be, over its value; default: 0.005.",
+        help="Width of an edge relative to its value; default: 0.005.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -66,13 +75,13 @@ ConfirmOption = Annotated[
         "--confirm",
         metavar="K",
         min=1,
-        help="Of results: run so many cells on each side of the edge live.",
+        help="With results: run this many cells on each side of the edge live.",
         rich_help_panel=_PANEL,
     ),
 ]
 
 
-def check_map_options(
+def _check_modes(
     mapped: bool,
     width: float | None,
     margin: str | None,
@@ -80,67 +89,26 @@ def check_map_options(
     confirm: int | None,
     cell: int | None,
 ) -> None:
-    """Refuses options that ask for two things, or say how to do what was not asked for.
-
-    Raises:
-        UsageError: some do.
-    """
-    wanted = {
+    """Refuses options of two modes at once, and options of a mode that is not chosen."""
+    modes = {
         "--map": mapped,
         "--margin": margin is not None,
         "--confirm": confirm is not None,
         "--cell": cell is not None,
     }
-    asked = [name for name, is_asked in wanted.items() if is_asked]
-    if len(asked) > 1:
-        raise UsageError(f"{' and '.join(asked)} are two things: ask for one at a time")
+    chosen = [name for name, is_chosen in modes.items() if is_chosen]
+    if len(chosen) > 1:
+        raise UsageError(f"{' and '.join(chosen)} exclude each other: give one at a time")
     if width is not None and not mapped:
         raise UsageError("--width is of a map: use it with --map")
     if tolerance is not None and margin is None:
         raise UsageError("--tolerance is of an edge: use it with --margin")
 
 
-def map_results(
-    path: Path, width: float | None, confirm: int | None, jobs: int | None, on: str | None = None
+def _draw_map(
+    results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
-    """Draws the map of results, or confirms some of their cells.
-
-    Args:
-        path: their folder or file.
-        width: of the map, in; None for one column.
-        confirm: how many cells on each side of the edge are run live; None: the map is drawn.
-        jobs: in how many processes; None for one per core.
-        on: the address of a Dask scheduler; None for processes of this machine.
-    """
-    from ..studies.sweep import read_results
-
-    results = read_results(path)
-    if confirm is not None:
-        confirm_cells_live(results, confirm)
-    else:
-        draw_sweep_map(True, results, path if path.is_dir() else path.parent, width, jobs, on)
-
-
-def draw_sweep_map(
-    mapped: bool,
-    results: "SweepResults",
-    folder: Path,
-    width: float | None,
-    jobs: int | None,
-    on: str | None = None,
-) -> None:
-    """Draws the map of a sweep into its folder, if it is wanted: map.png, map.svg, map.md.
-
-    Args:
-        mapped: whether it is.
-        results: the sweep.
-        folder: where to.
-        width: 3.5 or 7, in; None for one column.
-        jobs: in how many processes; None for one per core.
-        on: the address of a Dask scheduler; None for processes of this machine.
-    """
-    if not mapped:
-        return
+    """Draws the map of a sweep into a folder: map.png, map.svg, map.md."""
     from ..reporting.figure_size import make_print_size
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map, build_sweep_command
@@ -152,36 +120,21 @@ def draw_sweep_map(
             results, (build_sweep_command(results.plan, "--map", *words),), jobs, progress, on=on
         )
     for line in made.remarks:
-        out.print(escape(f"note: {line}"), soft_wrap=True)
-    for path in write_map(made, folder, form.width_in):
-        out.print(f"  {escape(str(path))}", soft_wrap=True)
+        print_text(f"note: {line}")
+    print_paths(write_map(made, folder, form.width_in))
 
 
-def margin_range_axis(margin: str) -> str:
-    """Returns the range of a margin as an axis of its two ends, so that a plan checks both."""
-    from ..studies.sweep.margin_search import format_range_axis as axis
-    from ..studies.sweep.margin_search import parse_search_range
-
-    return axis(parse_search_range(margin))
-
-
-def print_margins(
+def _search_margins(
     asked: "SweepPlan",
     margin: str,
     tolerance: float | None,
     folder: Path | None,
     jobs: int | None,
-    on: str | None = None,
+    on: str | None,
 ) -> None:
-    """Searches edges along one key, prints them beside theory, and writes margin.json and margin.md.
+    """Searches edges along one key, prints them with theory, and writes margin.json and margin.md.
 
-    Args:
-        asked: the plan whose last axis is the two ends of the range.
-        margin: the range, as it was asked for.
-        tolerance: how wide an edge may be, over its value; None for the usual one.
-        folder: where results go; None for the next free one below runs.
-        jobs: in how many processes; None for one per core.
-        on: the address of a Dask scheduler; None for processes of this machine.
+    The last axis of the plan is the two ends of the range.
     """
     from ..files import make_results_folder, write_whole
     from ..studies.sweep.margin_search import (
@@ -199,31 +152,21 @@ def print_margins(
         found = search_margins(asked, within, jobs, progress, on)
     out.print()
     print_table(tabulate_margins(asked, within, found))
-    data, text = chosen / "margin.json", chosen / "margin.md"
-    write_whole(data, json.dumps(margins_to_json(asked, within, found), indent=2, allow_nan=False) + "\n")
-    write_whole(text, build_margin_page(asked, within, found))
-    for path in (data, text):
-        out.print(f"  {escape(str(path))}", soft_wrap=True)
+    paths = chosen / "margin.json", chosen / "margin.md"
+    facts = margins_to_json(asked, within, found)
+    write_whole(paths[0], json.dumps(facts, indent=2, allow_nan=False) + "\n")
+    write_whole(paths[1], build_margin_page(asked, within, found))
+    print_paths(paths)
 
 
-def confirm_cells_live(results: "SweepResults", count: int) -> None:
-    """Runs cells beside the edges of a sweep over a network and compares verdicts.
-
-    Args:
-        results: the sweep.
-        count: how many on each side.
-
-    Raises:
-        UsageError: there is no edge, or no cell beside it.
-        Exit: 1 where a verdict differs; 128 + n where signal n ended it.
-    """
+def _confirm_cells(results: "SweepResults", count: int) -> None:
+    """Runs `count` cells on each side of the edges of a sweep live, and compares verdicts."""
     from ..studies.sweep.live_confirmation import choose_cells_near_edges, confirm_cell
     from ..studies.sweep.map_page import tabulate_confirmations
 
     keys = [one.key for one in results.plan.axes]
     rows = choose_cells_near_edges(results.rows, keys, count)
-    run = _live_runner(results.plan.base.name)
-    found = [confirm_cell(row, run) for row in rows]
+    found = [confirm_cell(row, partial(_run_live, results.plan.base.name)) for row in rows]
     out.print()
     print_table(tabulate_confirmations(found, keys))
     same = sum(one.same for one in found)
@@ -232,41 +175,38 @@ def confirm_cells_live(results: "SweepResults", count: int) -> None:
         raise typer.Exit(1)
 
 
-def _live_runner(name: str) -> "Callable[[Scenario, str], LiveSession]":
-    """Returns what runs a scenario over a network, in a folder of its own."""
+def _run_live(name: str, scenario: "Scenario", cell: str) -> "LiveSession":
+    """Runs the scenario of a cell over a network, in a folder of its own."""
     from sites.demo_session import run_demo
     from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
     from ..studies.sweep.live_confirmation import LiveSession
 
-    def run(scenario: "Scenario", cell: str) -> LiveSession:
-        folder = make_results_folder(None, f"confirm-{name}-{cell}", force=False)
-        out.print(escape(f"{cell}: {scenario.duration_s:g} s live, into {folder}"), soft_wrap=True)
-        with SessionDisplay(scenario, out) as display:
-            outcome = run_demo(scenario, folder, display)
-        if outcome.interrupted:
-            err.print("interrupted")
-            raise typer.Exit(128 + outcome.interrupted)
-        return LiveSession(outcome.log, outcome.problems)
-
-    return run
+    folder = make_results_folder(None, f"confirm-{name}-{cell}", force=False)
+    print_text(f"{cell}: {scenario.duration_s:g} s live, into {folder}")
+    with SessionDisplay(scenario, out) as display:
+        outcome = run_demo(scenario, folder, display)
+    if outcome.interrupted:
+        err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return LiveSession(outcome.log, outcome.problems)
 
 
 _LINES = 10
-"""So many lines say how far a sweep is, where there is no terminal for a bar."""
+"""Lines of progress, where no terminal shows a bar."""
 
 
-def start_sweep(
-    asked: "SweepPlan", output: Path | None, jobs: int | None, *, yes: bool, on: str | None = None
+def _start_sweep(
+    asked: "SweepPlan", output: Path | None, jobs: int | None, on: str | None, *, yes: bool
 ) -> "FinishedSweep":
-    """Runs a sweep, or goes on with it where its folder holds it."""
+    """Runs a sweep, or continues it if its folder holds it."""
     from ..studies.executor import count_workers
     from ..studies.sweep.sweep_folder import PLAN_FILE, prepare_sweep_folder
     from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
 
     if output is not None and (output / PLAN_FILE).exists():
-        return _run_rest(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
+        return _resume_sweep(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
     _print_plan(asked)
     workers = count_workers(jobs, on)
     expected = estimate_sweep(asked, jobs=workers)
@@ -275,22 +215,15 @@ def start_sweep(
     return _run_in_folder(prepare_sweep_folder(asked, output), jobs, on, expected)
 
 
-def resume_sweep(path: Path, jobs: int | None, *, yes: bool, on: str | None = None) -> "FinishedSweep":
-    """Goes on with a sweep that was interrupted."""
-    from ..studies.sweep import open_sweep_folder
-
-    return _run_rest(open_sweep_folder(path), jobs, on, yes=yes)
-
-
-def _run_rest(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
-    """Runs what is left of a sweep."""
+def _resume_sweep(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
+    """Runs the rest of a sweep."""
     from ..studies.executor import count_workers
     from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
 
     with folder.journal() as journal:
         done = list(journal.done)
     _print_plan(folder.plan)
-    out.print(f"  {len(done)} runs are done already", soft_wrap=True)
+    print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
     expected = estimate_sweep(folder.plan, done, workers)
     if not yes:
@@ -302,37 +235,47 @@ def _print_plan(asked: "SweepPlan") -> None:
     from ..studies.sweep.sweep_report import describe_sweep_plan
 
     for line in describe_sweep_plan(asked):
-        out.print(escape(line), soft_wrap=True)
+        print_text(line)
 
 
 def _run_in_folder(
     folder: "SweepFolder", jobs: int | None, on: str | None, expected: "DurationEstimate"
 ) -> "FinishedSweep":
-    """Runs a sweep in its folder and shows what came of it; Ctrl-C says how to go on."""
+    """Runs a sweep in its folder and prints its summary; on Ctrl-C, the command that resumes it."""
     from ..studies.sweep import run_sweep
+    from ..studies.sweep.sweep_report import describe_sweep_speed, summarize_sweep
     from ..studies.sweep.sweep_run import format_wall_time
 
     if expected.seconds:
-        line = f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}"
-        out.print(escape(line), soft_wrap=True)
+        print_text(f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}")
     try:
         with _sweep_progress() as progress:
             swept = run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
         with folder.journal() as journal:
             done = len(journal.done)
-        where = shlex.quote(str(folder.path))
-        err.print(f"{done} runs are done and kept; go on with: trilat sweep --resume {where}", soft_wrap=True)
+        resume = f"trilat sweep --resume {shlex.quote(str(folder.path))}"
+        err.print(f"{done} runs are done and kept; go on with: {resume}", markup=False, soft_wrap=True)
         raise
     if not (expected.entries or swept.speed.runs):
         out.print("nothing was left to run")
-    _print_swept(swept)
+    speed = [describe_sweep_speed(swept.speed)] if swept.speed.runs else []
+    for line in [*summarize_sweep(swept.results), *speed, f"results: {swept.folder.results}"]:
+        print_text(line)
+    _print_next_commands(swept.folder.path)
     return swept
+
+
+def _print_next_commands(path: Path) -> None:
+    from ..studies.sweep.sweep_report import list_next_commands
+
+    for line in list_next_commands(path):
+        print_text(f"  {line}")
 
 
 @contextmanager
 def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
-    """Yields what is told how far a sweep is: a bar, or where there is no terminal a line now and then."""
+    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
     if err.is_interactive:
         with progress_bar("sweeping") as show:
             yield show
@@ -341,44 +284,34 @@ def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
     from ..studies.sweep.sweep_run import format_wall_time
 
     clock = SystemClock()
-    began_ns, first, said = -1, 0, 0
+    began_ns, first, printed = -1, 0, 0
 
     def line(done: int, total: int) -> None:
-        nonlocal began_ns, first, said
-        if began_ns < 0:  # not before: processes that begin take seconds, and none later
+        nonlocal began_ns, first, printed
+        if began_ns < 0:  # the start of processes takes seconds and is not counted
             began_ns, first = clock.monotonic_ns(), done
-        if done in (total, first) or done * _LINES // total <= said:
+        if done in (total, first) or done * _LINES // total <= printed:
             return
-        said = done * _LINES // total
+        printed = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
-        out.print(f"  {done} of {total} runs, about {format_wall_time(left_s)} left", soft_wrap=True)
+        print_text(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
 
     yield line
 
 
-def _print_swept(swept: "FinishedSweep") -> None:
-    from ..studies.sweep.sweep_report import describe_sweep_speed, list_next_commands, summarize_sweep
-
-    speed = [describe_sweep_speed(swept.speed)] if swept.speed.runs else []
-    for line in [*summarize_sweep(swept.results), *speed, f"results: {swept.folder.results}"]:
-        out.print(escape(line), soft_wrap=True)
-    for line in list_next_commands(swept.folder.path):
-        out.print(f"  {escape(line)}", soft_wrap=True)
-
-
-def print_sweep_results(path: Path) -> None:
-    """Prints what came of a sweep once more."""
+def _print_results(path: Path) -> None:
+    """Prints the plan and the summary of a finished sweep."""
     from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_report import describe_sweep_plan, list_next_commands, summarize_sweep
+    from ..studies.sweep.sweep_report import summarize_sweep
 
     results = read_results(path)
-    for line in [*describe_sweep_plan(results.plan), *summarize_sweep(results)]:
-        out.print(escape(line), soft_wrap=True)
-    for line in list_next_commands(path):
-        out.print(f"  {escape(line)}", soft_wrap=True)
+    _print_plan(results.plan)
+    for line in summarize_sweep(results):
+        print_text(line)
+    _print_next_commands(path)
 
 
-def print_cell_commands(path: Path, number: int) -> None:
+def _print_cell_commands(path: Path, number: int) -> None:
     """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_report import build_reproduce_command
@@ -387,7 +320,7 @@ def print_cell_commands(path: Path, number: int) -> None:
     for row in results.of_cell(number):
         found = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
         if found.note:
-            err.print(f"note: {escape(found.note)}", soft_wrap=True)
+            print_note(found.note)
         print_line(found.command)
 
 
@@ -405,7 +338,7 @@ def sweep_command(
         str | None,
         typer.Argument(
             metavar="[SCENARIO|RESULTS]",
-            help="Name of a shipped scenario, or path of a TOML file; or of the results of a sweep.",
+            help="Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.",
         ),
     ] = None,
     over: Annotated[
@@ -419,7 +352,9 @@ def sweep_command(
     seeds: Annotated[
         str | None,
         typer.Option(
-            "--seeds", metavar="N|LIST", help="How many per cell, or which, as in 1..20; default: one."
+            "--seeds",
+            metavar="N|LIST",
+            help="Number of seeds per cell, or a list, as in 1..20; default: one.",
         ),
     ] = None,
     law: Annotated[
@@ -432,7 +367,7 @@ def sweep_command(
         typer.Option(
             "--longest",
             metavar="S",
-            help="How long an undecided cell may run, s; default: eight times the others.",
+            help="Longest run of an undecided cell, s; default: eight times the others.",
         ),
     ] = None,
     output: Annotated[
@@ -441,21 +376,21 @@ def sweep_command(
             "-o",
             "--out",
             metavar="DIR",
-            help="Where results go; one that holds this sweep is gone on with. Default: runs/sweep-NAME-N.",
+            help="Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
         ),
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option("--resume", metavar="DIR", help="Go on with a sweep that was interrupted.")
+        Path | None, typer.Option("--resume", metavar="DIR", help="Continue an interrupted sweep.")
     ] = None,
     cell: Annotated[
         int | None,
-        typer.Option("--cell", metavar="N", help="Of results: print the command that makes a log of a cell."),
+        typer.Option(
+            "--cell", metavar="N", help="With results: print the commands that make logs of a cell."
+        ),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
-    ] = None,
+    jobs: JobsOption = None,
     on: OnOption = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Run it though it is enormous.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Run an oversized sweep.")] = False,
     overrides: SetOption = None,
     mapped: MapOption = False,
     width: WidthOption = None,
@@ -463,14 +398,15 @@ def sweep_command(
     tolerance: ToleranceOption = None,
     confirm: ConfirmOption = None,
 ) -> None:
-    """Runs a scenario over a plane of its keys, in virtual time on all cores, and says what is stable.
+    """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
-    What is done is kept, whatever ends the sweep: the same command with the same -o, or --resume, goes on.
+    Finished runs are kept however the sweep ends: the same command with the same -o, or --resume, continues.
     """
+    from ..studies.sweep import open_sweep_folder, plan_sweep
     from ..studies.sweep.sweep_results import require_polars
 
     require_polars()
-    asking = {
+    planned = {
         "--over": over,
         "--seeds": seeds,
         "--law": law,
@@ -478,62 +414,71 @@ def sweep_command(
         "--longest": longest,
         "--set": overrides,
     }
-    check_map_options(mapped, width, margin, tolerance, confirm, cell)
-    if cell is not None or resume is not None or _is_results(scenario):
-        _refuse_given({**asking, "-o": output}.items(), "is of the sweep already: leave it out")
-        _refuse_given([("--margin", margin)], "is of a scenario, and searches anew: name that")
+    _check_modes(mapped, width, margin, tolerance, confirm, cell)
+    results = Path(scenario) if scenario is not None and _is_results(scenario) else None
+    if cell is not None or resume is not None or results is not None:
+        _refuse_given({**planned, "-o": output}, "is of the sweep already: leave it out")
+        _refuse_given({"--margin": margin}, "is of a scenario, and searches anew: name that")
     elif confirm is not None:
         raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
     if resume is not None:
         if scenario is not None or cell is not None:
             raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
-        swept = resume_sweep(resume, jobs, yes=yes, on=on)
-        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs, on)
+        swept = _resume_sweep(open_sweep_folder(resume), jobs, on, yes=yes)
     elif cell is not None:
         if scenario is None:
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
-        print_cell_commands(Path(scenario), cell)
-    elif scenario is not None and _is_results(scenario):
-        if mapped or confirm is not None:
-            map_results(Path(scenario), width, confirm, jobs, on)
-        else:
-            print_sweep_results(Path(scenario))
+        return _print_cell_commands(Path(scenario), cell)
+    elif results is not None:
+        return _show_results(results, jobs, on, mapped=mapped, width=width, confirm=confirm)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
-        axes = [*(over or []), *([] if margin is None else [margin_range_axis(margin)])]
-        asked = _requested_plan(scenario, axes, seeds, law, duration, longest, overrides)
+        asked = plan_sweep(
+            scenario,
+            list_overrides(overrides, duration),
+            over=[*(over or []), *([] if margin is None else [_margin_axis(margin)])],
+            seeds=parse_seed_count(seeds),
+            laws=[name.strip() for name in law.split(",")] if law is not None else (),
+            longest_s=longest,
+        )
         if margin is not None:
-            print_margins(asked, margin, tolerance, output, jobs, on)
-            return
-        swept = start_sweep(asked, output, jobs, yes=yes, on=on)
-        draw_sweep_map(mapped, swept.results, swept.folder.path, width, jobs, on)
+            return _search_margins(asked, margin, tolerance, output, jobs, on)
+        swept = _start_sweep(asked, output, jobs, on, yes=yes)
+    if mapped:
+        _draw_map(swept.results, swept.folder.path, width, jobs, on)
+    return None
 
 
-def _requested_plan(
-    scenario: str,
-    over: list[str] | None,
-    seeds: str | None,
-    law: str | None,
-    duration: float | None,
-    longest: float | None,
-    overrides: list[str] | None,
-) -> "SweepPlan":
-    """Returns the sweep that options describe."""
-    from ..studies.sweep import plan_sweep
+def _show_results(
+    path: Path,
+    jobs: int | None,
+    on: str | None,
+    *,
+    mapped: bool,
+    width: float | None,
+    confirm: int | None,
+) -> None:
+    """Draws the map of finished results, confirms some of their cells live, or prints their summary."""
+    from ..studies.sweep import read_results
 
-    return plan_sweep(
-        scenario,
-        [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])],
-        over=over or (),
-        seeds=parse_seed_count(seeds),
-        laws=[name.strip() for name in law.split(",")] if law is not None else (),
-        longest_s=longest,
-    )
+    if confirm is not None:
+        _confirm_cells(read_results(path), confirm)
+    elif mapped:
+        _draw_map(read_results(path), path if path.is_dir() else path.parent, width, jobs, on)
+    else:
+        _print_results(path)
+
+
+def _margin_axis(margin: str) -> str:
+    """Returns the range of a margin as an axis of its two ends, so that a plan checks both."""
+    from ..studies.sweep.margin_search import format_range_axis, parse_search_range
+
+    return format_range_axis(parse_search_range(margin))
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
-    """Returns how many seeds a text names, as in 10, or which, as in 1..20, 1,5,9 or 7,; one for None."""
+    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,; 1 for None."""
     if text is None:
         return 1
     if text.strip().isdecimal() and len(text) < 19:
@@ -541,17 +486,17 @@ def parse_seed_count(text: str | None) -> int | list[int]:
     return parse_seeds(text.strip().removesuffix(","))
 
 
-def _is_results(source: str | None) -> bool:
-    """Returns whether a source is the results of a sweep; what is called as a shipped scenario is that."""
+def _is_results(source: str) -> bool:
+    """True if a source names the results of a sweep; names of shipped scenarios never do."""
     from ..scenario import list_shipped
     from ..studies.sweep.sweep_folder import PLAN_FILE
 
-    if source is None or source in list_shipped():
-        return False
-    return source.endswith(".parquet") or (Path(source) / PLAN_FILE).exists()
+    return source not in list_shipped() and (
+        source.endswith(".parquet") or (Path(source) / PLAN_FILE).exists()
+    )
 
 
-def _refuse_given(options: Iterable[tuple[str, object]], why: str) -> None:
-    for name, value in options:
+def _refuse_given(options: Mapping[str, object], reason: str) -> None:
+    for name, value in options.items():
         if value is not None:
-            raise UsageError(f"{name} {why}")
+            raise UsageError(f"{name} {reason}")

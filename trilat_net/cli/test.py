@@ -11,8 +11,8 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import err, out
-from .options import OnOption, SetOption
+from ..reporting.terminal_output import err, out, print_text
+from .options import JobsOption, OnOption, SetOption
 
 if TYPE_CHECKING:
     from ..studies.trials.trial import Trial, TrialResult
@@ -34,7 +34,9 @@ def test_command(
     ] = None,
     live: Annotated[
         bool,
-        typer.Option("--live/--virtual", help="Over a network, one after the other, or in virtual time."),
+        typer.Option(
+            "--live/--virtual", help="Live over a network, one after the other, or in virtual time."
+        ),
     ] = False,
     seeds: Annotated[
         str | None,
@@ -43,13 +45,11 @@ def test_command(
     junit: Annotated[
         Path | None, typer.Option("--junit", metavar="FILE", help="Write the results as JUnit XML as well.")
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
-    ] = None,
+    jobs: JobsOption = None,
     on: OnOption = None,
     overrides: SetOption = None,
 ) -> None:
-    r"""Runs scenarios and says which of their \[expect] held, by how much, and how to repeat what did not."""
+    r"""Runs scenarios and checks their \[expect]: which held, by what margin, how to repeat the others."""
     from ..files import write_whole
     from ..net.clock import SystemClock
     from ..studies.executor import check_workers
@@ -114,7 +114,7 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
             source = result.trial.source
             to_do[source] -= 1
             if not to_do[source] and not out.is_terminal:
-                out.print(escape(f"{source}: ran"), soft_wrap=True)
+                print_text(f"{source}: ran")
 
         return run_trials(batch, jobs, done, on)
 
@@ -134,7 +134,7 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
     results = []
     for trial in batch:
         folder = make_results_folder(None, f"test-{trial}", force=False)
-        out.print(escape(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}"), soft_wrap=True)
+        print_text(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}")
         began_ns = clock.monotonic_ns()
         with SessionDisplay(trial.scenario, out) as display:
             outcome = run_demo(trial.scenario, folder, display)
@@ -155,4 +155,4 @@ def _show(report: "TrialReport") -> None:
         color = "green" if mark == "ok" else "red"
         out.print(f"[{color}]{mark}[/{color}]{space}{escape(rest)}", soft_wrap=True)
     for line in [*report.failures(), *report.remarks()]:
-        out.print(escape(line), soft_wrap=True)
+        print_text(line)

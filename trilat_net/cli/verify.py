@@ -1,12 +1,19 @@
 """`trilat verify`: executes a log again and compares every computed field."""
 
-import json
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from ..reporting.terminal_output import err, open_with_progress, out, progress_bar, sanitize, warn_user_laws
+from ..reporting.terminal_output import (
+    err,
+    open_with_progress,
+    out,
+    print_json,
+    print_text,
+    progress_bar,
+    sanitize,
+    warn_user_laws,
+)
 from .options import JsonOption, LogsArgument
 
 app = typer.Typer()
@@ -16,11 +23,12 @@ app = typer.Typer()
 def verify_command(
     files: LogsArgument,
     virtual: Annotated[
-        bool, typer.Option("--virtual", help="Compare with virtual time as well, with and without arrivals.")
+        bool,
+        typer.Option("--virtual", help="Compare with virtual time too, with and without the log's arrivals."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Executes every site again from a log, and compares every computed field of every record."""
+    """Executes every site again from a log and compares every computed field of every record."""
     from ..execution.log_checks import run_log_checks
     from ..reporting.summary_text import format_run_lines
 
@@ -29,14 +37,14 @@ def verify_command(
     with progress_bar(f"executing {files[0]}") as progress:
         result = run_log_checks(log, virtual=virtual, progress=progress)
     if as_json:
-        typer.echo(json.dumps({"files": [str(file) for file in files], **result.to_json()}, indent=2))
+        print_json({"files": [str(file) for file in files], **result.to_json()})
     else:
         for line in result.lines:
-            console = out if line.passed else err
-            console.print(escape(sanitize(f"{line.label}: {line.text}", 4000)), soft_wrap=True)
+            text = sanitize(f"{line.label}: {line.text}", 4000)
+            (out if line.passed else err).print(text, markup=False, soft_wrap=True)
     if not result.passed:
         raise typer.Exit(1)
     if as_json:
         return
     for note in format_run_lines(log):
-        out.print(escape(note), soft_wrap=True)
+        print_text(note)

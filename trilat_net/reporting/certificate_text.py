@@ -13,7 +13,7 @@ from ..analysis.certificate.stability_certificate import Certificate, StabilityF
 from ..core.vectors import Array
 
 MIN_ENERGY_SHARE = 1e-6
-"""A share of the largest energy below which nobody is listed."""
+"""Smaller shares of the largest energy are not listed."""
 MAX_LISTED_LINKS = 6
 """Links that are listed one by one."""
 _SOURCE_NAMES = {
@@ -24,7 +24,7 @@ _SOURCE_NAMES = {
 
 
 class CertificateMark(StrEnum):
-    """What a line does to the exit code."""
+    """Effect of a line on the exit code."""
 
     OK = "ok"
     FAIL = "FAIL"
@@ -36,7 +36,7 @@ class CertificateLine(NamedTuple):
     """One sentence.
 
     Attributes:
-        mark: ok: it vouches for the run; FAIL: it alone fails it; open: it decides nothing; note: beside it.
+        mark: ok: it supports the run; FAIL: it alone fails the run; open: it decides nothing; note: a remark.
         text: the sentence.
     """
 
@@ -51,12 +51,12 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     verdict = (
         CertificateMark.FAIL if broken else CertificateMark.OK if found.bounded_by_v else CertificateMark.OPEN
     )
-    said = [
+    lines = [
         CertificateLine(verdict, found.verdict.text),
         CertificateLine(_GROWTH[found.end.behaviour.grows], f"e and qd: {found.end.text}"),
     ]
     if found.balance is not None:
-        said.append(
+        lines.append(
             CertificateLine(
                 _BALANCE.get(finding, CertificateMark.OK),
                 f"energy balance: {describe_balance(found.balance)}",
@@ -64,12 +64,12 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
         )
     if found.ones is not None and found.ones_rise is not None:
         risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
-        said.append(
+        lines.append(
             CertificateLine(
                 CertificateMark.NOTE, f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"
             )
         )
-    return said
+    return lines
 
 
 _GROWTH = {True: CertificateMark.FAIL, False: CertificateMark.OK, None: CertificateMark.OPEN}
@@ -77,7 +77,7 @@ _BALANCE = {StabilityFinding.BROKEN: CertificateMark.FAIL, StabilityFinding.NOT_
 
 
 def describe_balance(balance: EnergyBalance) -> str:
-    """Returns how well the balance closes."""
+    """Returns the residual of the balance, in words."""
     residual, rest = (float(np.abs(x).max()) for x in (balance.residual, balance.unexplained))
     scale = balance.scale
     if scale <= ZERO_ENERGY_J:
@@ -89,7 +89,7 @@ def describe_balance(balance: EnergyBalance) -> str:
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Returns V at the start and what made V at the end of it, in J; what is next to nothing is left out."""
+    """Returns V at the start, the energies that changed it, and V at the end, J; tiny ones are left out."""
     links = {name: x for name, x in balance.work.items() if "->" in name}
     given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
@@ -111,9 +111,8 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _rest(balance: EnergyBalance) -> Array:
-    """Returns what nobody gave or took, in the gaps too, shape (T,), J."""
-    known = (
-        sum(balance.work.values()) - sum(balance.dissipation.values()) + balance.sampling - balance.transfer
-    )
+    """Returns the unexplained part of V, in gaps too, shape (T,), J."""
+    gained, lost = sum(balance.work.values()), sum(balance.dissipation.values())
+    known = gained - lost + balance.sampling - balance.transfer
     rest: Array = balance.V - balance.V[0] - known
     return rest

@@ -20,11 +20,11 @@ from .export_tables import (
 from .ros2_bag import export_ros2
 
 ExportProgress = Callable[[int, int], None]
-"""Told how much of something is done: (so far, in all)."""
+"""Called with the number of records that are written, and of all."""
 
 
 class ExportFormat(StrEnum):
-    """What a log can be exported to."""
+    """A format of exports."""
 
     ROS2 = "ros2"
     PARQUET = "parquet"
@@ -34,17 +34,17 @@ class ExportFormat(StrEnum):
 
     @property
     def is_folder(self) -> bool:
-        """True where it is a folder of files, False where it is one file."""
+        """True if an export is a folder of files, False if it is one file."""
         return self in (ExportFormat.CSV, ExportFormat.PARQUET)
 
 
 class Exporter:
-    """What exports a log to one form, at one place.
+    """An export to a path, which is refused before a log is read.
 
     Args:
-        form: what to.
-        path: where to: a file, or a folder of files.
-        force: whether an export that is there may be replaced.
+        form: its format.
+        path: a file, or a folder of files.
+        force: whether an earlier export may be replaced.
 
     Raises:
         UsageError: the place is taken, or a package is missing.
@@ -61,7 +61,7 @@ class Exporter:
 
         Args:
             log: the log.
-            progress: told how many records are written, and how many there are.
+            progress: called with the number of records that are written, and of all.
 
         Raises:
             LogError: a record cannot be read.
@@ -82,12 +82,7 @@ class Exporter:
 
 
 def default_export_path(form: ExportFormat, first: Path) -> Path:
-    """Returns where an export goes if nobody says: beside the log, by its name.
-
-    Args:
-        form: what to.
-        first: the log, or its first part.
-    """
+    """Returns the default path of an export: next to the log, or its first part, and named after it."""
     name = first.name.removesuffix(".active").removesuffix(".mcap")
     ending = {ExportFormat.NPZ: ".npz", ExportFormat.MAT: ".mat", ExportFormat.ROS2: "-ros2.mcap"}.get(
         form, f"-{form}"

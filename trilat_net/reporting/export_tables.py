@@ -28,7 +28,7 @@ EXPORT_MANIFEST = "about.json"
 
 
 def describe_table(table: Table) -> TableFacts:
-    """Returns what a table's rows and columns are."""
+    """Returns the description of a table's rows and columns."""
     return {
         "row": table.about,
         "rows": len(table),
@@ -40,12 +40,7 @@ def describe_table(table: Table) -> TableFacts:
 
 
 def describe_export(log: Log, tables: Iterable[tuple[str, TableFacts]]) -> str:
-    """Returns what an export is, as JSON.
-
-    Args:
-        log: the log.
-        tables: every table's facts, by where it stands.
-    """
+    """Returns the description of an export as JSON, with that of every table by its place."""
     facts = {
         "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
         "session": log.session,
@@ -58,19 +53,19 @@ def describe_export(log: Log, tables: Iterable[tuple[str, TableFacts]]) -> str:
 
 
 _ROWS = 4096
-"""Rows that are turned into text together."""
+"""Rows that are converted to text together."""
 
 WriteExport = Callable[[Log, Path, Callable[[int], None]], None]
-"""Writes a log to a path, and calls with how many more records are written."""
+"""Writes a log to a path; calls a function with the number of records just written."""
 
 
 def make_csv_writer() -> WriteExport:
-    """Returns what writes CSV: a line of names, then a row per line, numbers as Python shows them."""
+    """Returns the writer of CSV: a line of names, then a row per line, numbers as Python shows them."""
     return partial(_write, ".csv", _write_csv)
 
 
 def make_parquet_writer() -> WriteExport:
-    """Returns what writes Parquet.
+    """Returns the writer of Parquet.
 
     Raises:
         UsageError: polars is not installed.
@@ -106,27 +101,27 @@ def _write_csv(table: Table, path: Path) -> None:
 
 
 def _write_parquet(table: Table, path: Path) -> None:
-    made = io.BytesIO()  # a disk that is full is an error of ours to tell, not of polars
+    made = io.BytesIO()  # a full disk is reported here, not by polars
     to_data_frame(table).write_parquet(made, compression="zstd")
     path.write_bytes(made.getbuffer())
 
 
 _EXACT = 2**53
-"""Whole numbers up to here are exact as floats, which is what MATLAB computes with."""
+"""Largest integer up to which all are exact as floats, the numbers of MATLAB."""
 _KEYWORDS = {
     "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global",
     "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while",
 }  # fmt: skip
-"""What no variable may be called in MATLAB."""
+"""Reserved words of MATLAB."""
 
 
 def make_npz_writer() -> WriteExport:
-    """Returns what writes NPZ: arrays "m1/q1_rad", "m1/link/age_s_us", "events/text", and two texts."""
+    """Returns the writer of NPZ: arrays "m1/q1_rad", "m1/link/age_s_us", "events/text", and two texts."""
     return _write_npz
 
 
 def make_mat_writer() -> WriteExport:
-    """Returns what writes MAT: a struct per site (`m1.q1_rad`, `m1.link.age_s_us`), `events`, and two texts.
+    """Returns the writer of MAT: a struct per site (`m1.q1_rad`, `m1.link.age_s_us`), `events`, two texts.
 
     Raises:
         UsageError: scipy is not installed.
@@ -178,7 +173,7 @@ def _texts(column: Column) -> NDArray[Any]:
 
 
 def _matlab(column: Column, table: Table) -> Any:
-    """Returns a column as MATLAB has it: doubles where they are exact, rows of characters or cells."""
+    """Returns a column for MATLAB: doubles if they are exact, rows of characters or cells."""
     if column.is_text:
         return _texts(column) if table.kind else column.values.reshape(-1, 1)
     values = column.numbers()

@@ -31,7 +31,7 @@ class FigureSize(NamedTuple):
 
     @property
     def narrow(self) -> bool:
-        """True where two panels beside each other have no room for many words."""
+        """True if two panels in a row have no room for many words."""
         return self.width_in < 5.0
 
 
@@ -40,10 +40,7 @@ REPORT_SIZE = FigureSize(PAGE_IN, 7.0, 6.0, _REPORT_DPI)
 
 
 def make_print_size(width_in: float) -> FigureSize:
-    """Returns the form of a figure in a paper.
-
-    Args:
-        width_in: 3.5 for one column, 7 for two, in.
+    """Returns the size of a figure in a paper, 3.5 in wide for one column or 7 in for two.
 
     Raises:
         UsageError: it is neither.

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from .terminal_output import out, print_table, sanitize
+from .terminal_output import out, print_table, print_text, sanitize
 from .text_table import TextTable
 
 JsonObject = dict[str, Any]
@@ -20,175 +20,147 @@ _TROUBLE = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]"
 
 
 def print_overview(facts: JsonObject) -> None:
-    """Prints what `analysis.overview` tells."""
+    """Prints the facts of `analysis.file_overview`."""
     session: JsonObject | None = facts["session"]
     if session is not None:
-        _show_session(facts, session)
-        _show_sites(facts["sites"])
-        _show_links(facts["links"])
+        _print_session(facts, session)
+        _print_sites(facts["sites"])
+        _print_links(facts["links"])
     elif facts["problem"]:
         out.print(f"[red]cannot be opened:[/red] {escape(sanitize(facts['problem']))}", soft_wrap=True)
     channels: dict[str, JsonObject] = facts["channels"]
     views = {topic: channel for topic, channel in channels.items() if topic.startswith(_VIEWS)}
     own = {topic: channel for topic, channel in channels.items() if topic not in views}
-    _show_channels(own, session)
-    _show_views(views)
+    _print_channels(own, session)
+    if views:
+        rows = [
+            (topic, v["messages"], _number(v["rate_hz"]), _size(v["bytes"]), v["schema"].rpartition("/")[2])
+            for topic, v in views.items()
+        ]
+        _print_table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
     if session is not None:
-        _show_accounts(session)
-        _show_origin(session)
-    _show_files(facts["files"])
+        _print_accounts(session)
+        _print_origin(session)
+    for file in facts["files"]:
+        _print_file(file)
 
 
-def _lines(rows: Iterable[tuple[str, str]]) -> None:
+def _print_rows(*rows: tuple[str, str]) -> None:
     for head, text in rows:
         if text:
             out.print(f"[bold]{head:<9}[/bold] {escape(sanitize(text))}", soft_wrap=True)
 
 
-def _show_session(facts: JsonObject, session: JsonObject) -> None:
+def _print_table(headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> None:
+    """Prints a table; its first columns hold words, the others numbers."""
+    cells = [["-" if value is None else str(value) for value in row] for row in rows]
+    out.print()
+    print_table(TextTable(headers, cells, "l" * words + "r"))
+
+
+def _print_session(facts: JsonObject, session: JsonObject) -> None:
     scenario: JsonObject = session["scenario"]
     sites: dict[str, JsonObject] = facts["sites"]
     missing = sum(site["missing"] for site in sites.values())
     records = sum(site["records"] for site in sites.values())
     began = f", began {session['began_utc']} UTC" if session["began_utc"] else ""
     changed = "" if scenario["as_named"] else "; NOT the text whose hash the session names"
-    finished = all(file["finished"] for file in facts["files"])
+    finished = "finished" if all(file["finished"] for file in facts["files"]) else "not finished"
     damaged = sum(len(file["damaged"]) for file in facts["files"])
-    whole = "finished" if finished else "not finished"
-    _lines(
-        [
-            ("session", f"{session['session']}, {session['driver']}{began}"),
-            (
-                "scenario",
-                f"{scenario['name']}: {scenario['title']}" if scenario["title"] else scenario["name"],
-            ),
-            ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
-            ("duration", f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"),
-            (
-                "records",
-                f"{records}, {missing or 'none'} missing; {whole}"
-                + (f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""),
-            ),
-        ]
+    places = f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""
+    title = f": {scenario['title']}" if scenario["title"] else ""
+    _print_rows(
+        ("session", f"{session['session']}, {session['driver']}{began}"),
+        ("scenario", scenario["name"] + title),
+        ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
+        ("duration", f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"),
+        ("records", f"{records}, {missing or 'none'} missing; {finished}{places}"),
     )
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> None:
-    """Prints a table; its first columns hold words, the others numbers."""
-    out.print()
-    cells = [["-" if value is None else str(value) for value in row] for row in rows]
-    print_table(TextTable(heads, cells, "l" * words + "r"))
-
-
-def _show_sites(sites: dict[str, JsonObject]) -> None:
-    rows: list[list[object]] = []
+def _print_sites(sites: dict[str, JsonObject]) -> None:
+    rows = []
     for name, site in sites.items():
-        of = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
-        row = [name, site["role"], site["rate_hz"], site["records"], of, site["missing"]]
-        rows.append([*row, site["overruns"]])
-    _table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
+        ticks = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
+        counts = (site["records"], ticks, site["missing"], site["overruns"])
+        rows.append((name, site["role"], site["rate_hz"], *counts))
+    _print_table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
     if any(site["late_us"] for site in sites.values()):
-        heads = ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max")
+        headers = ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max")
         loops = [(name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()]
-        _table(heads, loops)
+        _print_table(headers, loops)
 
 
-def _show_links(links: dict[str, JsonObject]) -> None:
+def _print_links(links: dict[str, JsonObject]) -> None:
     measured = any(link["one_way_ms"] for link in links.values())
     clocks = any(link["clock_bound_us"] for link in links.values())
-    heads = ["link", "age ms p50", "p99", "max"]
-    heads += ["one way ms p50", "p99", "max"] if measured else []
-    heads += ["clock us", "+-"] if clocks else []
-    rows: list[list[object]] = []
+    headers = ["link", "age ms p50", "p99", "max"]
+    headers += ["one way ms p50", "p99", "max"] if measured else []
+    headers += ["clock us", "+-"] if clocks else []
+    rows = []
     for name, link in links.items():
         row = [name, *_three(link["age_ms"])]
         row += _three(link["one_way_ms"]) if measured else []
         row += [link["clock_offset_us"], link["clock_bound_us"]] if clocks else []
         rows.append([*row, link["late"], link["lost"], link["duplicate"]])
-    _table([*heads, "late", "lost", "twice"], rows)
+    _print_table([*headers, "late", "lost", "twice"], rows)
 
 
-def _show_views(views: dict[str, JsonObject]) -> None:
-    """Prints the channels that show to viewers what others hold."""
-    if views:
-        heads = ("view, for other tools", "messages", "rate Hz", "size", "as")
-        facts = [
-            (topic, v["messages"], _number(v["rate_hz"]), _size(v["bytes"]), v["schema"].rpartition("/")[2])
-            for topic, v in views.items()
-        ]
-        _table(heads, facts)
-
-
-def _show_channels(channels: dict[str, JsonObject], session: JsonObject | None) -> None:
+def _print_channels(channels: dict[str, JsonObject], session: JsonObject | None) -> None:
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
-    rows = [
-        (
-            topic.removeprefix(prefix) or "(none)",
-            channel["messages"],
-            _number(channel["rate_hz"]),
-            _size(channel["bytes"]),
-            channel["missing"],
-            *_three(channel["between_ms"]),
-        )
-        for topic, channel in channels.items()
-    ]
-    _table(("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
+    rows = []
     for topic, channel in channels.items():
-        if channel["gaps"]:
-            words = [f"{a}-{b}" if b > a else str(a) for a, b in channel["gaps"][:_MOST_GAPS]]
-            more = len(channel["gaps"]) - _MOST_GAPS
-            text = f"{topic.removeprefix(prefix)} lacks {', '.join(words)}"
-            out.print(
-                escape(sanitize(text + (f" and {more} more ranges" if more > 0 else ""))), soft_wrap=True
-            )
+        count, rate_hz, size = channel["messages"], _number(channel["rate_hz"]), _size(channel["bytes"])
+        name = topic.removeprefix(prefix) or "(none)"
+        rows.append((name, count, rate_hz, size, channel["missing"], *_three(channel["between_ms"])))
+    _print_table(("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
+    for topic, channel in channels.items():
+        if gaps := channel["gaps"]:
+            words = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in gaps[:_MOST_GAPS])
+            more = f" and {len(gaps) - _MOST_GAPS} more ranges" if len(gaps) > _MOST_GAPS else ""
+            print_text(f"{topic.removeprefix(prefix)} lacks {words}{more}")
 
 
-def _show_accounts(session: JsonObject) -> None:
-    """Prints what the recorder wrote of each channel of which something is to be said."""
+def _print_accounts(session: JsonObject) -> None:
+    """Prints the recorder's accounts of channels with faults, and counts the others."""
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
     out.print()
     if not accounts:
         out.print("no accounts: the recording did not come to its end")
         return
-    telling = {topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic}
-    plain = len(accounts) - len(telling)
-    if plain:
-        out.print(f"the recorder accounts for {plain} channels without a fault")
-    for topic, text in telling.items():
-        out.print(f"{escape(sanitize(topic.removeprefix(prefix)))}: {escape(sanitize(text))}", soft_wrap=True)
+    faulty = {topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic}
+    if len(accounts) > len(faulty):
+        out.print(f"the recorder accounts for {len(accounts) - len(faulty)} channels without a fault")
+    for topic, text in faulty.items():
+        print_text(f"{topic.removeprefix(prefix)}: {sanitize(text)}")
 
 
-def _show_origin(session: JsonObject) -> None:
+def _print_origin(session: JsonObject) -> None:
     versions: dict[str, str] = session["versions"]
     dirty = {"true": " with changes", "false": ""}.get(session["commit_dirty"] or "", " (changes unknown)")
-    ours = versions.get("trilat-net", "unknown")
+    version = versions.get("trilat-net", "unknown")
     others = ", ".join(f"{name} {version}" for name, version in versions.items() if name != "trilat-net")
     out.print()
-    _lines(
-        [
-            ("made by", f"trilat-net {ours}, commit {(session['commit'] or 'unknown')[:12]}{dirty}"),
-            ("on", f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}"),
-            ("with", others),
-            ("schema", f"version {session['schema_version']}"),
-        ]
+    _print_rows(
+        ("made by", f"trilat-net {version}, commit {(session['commit'] or 'unknown')[:12]}{dirty}"),
+        ("on", f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}"),
+        ("with", others),
+        ("schema", f"version {session['schema_version']}"),
     )
 
 
-def _show_files(files: list[JsonObject]) -> None:
-    for file in files:
-        kinds = (
-            ", ".join(f"{count} chunks {name}" for name, count in file["compression"].items()) or "no chunks"
-        )
-        ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
-        end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
-        part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
-        text = f"{file['path']}{part}: {_size(file['size_bytes'])}, {kinds} ({ratio:.1f} : 1), {end}"
-        _lines([("file", text)])
-        for damage in file["damaged"][:_MOST_GAPS]:
-            _lines([("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}")])
+def _print_file(file: JsonObject) -> None:
+    chunks = ", ".join(f"{count} chunks {name}" for name, count in file["compression"].items()) or "no chunks"
+    ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
+    end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
+    part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
+    size = _size(file["size_bytes"])
+    _print_rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
+    for damage in file["damaged"][:_MOST_GAPS]:
+        _print_rows(("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}"))
 
 
 def _three(spread: JsonObject | None) -> list[str | None]:

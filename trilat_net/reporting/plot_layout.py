@@ -59,21 +59,21 @@ _PAGES = {
         ("largest in 100 ms", "us", (("timing", ""),)),
     ),
 }
-"""Per page its rows: what, the unit, and the parts: channel, and of joint states which of their lists."""
+"""Per page its rows: quantity, unit, and parts: channel, and for joint states one of their lists."""
 
 
 class PlotLayout(NamedTuple):
-    """All pages by name, and where the lines of what happened stand; "" where there are none."""
+    """All pages by name, and the topic of the event lines; "" without any."""
 
     pages: dict[str, PlotPage]
     lines: str
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Returns what to show of the standard channels of a log.
+    """Returns the plots of the standard channels of a log.
 
     Args:
-        channels: those that there are, by topic: `<root>/<site>/<name>`, and of the session `<root>/log`.
+        channels: by topic: `<root>/<site>/<name>`, and of the session `<root>/log`.
     """
     session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES)]
     roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
@@ -88,7 +88,7 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
 def _row(
     channels: Ros2Channels, roots: list[str], what: str, unit: str, parts: tuple[tuple[str, str], ...]
 ) -> Iterator[CurvePlot]:
-    """Yields a quantity of every site that has it."""
+    """Yields the plots of a quantity, one per site that has it."""
     for root in roots:
         curves = [
             curves
@@ -118,7 +118,7 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Returns the names of the numbers of an array, from those along its dimensions: every one with every."""
+    """Returns the names of the numbers of an array: all combinations of the names along its dimensions."""
     names = [""]
     for axis in text.split("; "):
         names = [f"{before} {name}".strip() for before in names for name in axis.split(" ")]
@@ -132,11 +132,11 @@ _TIMELINE = "message_publish_time"
 
 
 def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
-    """Writes a board as a blueprint file.
+    """Writes a layout as a blueprint file.
 
     Args:
-        board: what to show.
-        application: what Rerun calls the recordings that it is for.
+        board: the layout.
+        application: Rerun's name of the recordings that it is for.
         path: the file.
 
     Raises:
@@ -146,7 +146,7 @@ def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
     pages = rrb.Tabs(*(_page(rrb, name, page) for name, page in board.pages.items()))
     views = [pages]
     if board.lines:
-        views.append(rrb.TextLogView(origin=board.lines, name="what happened"))
+        views.append(rrb.TextLogView(origin=board.lines, name="events"))
     blueprint = rrb.Blueprint(
         rrb.Vertical(*views, row_shares=[6, 1][: len(views)]),
         rrb.TimePanel(state="collapsed", timeline=_TIMELINE),
@@ -164,7 +164,7 @@ def _page(rrb: Any, name: str, page: PlotPage) -> Any:
 
 
 def _view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns a plot; of several channels in it each has colors of its own."""
+    """Returns a plot; each of its channels has colors of its own."""
     overrides: dict[str, Any] = {}
     for curves in plot.curves:
         overrides[curves.entity] = _lines(curves, 2 * len(overrides))
@@ -178,7 +178,7 @@ def _view(rrb: Any, plot: CurvePlot) -> Any:
 
 
 def _lines(curves: PlotCurves, first: int) -> Any:
-    """Returns how curves are drawn, from a color on; references paler than what follows them."""
+    """Returns the style of curves, from a color on; references are paler than the joints."""
     rr = import_extra("rerun", "view", "viewers")
     pale, strong = cycle(_PALE), cycle(_COLORS[first:] + _COLORS[:first])
     colors = [next(pale) if name.endswith("_ref") else next(strong) for name in curves.names]

@@ -28,16 +28,16 @@ RunCommand = Callable[[list[str], Mapping[str, str]], int]
 _PROGRAM = (sys.executable, "-m", "rerun")
 _OWN = "127.0.0.1"
 _QUIET = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
-"""Nothing is told to anybody, unless a person's own settings say so."""
+"""No telemetry, unless the user's own settings ask for it."""
 
 
 class ViewerOptions(NamedTuple):
     """How to show a log.
 
     Attributes:
-        full: every record, not the channels that the log has beside them.
-        web: to a browser, which a person opens.
-        save: not at all: what Rerun would show goes into this file, `.rrd`.
+        full: every record instead of the decimated channels.
+        web: in a browser.
+        save: write the recording into this file, `.rrd`, instead of showing it.
     """
 
     full: bool = False
@@ -56,19 +56,20 @@ def open_rerun(
 
     Args:
         paths: its file, or its parts.
-        opened: opens it, where it has to be read.
-        show: how.
-        say: tells a person what happens.
-        run: runs Rerun; else as a process.
+        opened: opens the log if it has to be read.
+        show: where to show it.
+        say: prints a line.
+        run: runs Rerun; by default as a process.
 
     Raises:
-        UsageError: Rerun is not installed, or there is nothing to show it on.
+        UsageError: Rerun is not installed, or there is no display.
         LogError: the log cannot be read.
         RunFailed: Rerun ended badly.
     """
     import_extra("rerun", "view", "viewers")
-    if show.save is None and not show.web:
-        _needs_display()
+    displays = {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
+    if show.save is None and not show.web and sys.platform == "linux" and not displays:
+        raise UsageError("there is no display here; show it in a browser with --web, or keep it with --save")
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
         path, named = paths[0], Path(folder) / f"{make_application_id(paths[0])}.mcap"
         if show.full or len(paths) > 1 or not read_ros2_channels(path):
@@ -81,29 +82,23 @@ def open_rerun(
         layout = Path(folder) / "layout.rbl"
         save_blueprint(build_plot_layout(read_ros2_channels(path)), path.stem, layout)
         for command in _commands(show, path, layout, say):
-            code = (run or _run)([*_PROGRAM, *command], {**_QUIET, **os.environ})
+            arguments, environment = [*_PROGRAM, *command], {**_QUIET, **os.environ}
+            if run is None:
+                code = subprocess.run(arguments, env=environment, check=False).returncode
+            else:
+                code = run(arguments, environment)
             if code:
                 raise RunFailed(f"Rerun ended with exit code {code}")
 
 
 def make_application_id(path: Path) -> str:
-    """Returns what Rerun shall call a log: by its name, in the letters that it takes for that."""
+    """Returns the name of a log in the letters that Rerun allows for an application."""
     stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
     return re.sub(r"[^A-Za-z0-9_-]", "-", stem).lstrip("-") or "log"
 
 
-def _needs_display() -> None:
-    """Refuses a window where there can be none.
-
-    Raises:
-        UsageError: there is no display.
-    """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
-        raise UsageError("there is no display here; show it in a browser with --web, or keep it with --save")
-
-
 def _commands(show: ViewerOptions, log: Path, layout: Path, say: Callable[[str], None]) -> list[list[str]]:
-    """Returns what Rerun is called with, one after the other; it listens on this machine alone."""
+    """Returns the arguments of one call of Rerun after the other; it listens on this machine alone."""
     if show.save is not None:
         return _saving(log, layout, show.save)
     port = _free_port()
@@ -116,10 +111,10 @@ def _commands(show: ViewerOptions, log: Path, layout: Path, say: Callable[[str],
 
 
 def _saving(log: Path, layout: Path, save: Path) -> list[list[str]]:
-    """Returns how Rerun writes what it would show.
+    """Returns the calls of Rerun that write the recording.
 
-    Its own `--save` of several files ends with the first of them that was read, and what the others had not
-    yet given is missing (measured with 0.41: up to all of a log).
+    Its own `--save` of several files ends with the first that was read; the rest of the others is missing
+    (measured with 0.41: up to all of a log).
     """
     recording = layout.with_name("log.rrd")
     return [
@@ -129,12 +124,8 @@ def _saving(log: Path, layout: Path, save: Path) -> list[list[str]]:
 
 
 def _free_port() -> int:
-    """Returns a port that nobody listens at."""
+    """Returns a free port."""
     with socket.socket() as probe:
         probe.bind((_OWN, 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-def _run(command: list[str], environment: Mapping[str, str]) -> int:
-    return subprocess.run(command, env=environment, check=False).returncode

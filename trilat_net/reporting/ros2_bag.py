@@ -29,7 +29,7 @@ from ..log.ros2.ros2_messages import (
 )
 
 SOURCE_METADATA = "trilat.source"
-"""Metadata of the file: which session it was made of."""
+"""Metadata of the file: its session."""
 _QOS = """\
 - history: 1
   depth: 10
@@ -41,20 +41,20 @@ _QOS = """\
   liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
   avoid_ros_namespace_conventions: false
 """
-"""Reliable, volatile, the last ten: what a publisher of ROS 2 offers by default."""
+"""Reliable, volatile, the last ten: the default of publishers in ROS 2."""
 _EVERY = 1000
-"""Records between two words on how far it is."""
+"""Records between two reports of progress."""
 
 
 class _TimedMessages(NamedTuple):
-    """What came at once: messages of one publish time, by topic."""
+    """Messages of one publish time, by topic."""
 
     log_ns: int
     publish_ns: int
     messages: list[tuple[str, bytes]]
 
 
-def export_ros2(log: Log, path: Path, told: Callable[[int], None] = lambda _: None) -> None:
+def export_ros2(log: Log, path: Path, progress: Callable[[int], None] = lambda _: None) -> None:
     """Writes a log as a bag that `ros2 bag` and its like play and read.
 
     Per site, under its name: `joint_states`, `reference`, `error`, `tau_x`, `theta_hat`, `mode`, and its
@@ -63,8 +63,8 @@ def export_ros2(log: Log, path: Path, told: Callable[[int], None] = lambda _: No
 
     Args:
         log: the log.
-        path: the file, which is made or replaced.
-        told: called with how many records of sites have been written since it was called last.
+        path: the file; an earlier one is replaced.
+        progress: called with the number of records that were written since the last call.
 
     Raises:
         LogError: a message of the log cannot be read.
@@ -74,7 +74,7 @@ def export_ros2(log: Log, path: Path, told: Callable[[int], None] = lambda _: No
         file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2")
         file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
         file.add_attachment(0, 0, SCENARIO, "application/toml", log.scenario_text.encode())
-        sites = [_SiteMessages(log, name, told) for name in log.sites]
+        sites = [_SiteMessages(log, name, progress) for name in log.sites]
         known = {f"/{name}": channel for name, channel in SESSION_CHANNELS.items()}
         for site in sites:
             known |= site.channels
@@ -87,11 +87,11 @@ def export_ros2(log: Log, path: Path, told: Callable[[int], None] = lambda _: No
 
 
 class _BagChannels:
-    """The channels of a bag, each made when its first message comes.
+    """The channels of a bag, each registered with its first message.
 
     Args:
         file: the file.
-        known: every channel that there may be, by topic.
+        known: every possible channel, by topic.
     """
 
     def __init__(self, file: McapWriter, known: dict[str, Ros2Channel]) -> None:
@@ -113,10 +113,10 @@ class _BagChannels:
 
 
 class _SiteMessages:
-    """What there is of one site; topics stand under its name."""
+    """The messages of one site, on topics under its name."""
 
-    def __init__(self, log: Log, name: str, told: Callable[[int], None]) -> None:
-        self._log, self._name, self._told = log, name, told
+    def __init__(self, log: Log, name: str, progress: Callable[[int], None]) -> None:
+        self._log, self._name, self._progress = log, name, progress
         self._epoch_unix_ns = int(log.session.get("epoch_unix_ns", "0"))
         self._shapes = shapes = Ros2SiteChannels(name, log.scenario.peers(name))
         self._states = cdr.JointStatePacker(shapes.joints)
@@ -131,7 +131,7 @@ class _SiteMessages:
         return [(f"/{self._name}/{part}", data) for part, data in messages]
 
     def records(self) -> Iterator[_TimedMessages]:
-        """Yields its records, as they came."""
+        """Yields its records in the order of arrival."""
         part = self._log[self._name]
         log_ns, publish_ns = part.log_time_ns.tolist(), part.publish_time_ns.tolist()
         for count, at in enumerate(np.argsort(part.log_time_ns, kind="stable").tolist(), 1):
@@ -146,10 +146,10 @@ class _SiteMessages:
             )
             yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
             if not count % _EVERY or count == len(part):
-                self._told((count - 1) % _EVERY + 1)
+                self._progress((count - 1) % _EVERY + 1)
 
     def statistics(self) -> Iterator[_TimedMessages]:
-        """Yields its statistics, as they came."""
+        """Yields its statistics in the order of arrival."""
         timed = self._log.timed_link_stats(self._name)
         rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
         for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
@@ -157,7 +157,7 @@ class _SiteMessages:
 
 
 def _events(log: Log) -> Iterator[_TimedMessages]:
-    """Yields what happened, as a text and as a line each."""
+    """Yields the events, each as a text and as a line."""
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:

@@ -13,14 +13,14 @@ from ..analysis.timeline import ModeInterval, StatedModel, find_mode_intervals, 
 from ..log.log_reader import Log
 
 MOST_LINES = 12
-"""Lines of each kind; what is more stands in summary.json."""
+"""Lines of each kind; summary.json has the rest."""
 MOST_LINE_CHARACTERS = 400
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
-"""Kinds of the events that tell of what came from outside of the program."""
+"""Kinds of the events about user laws and external arms."""
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns what there is to say of a run besides its numbers: its links, changes, modes and clocks.
+    """Returns the lines of a run besides its numbers: user laws, links, changes, modes and clocks.
 
     Raises:
         LogError: a record names a change that is none.
@@ -35,17 +35,13 @@ def format_run_lines(log: Log) -> list[str]:
 
 
 def format_outside_lines(log: Log) -> list[str]:
-    """Returns what sites said of laws and arms from outside: why one ended the run, and what was odd."""
-    return _first([_plain(event.text) for event in log.events if event.kind in OUTSIDE_EVENT_KINDS])
-
-
-def _plain(text: str) -> str:
-    """Returns what somebody wrote into a log as a line of bounded length."""
-    return "".join(letter if letter.isprintable() else " " for letter in text[:MOST_LINE_CHARACTERS])
+    """Returns the messages about user laws and external arms, as lines of bounded length."""
+    texts = (e.text[:MOST_LINE_CHARACTERS] for e in log.events if e.kind in OUTSIDE_EVENT_KINDS)
+    return _first(["".join(letter if letter.isprintable() else " " for letter in text) for text in texts])
 
 
 def format_link_lines(log: Log) -> list[str]:
-    """Returns a line per link that was not said to be constant without loss, or was not."""
+    """Returns a line per link that is not stated as constant without loss, or was not so."""
     return _first([format_link_line(use) for use in summarise_links(log) if not use.plain])
 
 
@@ -82,7 +78,7 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def format_link_line(use: LinkSummary) -> str:
-    """Returns what one link did, in a line."""
+    """Returns the summary of a link in a line."""
     measured = any(state.link.measured for state in use.stated)
     parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
     if use.one_way_us is not None and measured:
@@ -94,7 +90,7 @@ def format_link_line(use: LinkSummary) -> str:
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Returns what a link was said to do; of many changes the last one."""
+    """Returns the stated models of a link; of many changes the last one."""
     first, *later = states
     words = [first.link.describe()]
     if len(later) > 2:
@@ -105,7 +101,7 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def format_clock(use: ClockSummary) -> str:
-    """Returns where a clock stood, in a few words."""
+    """Returns offset, bound and drift of a clock in a few words."""
     known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
     words = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
     if use.drift_ppm is not None:
@@ -126,14 +122,14 @@ def _number(value: float) -> str:
 
 
 def _losses(use: LinkSummary, counts: SampleCounts) -> str:
-    said = {
+    losses = {
         "missing on the way": counts.missing,
         "lost": counts.lost,
         "late": counts.late,
         "superseded": counts.superseded,
         "duplicates": counts.duplicate + counts.copies,
     }
-    words = [f"{name} {_share(count, counts.judged)}" for name, count in said.items() if count]
+    words = [f"{name} {_share(count, counts.judged)}" for name, count in losses.items() if count]
     if use.burst is not None and use.burst > 1.005:
         words.append(f"{_number(use.burst)} in a row")
     return ", ".join(words) or "nothing lost"

@@ -1,15 +1,16 @@
-"""Terminal output that commands share: consoles, progress bar, tables, warnings about a log that is opened.
+"""Terminal output that commands share: consoles, lines, tables, progress bar, opening of a log with warnings.
 
 Invariants: text from a file or a peer passes `sanitize`: no control characters, bounded length. Library code
 knows nothing of the bar; it calls a function with (done, total). Imports only Rich at the top, so that
 `trilat --help` stays fast.
 """
 
+import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,39 +20,101 @@ if TYPE_CHECKING:
     from .conclude import Conclusion
     from .text_table import TextTable
 
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+PATIENCE_S = 1.0
+"""Time until a progress bar appears, s."""
+_EVERY_S = 0.1
+_MAX_DAMAGED = 3
+"""Damaged parts that are listed."""
+_MAX_LETTERS = 4000
+"""Of a line."""
+_PIPE_WIDTH = 160
+"""Columns that output has at least where it is no terminal."""
+
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Returns a text of strangers as a terminal may have it: no control characters, and no endless one."""
+    """Returns a text for a terminal: no control characters, at most `most` letters."""
     plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1])
     return plain if len(plain) <= most else plain[:most] + "..."
 
 
+def print_text(text: object) -> None:
+    """Prints a line as it is, sanitized."""
+    out.print(sanitize(text, _MAX_LETTERS), markup=False, soft_wrap=True)
+
+
+def print_note(text: object) -> None:
+    """Prints a note to standard error."""
+    err.print(f"note: {sanitize(text, _MAX_LETTERS)}", markup=False, soft_wrap=True)
+
+
+def print_error(text: object) -> None:
+    """Prints an error to standard error."""
+    err.print(f"error: {sanitize(text, _MAX_LETTERS)}", markup=False, soft_wrap=True)
+
+
+def print_check(passed: bool, text: object) -> None:
+    """Prints the result of a check."""
+    mark = "[green]ok[/green]  " if passed else "[red]FAIL[/red]"
+    out.print(f"{mark} {escape(sanitize(text, _MAX_LETTERS))}", soft_wrap=True)
+
+
+def print_paths(paths: Iterable[Path]) -> None:
+    """Prints the files that were written, a line each."""
+    for path in paths:
+        print_text(f"  {path}")
+
+
+def print_json(value: Any) -> None:
+    """Prints JSON; NaN is an error."""
+    print_line(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_line(text: str) -> None:
+    """Prints a line at once, for programs that read the output."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def print_table(table: "TextTable", styles: Mapping[str, str] | None = None) -> None:
+    """Prints a table; cells with a text of `styles` in that style."""
+    wide = Console(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
+    (out if out.is_terminal else wide).print(table.rich(styles or {}))
+
+
 def print_conclusion(conclusion: "Conclusion") -> None:
-    """Prints what there is to say of a log."""
+    """Prints the report of a finished run."""
     print_table(conclusion.table)
     for note in conclusion.notes:
-        out.print(escape(note), soft_wrap=True)
+        print_text(note)
     for line in conclusion.lines:
-        mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
-        out.print(f"{mark} {escape(line.label)}: {escape(line.text)}", soft_wrap=True)
-    for path in conclusion.paths:
-        out.print(f"  {escape(str(path))}", soft_wrap=True)
+        print_check(line.passed, f"{line.label}: {line.text}")
+    print_paths(conclusion.paths)
 
 
-PATIENCE_S = 1.0
-"""How long nobody needs to be told that something goes on, s."""
-_EVERY_S = 0.1
+def conclude_files(paths: Sequence[Path], folder: Path) -> "tuple[Log, Conclusion]":
+    """Checks a log that was just recorded, writes its report into a folder and prints the conclusion."""
+    from .conclude import conclude
+
+    out.print("checking the log and drawing ...")
+    log = open_with_progress(*paths)
+    with progress_bar("executing and drawing") as progress:
+        conclusion = conclude(log, folder, progress)
+    print_conclusion(conclusion)
+    return log, conclusion
 
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total), as often as one likes; it draws when it is worth it.
+    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a second.
 
     Args:
-        label: what is going on, as in "reading run.mcap".
+        label: the activity, as in "reading run.mcap".
     """
     if not err.is_interactive:
-        yield _ignore_progress
+        yield lambda _done, _total: None
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -81,16 +144,8 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         display.stop()
 
 
-def _ignore_progress(done: int, total: int) -> None:
-    """Draws nothing, where nobody looks."""
-
-
-_MAX_DAMAGED = 3
-"""Damaged parts that are told one by one."""
-
-
 def open_with_progress(first: Path, *more: Path) -> "Log":
-    """Returns the log in a file, or in the files that are its parts.
+    """Returns the log in a file, or in the files that are its parts, and warns of damage.
 
     Raises:
         LogError: one is missing, is no MCAP file, or no log of trilat-net.
@@ -102,26 +157,23 @@ def open_with_progress(first: Path, *more: Path) -> "Log":
     for path in (first, *more):
         warn_if_unfinished(path)
     for problem in log.damaged[:_MAX_DAMAGED]:
-        err.print(f"note: {escape(sanitize(problem))}", soft_wrap=True)
+        print_note(problem)
     if log.damaged:
-        untold = len(log.damaged) - _MAX_DAMAGED
-        rest = f"and {untold} more damaged parts; " if untold > 0 else ""
-        err.print(
-            f"note: {rest}all that can be read is made a whole file by: trilat log recover FILE",
-            soft_wrap=True,
-        )
+        rest = len(log.damaged) - _MAX_DAMAGED
+        unlisted = f"and {rest} more damaged parts; " if rest > 0 else ""
+        print_note(f"{unlisted}make a whole file of everything that can be read: trilat log recover FILE")
     return log
 
 
 def warn_user_laws(log: "Log", *, needed: bool = True) -> None:
-    """Says which code a log names that it does not hold, and that executing the log runs it.
+    """Warns of code outside the log, which an execution of the log runs.
 
     Args:
         log: the log.
         needed: whether nothing can be done without that code.
 
     Raises:
-        ScenarioError: the file of a law is not there, and needed.
+        ScenarioError: the file of a needed law does not exist.
     """
     from ..errors import ScenarioError
     from ..execution.verify import find_user_laws
@@ -133,11 +185,11 @@ def warn_user_laws(log: "Log", *, needed: bool = True) -> None:
             raise
         return
     for law in laws:
-        err.print(f"note: executing this log runs code from outside: {escape(sanitize(law))}", soft_wrap=True)
+        print_note(f"executing this log runs code from outside: {law}")
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Says so where a file was not finished, and what mends it.
+    """Warns of a file that was not finished, with the command that mends it.
 
     Raises:
         LogError: it cannot be read.
@@ -151,25 +203,7 @@ def warn_if_unfinished(path: Path) -> None:
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     if not whole:
-        text = f"{path}: was not finished: its end and its index are missing; make it whole with: "
-        err.print(f"note: {escape(text)}trilat log recover {escape(str(path))}", soft_wrap=True)
-
-
-_PIPE_WIDTH = 160
-"""Columns that output has at least where it is no terminal."""
-
-
-def print_table(table: "TextTable", styles: Mapping[str, str] | None = None) -> None:
-    """Prints a table; cells with a text of `styles` in that style."""
-    wide = Console(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
-    (out if out.is_terminal else wide).print(table.rich(styles or {}))
-
-
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
-
-
-def print_line(text: str) -> None:
-    """Prints a line at once, as a process does that others watch."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+        print_note(
+            f"{path}: was not finished: its end and its index are missing; make it whole with: "
+            f"trilat log recover {path}"
+        )

@@ -28,7 +28,7 @@ def explain_missing_loop_times(log: Log) -> str:
 def loop_time_bin_edges(log: Log) -> Array:
     """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the logarithm.
 
-    The last edge lies above every time in the log; what is below the first, 1 us, counts in the first bin.
+    The last edge lies above every time in the log; times below the first, 1 us, count in the first bin.
     """
     largest = max(
         (int(times.max()) for s in log.sites for times in (log[s].late_us, log[s].busy_us) if len(times)),

@@ -1,0 +1,89 @@
+"""`trilat figure`: single figures of a log for a paper."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from ..errors import UsageError
+from ..reporting.terminal_output import (
+    open_with_progress,
+    out,
+    print_json,
+    print_paths,
+    print_table,
+    progress_bar,
+)
+from ..reporting.text_table import TextTable
+from .options import ForceOption, LogArgument
+
+if TYPE_CHECKING:
+    from ..log.log_reader import Log
+
+
+app = typer.Typer()
+
+
+@app.command(
+    "figure", epilog="Example: trilat figure run.mcap positions settling --width 3.5 --format pdf --out paper"
+)
+def figure_command(
+    file: LogArgument,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(help="Names of figures, see --list; default: all that FILE has.", metavar="NAME"),
+    ] = None,
+    width_in: Annotated[
+        float, typer.Option("--width", metavar="3.5|7", help="Width of one or two columns of a paper, in.")
+    ] = 3.5,
+    formats: Annotated[
+        str, typer.Option("--format", metavar="pdf,png,svg", help="One or more formats.")
+    ] = "pdf,png",
+    folder: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Default: FILE without .mcap, -figures.")
+    ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Only list the figures.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
+    force: ForceOption = False,
+) -> None:
+    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
+    log = open_with_progress(file)
+    if listed:
+        _list_figures(log, as_json=as_json)
+        return
+    from ..reporting.figures.registry import write_figures
+
+    place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
+    kinds = _formats(formats)
+    with progress_bar("drawing") as progress:
+        paths = write_figures(
+            log, place, names or (), width_in=width_in, formats=kinds, force=force, progress=progress
+        )
+    if as_json:
+        print_json([str(path) for path in paths])
+        return
+    print_paths(paths)
+
+
+def _formats(text: str) -> list[str]:
+    kinds = [kind.strip().lower() for kind in text.split(",") if kind.strip()]
+    if not kinds:
+        raise UsageError("--format names no format, as in --format pdf,png")
+    return kinds
+
+
+def _list_figures(log: "Log", *, as_json: bool) -> None:
+    """Prints every figure, and for which of them a log has nothing to show."""
+    from ..reporting.figures.registry import FIGURES
+
+    absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
+    if as_json:
+        rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
+        print_json(rows)
+        return
+    drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
+    print_table(TextTable(("figure", "shows"), drawable))
+    for name, why in absent.items():
+        if why:
+            out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)

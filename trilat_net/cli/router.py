@@ -1,0 +1,59 @@
+"""`trilat router`: lets sites meet that cannot reach each other directly."""
+
+from typing import Annotated
+
+import typer
+
+from ..reporting.terminal_output import print_line
+from .options import ConnectOption, ZenohConfigOption, check_seconds
+
+app = typer.Typer()
+
+ANY_ADDRESS = "tcp/0.0.0.0:7447"
+
+
+@app.command("router", epilog=f"Example: trilat router --listen {ANY_ADDRESS}")
+def router_command(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--listen", metavar="EP", help=f"Endpoint to listen at; repeatable; default: {ANY_ADDRESS}."
+        ),
+    ] = None,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    until_idle: Annotated[
+        float | None,
+        typer.Option(
+            "--until-idle",
+            metavar="S",
+            help="End once all members have been gone for this long, s; default: never.",
+            callback=check_seconds,
+        ),
+    ] = None,
+) -> None:
+    """Connects sites that cannot reach each other directly, as behind NAT.
+
+    Sites and recorder name it with --router; the order of starts is free. It runs until Ctrl-C; a session
+    continues when it is restarted. Routers that --connect to each other act as one.
+    """
+    from ..net.clock import SystemClock
+    from ..net.connection import open_bus, resolve_router_connection, run_router
+    from ..net.zenoh_bus import read_zenoh_file
+    from ..process import Interrupt
+
+    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
+    connection = resolve_router_connection(listen, connect, file, [ANY_ADDRESS])
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        bus = open_bus(connection, clock, interrupt.requested, None, print_line)
+        if bus is None:
+            raise typer.Exit(interrupt.exit_code)
+        try:
+            print_line(f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            run_router(
+                bus, clock, interrupt.requested, lambda text: print_line(f"router: {text}"), until_idle
+            )
+        finally:
+            bus.close()
+        raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
