@@ -201,6 +201,7 @@ class McapReader:
     def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
         find_topic, ours = self._topics.get, self._ours
         parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
+        new = tuple.__new__  # what the class does with its arguments, in half the time
         memory = 0
         for opcode, begin, end in iterate_records(data):
             if opcode == OP_MESSAGE:
@@ -215,7 +216,8 @@ class McapReader:
                 else:
                     memory += 100 + length
                 payload = data[begin + head_bytes : end]
-                yield McapMessage(find_topic(channel, ""), payload, log_time_ns, publish_time_ns, sequence)
+                topic = find_topic(channel, "")
+                yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in _DEFINITIONS:
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
