@@ -125,14 +125,18 @@ def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
         text=True,
     )
 
-    def workers() -> list[str]:
+    def workers() -> list[Path]:
         threads = Path(f"/proc/{process.pid}/task").glob("*/children")
-        return [pid for thread in threads for pid in thread.read_text().split()]
+        children = [Path("/proc", pid) for thread in threads for pid in thread.read_text().split()]
+        return [child for child in children if b"LokyProcess" in (child / "cmdline").read_bytes()]
 
-    until(lambda: len(workers()) == 2, timeout_s=60)
-    pids = workers()
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    assert "Traceback" not in err
-    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids), timeout_s=20)
+    try:
+        until(lambda: len(workers()) == 2, timeout_s=60)
+        started = workers()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 130, err
+        assert "Traceback" not in err
+        until(lambda: not any(path.exists() for path in started), timeout_s=20)
+    finally:
+        process.kill()
