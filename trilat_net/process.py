@@ -112,7 +112,7 @@ def worker_pool(count: int) -> Iterator[Executor]:
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
     pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=(os.getpid(),))
     try:
-        with ignore_sigint():
+        with hold_sigint():
             pool.submit(os.getpid)  # starts all processes, which inherit it
         yield pool
         pool.shutdown()
@@ -121,16 +121,16 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def ignore_sigint() -> Iterator[None]:
-    """Ignores Ctrl-C inside the block, in the main thread: processes that start there inherit it."""
-    if threading.current_thread() is not threading.main_thread():
+def hold_sigint() -> Iterator[None]:
+    """Holds Ctrl-C back in the block: processes that start there never get it, this one does afterwards."""
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _prepare_worker(parent: int) -> None:
