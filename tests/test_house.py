@@ -37,7 +37,7 @@ def test_the_house_is_no_larger_than_it_may_be() -> None:
 
 def test_no_body_is_longer_than_forty_lines() -> None:
     assert not [
-        (path.name, *found) for path in house.files() for found in house.bodies(path) if found[1] > 60
+        (path.name, *found) for path in house.files() for found in house.bodies(path) if found[1] > 40
     ]
 
 

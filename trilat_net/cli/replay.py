@@ -128,8 +128,7 @@ def replay_command(
     with progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
     name = check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    place = [default_endpoint(name, 0)]
-    connection = resolve_connection(listen, connect, router, zenoh_config, place, [])
+    connection = resolve_connection(listen, connect, router, zenoh_config, [default_endpoint(name, 0)], [])
     options = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
     console = err if as_json else out
     tell = partial(console.print, markup=False, soft_wrap=True)
@@ -138,31 +137,31 @@ def replay_command(
     reported = set(facts.torn)
     _warn_torn(facts.torn)
     clock = SystemClock()
+    show = _line(clock)
     with Interrupt() as interrupt:
         outcome = play_log(
-            (facts, block),
-            files,
-            selection,
-            options,
-            connection,
-            clock,
-            interrupt.requested,
-            tell,
-            _line(clock),
+            (facts, block), files, selection, options, connection, clock, interrupt.requested, tell, show
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
+    _report_playback(outcome, name, speed, reported, as_json=as_json)
+    if interrupt.requested():
+        err.print("interrupted")
+        raise typer.Exit(interrupt.exit_code)
+    if outcome.cut or outcome.strays:
+        raise typer.Exit(1)
+
+
+def _report_playback(
+    outcome: "PlaybackSummary", name: str, speed: float, reported: set[Path], *, as_json: bool
+) -> None:
+    """Prints the summary of a playback, and warns of damage not `reported` before and of gaps."""
     if as_json:
         print_json({"session": name, **_facts(outcome, speed)})
     else:
         _show(outcome)
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     _warn_undelivered(outcome)
-    if interrupt.requested():
-        err.print("interrupted")
-        raise typer.Exit(interrupt.exit_code)
-    if outcome.cut or outcome.strays:
-        raise typer.Exit(1)
 
 
 def _time(text: str) -> Literal["publish", "log"]:

@@ -406,18 +406,12 @@ def sweep_command(
     from ..studies.sweep.sweep_results import require_polars
 
     require_polars()
-    planned = {
-        "--over": over,
-        "--seeds": seeds,
-        "--law": law,
-        "--duration": duration,
-        "--longest": longest,
-        "--set": overrides,
-    }
     _check_modes(mapped, width, margin, tolerance, confirm, cell)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     if cell is not None or resume is not None or results is not None:
-        _refuse_given({**planned, "-o": output}, "is of the sweep already: leave it out")
+        planned: dict[str, object] = {"--over": over, "--seeds": seeds, "--law": law, "-o": output}
+        planned |= {"--longest": longest, "--set": overrides, "--duration": duration}
+        _refuse_given(planned, "is of the sweep already: leave it out")
         _refuse_given({"--margin": margin}, "is of a scenario, and searches anew: name that")
     elif confirm is not None:
         raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
