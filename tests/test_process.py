@@ -122,6 +122,6 @@ def test_workers_end_when_their_parent_is_killed() -> None:
 def test_a_ctrl_c_while_workers_start_arrives_afterwards() -> None:
     with Interrupt() as interrupt:
         with hold_sigint():
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
             assert not interrupt.requested()
         assert interrupt.requested()
