@@ -5,7 +5,7 @@ import io
 import os
 from pathlib import Path
 
-from trilat_net.log.log_file import LogFile
+from trilat_net.log.log_file import DiskReserve, LogFile
 from trilat_net.log.mcap_writer import McapWriter
 
 
@@ -50,10 +50,11 @@ class SmallFile(io.FileIO):
         return super().truncate(size)
 
 
-class SmallRoom:
+class SmallRoom(DiskReserve):
     """Room kept on a small disk; none where `possible` is False."""
 
     def __init__(self, disk: SmallDisk, possible: bool = True) -> None:
+        super().__init__(Path())
         self._disk, self._possible = disk, possible
 
     def grow(self, size: int) -> None:

@@ -24,8 +24,6 @@ from trilat_net.log.log_file import (
     SYNC_PERIOD_NS,
     DiskReserve,
     LogFile,
-    close_log_file,
-    open_new_log,
 )
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.recover import recover_log
@@ -48,7 +46,7 @@ def messages(path: Path) -> list[Sent]:
 
 def test_a_log_has_its_name_when_it_is_whole_and_not_before(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with open_new_log(path) as file:
+    with LogFile(path) as file:
         container = begun(file)
         container.add_message(1, 0, b"x", 0)
         container.flush()
@@ -79,7 +77,7 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
     path = tmp_path / "run.mcap"
 
     def fail() -> None:
-        with open_new_log(path) as file:
+        with LogFile(path) as file:
             begun(file).add_message(1, 0, b"x", 0)
             _ = 1 / 0
 
@@ -88,16 +86,16 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
     with (
         pytest.raises(UsageError, match=r"never finished.*trilat log recover .*run\.mcap\.active"),
-        open_new_log(path),
+        LogFile(path),
     ):
         pass
-    with open_new_log(path, force=True) as file:
+    with LogFile(path, force=True) as file:
         begun(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
 
 def test_a_file_into_which_nothing_was_written_is_not_there(tmp_path: Path) -> None:
-    with open_new_log(tmp_path / "run.mcap") as file:
+    with LogFile(tmp_path / "run.mcap") as file:
         file.write(b"not flushed")
     assert list(tmp_path.iterdir()) == []
 
@@ -107,10 +105,10 @@ def test_what_exists_is_replaced_only_when_asked_and_only_when_the_new_one_is_wh
     path.write_bytes(b"precious")
     with (
         pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"),
-        open_new_log(path),
+        LogFile(path),
     ):
         pass
-    with open_new_log(path, force=True) as file:
+    with LogFile(path, force=True) as file:
         container = begun(file)
         assert path.read_bytes() == b"precious"
         container.finish()
@@ -121,7 +119,7 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
 
     def write() -> None:
-        with open_new_log(path) as file:
+        with LogFile(path) as file:
             begun(file).finish()
             path.write_bytes(b"precious")
 
@@ -138,7 +136,7 @@ def test_where_there_are_no_links_a_log_gets_its_name_all_the_same(
         raise OSError(errno.EPERM, "no links here")
 
     monkeypatch.setattr(os, "link", link)
-    with open_new_log(tmp_path / "run.mcap") as file:
+    with LogFile(tmp_path / "run.mcap") as file:
         begun(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
@@ -166,7 +164,7 @@ def test_a_disk_that_takes_little_at_a_time_takes_all(count: int, most: int, tmp
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     wanted = sent(count)
-    with close_log_file(file_on(SmallDisk(1 << 20, most=most), path)) as file:
+    with file_on(SmallDisk(1 << 20, most=most), path) as file:
         container = begun(file)
         for message in wanted:
             container.add_message(*message)
@@ -205,7 +203,7 @@ def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_give
     for capacity in range(4000, 7000, 5):
         disk = SmallDisk(capacity)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, close_log_file(file_on(disk, path)) as file:
+        with pytest.raises(LogRefused) as refusal, file_on(disk, path) as file:
             recorded(file, wanted, flushed)
         text = str(refusal.value)
         assert refusal.value.exit_code == 5
@@ -228,7 +226,7 @@ def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
     """At every byte of a chunk and of the end: cut where the last flush ended."""
     path = tmp_path / "run.mcap"
     wanted = sent(3 * CHUNK)
-    with close_log_file(file_on(SmallDisk(1 << 20), path)) as file:
+    with file_on(SmallDisk(1 << 20), path) as file:
         recorded(file, wanted, [])
     whole = path.stat().st_size
     path.unlink()
@@ -237,7 +235,7 @@ def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
         active_path(path).unlink(missing_ok=True)
         disk = SmallDisk(capacity, error)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, close_log_file(file_on(disk, path, room=False)) as file:
+        with pytest.raises(LogRefused) as refusal, file_on(disk, path, room=False) as file:
             recorded(file, wanted, flushed)
         assert refusal.value.exit_code == 5
         assert not path.exists()
@@ -303,10 +301,10 @@ import os, resource, sys
 from pathlib import Path
 from trilat_net.errors import LogRefused
 from trilat_net.log.mcap_writer import McapWriter
-from trilat_net.log.log_file import open_new_log
+from trilat_net.log.log_file import LogFile
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 try:
-    with open_new_log(Path(sys.argv[1])) as file:
+    with LogFile(Path(sys.argv[1])) as file:
         container = McapWriter(file, "lib")
         channel = container.register_channel("/a", "msgpack", 0)
         try:
@@ -363,7 +361,7 @@ def test_a_disk_that_refuses_what_it_had_taken_ends_the_log(
     times_ns = iter(range(0, 1000 * SYNC_PERIOD_NS, SYNC_PERIOD_NS))
 
     def write() -> None:
-        with close_log_file(LogFile(path, now_ns=times_ns.__next__)) as file:
+        with LogFile(path, now_ns=times_ns.__next__) as file:
             recorded(file, sent(100), [])
 
     with pytest.raises(LogRefused, match="the disk fails; the log ends there, finished, with") as refusal:

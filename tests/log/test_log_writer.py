@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,9 +12,9 @@ from mcap.reader import make_reader
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log import log_file
 from trilat_net.log.log_file import LogFile
-from trilat_net.log.log_layout import ALL_CHANNELS, find_parts, part_path
+from trilat_net.log.log_layout import find_parts, part_path
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, make_log_storage
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, parse_split
 from trilat_net.log.mcap_writer import Sink
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
@@ -184,21 +183,15 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     assert [message for path in find_parts(place.path).values() for message in read(path)[0]] == messages
 
 
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
-        ({"split_mib": 0.5}, "--split-size"),
-        ({"split_mib": float("nan")}, "--split-size"),
-        ({"split_s": 0.0}, "--split-duration"),
-        ({"force": True, "carry_on": True}, "give one of them"),
-    ],
-)
-def test_what_cannot_be_meant_is_refused(options: dict[str, Any], problem: str, tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"split_mib": None, "split_s": None, "force": False, "carry_on": False, **options}
-    with pytest.raises(UsageError, match=problem):
-        make_log_storage(
-            tmp_path / "run.mcap", choice=ALL_CHANNELS, durable=False, views_hz=0.0, **asked
-        ).first()
+@pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
+def test_a_part_that_cannot_be_meant_is_refused(number: float) -> None:
+    with pytest.raises(UsageError, match="--split-size is a number of MiB"):
+        parse_split("--split-size", "MiB", number, 1 << 20)
+
+
+def test_to_continue_and_to_replace_at_once_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="give one of them"):
+        LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).first()
 
 
 def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:

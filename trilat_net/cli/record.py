@@ -84,20 +84,20 @@ def record_command(
 
     from ..files import refuse_existing
     from ..log.log_layout import find_parts, parse_channel_filter
-    from ..log.log_writer import make_log_storage
+    from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
     from ..net.clock import make_system_clock
 
     connection = resolve_connection(listen, connect, router, zenoh_config, [], None)
     path = output if output is not None else Path(f"{check_session_name(session)}.mcap")
-    place = make_log_storage(
+    place = LogStorage(
         path,
-        split_mib=split_size,
-        split_s=split_duration,
-        choice=parse_channel_filter(include or [], exclude or []),
         force=force,
-        carry_on=carry_on,
         durable=durable,
+        split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
+        split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
+        carry_on=carry_on,
+        choice=parse_channel_filter(include or [], exclude or []),
         views_hz=parse_viz_rate(views),
     )
     place.first()  # refuses a taken name before anything waits

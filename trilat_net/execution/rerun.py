@@ -21,7 +21,7 @@ from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
-from ..log.log_file import open_new_log
+from ..log.log_file import LogFile
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..log.mcap_writer import Sink
@@ -220,7 +220,7 @@ class Rerun:
             UsageError: the file exists, or cannot be made.
             LogRefused: the disk refused.
         """
-        with open_new_log(path, force=force) as stream:
+        with LogFile(path, force=force) as stream:
             write_rerun_log(self.before, self.request, self.ticks, stream, VIZ_HZ)
 
     @property

@@ -15,7 +15,7 @@ from .. import process
 from ..core.site_step import Site
 from ..core.ticks import NS_PER_S, Arrival, CoreChange, Mode, PlantState, TickInput, TickRecord
 from ..errors import LawFailed, ScenarioError
-from ..log.log_file import open_new_log
+from ..log.log_file import LogFile
 from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
 from ..log.mcap_writer import Sink
@@ -227,7 +227,7 @@ def record_virtual(
         ScenarioError: virtual time cannot run the scenario; there is no file.
         LawFailed: a user law failed; the file is finished with the ticks before.
     """
-    with open_new_log(path, force=force) as stream:
+    with LogFile(path, force=force) as stream:
         return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz)
 
 

@@ -10,10 +10,11 @@ import errno
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 from ..errors import LogRefused, UsageError
 from ..files import publish_file, refuse_existing, sync_folder
@@ -26,16 +27,6 @@ DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of a disk that takes no more."""
 RESERVE_STEP_BYTES = 1 << 19
 """Step by which a reserve grows."""
-
-
-class ReservedSpace(Protocol):
-    """Space reserved on a disk."""
-
-    def grow(self, size: int) -> None:
-        """Reserves so many bytes at least."""
-
-    def release(self) -> None:
-        """Gives the space back, for good."""
 
 
 class DiskReserve:
@@ -134,8 +125,7 @@ class FileSync:
 
 
 def _datasync(descriptor: int) -> None:
-    """Puts a file's content onto the disk, and its metadata as far as reading it back needs them."""
-    getattr(os, "fdatasync", os.fsync)(descriptor)
+    getattr(os, "fdatasync", os.fsync)(descriptor)  # of the metadata what reading it back needs
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
@@ -151,7 +141,7 @@ _ADVICE = {
 
 
 class LogFile:
-    """A file that is written in order and survives any end of its writer.
+    """A file that is written in order and survives any end of its writer; for use in a `with` statement.
 
     Written data stay in memory until `flush`, so that the file always ends at the end of a flush.
 
@@ -181,7 +171,7 @@ class LogFile:
         force: bool = False,
         durable: bool = False,
         working: Path | None = None,
-        room: ReservedSpace | None = None,
+        room: DiskReserve | None = None,
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
@@ -191,14 +181,13 @@ class LogFile:
         self._force = force
         try:
             refuse_existing(path, force=force, unfinished=self.working)
-            self._raw = (opened or _open_unbuffered)(self.working, "wb" if force else "xb")
+            self._raw = (opened or FileIO)(self.working, "wb" if force else "xb")
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
         sync_folder(path.parent)
         self._room = room or DiskReserve(path.parent)
         self._syncing = FileSync(self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns)
-        self._pending, self._done = bytearray(), 0
-        self._owed = 0
+        self._pending, self._done, self._owed = bytearray(), 0, 0
         self._tail = b""
         self._broken = self._closed = self._published = False
 
@@ -292,6 +281,25 @@ class LogFile:
         self.working.unlink(missing_ok=True)
         self.size = 0
 
+    def end(self, error: BaseException | None = None) -> None:
+        """Closes the file, whatever ended it.
+
+        Raises:
+            LogRefused: the disk refused, now or as `error` says; the text states what is kept, and where.
+        """
+        try:
+            self.close()
+        except OSError as failure:
+            raise self.refused(self.trouble or failure) from None
+        if isinstance(error, LogRefused) and self.trouble is not None:
+            raise self.refused(self.trouble) from None
+
+    def __enter__(self) -> "LogFile":
+        return self
+
+    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: object) -> None:
+        self.end(error)
+
     def refused(self, error: OSError) -> LogRefused:
         """Returns the error of a file that the disk refused, once it is closed."""
         what, advice = _ADVICE.get(error.errno or 0, (error.strerror or str(error), _ELSEWHERE))
@@ -306,10 +314,6 @@ class LogFile:
         )
 
 
-def _open_unbuffered(path: Path, mode: str) -> Any:
-    return path.open(mode, buffering=0)
-
-
 def _describe_content(path: Path) -> str:
     from mcap.reader import make_reader
 
@@ -321,36 +325,3 @@ def _describe_content(path: Path) -> str:
     topic = {number: channel.topic for number, channel in summary.channels.items()}
     records = sum(count for n, count in counts.items() if topic[n].endswith(f"/{topics.STATE}"))
     return f"{records} records and {summary.statistics.message_count - records} other messages"
-
-
-@contextmanager
-def open_new_log(path: Path, *, force: bool = False, durable: bool = False) -> Iterator[LogFile]:
-    """Opens a log for writing; at the end closes it, and gives it its name if it was finished.
-
-    Raises:
-        UsageError: it exists, or cannot be made.
-        LogRefused: the disk refused; the text states what is kept, and where.
-    """
-    with close_log_file(LogFile(path, force=force, durable=durable)) as file:
-        yield file
-
-
-@contextmanager
-def close_log_file(file: LogFile) -> Iterator[LogFile]:
-    """Closes a log's file at the end of a `with` statement, whatever ends it.
-
-    Raises:
-        LogRefused: the disk refused; the text states what is kept, and where.
-    """
-    refused: LogRefused | None = None
-    try:
-        yield file
-    except LogRefused as error:
-        refused = error
-    finally:
-        try:
-            file.close()
-        except OSError as error:
-            raise file.refused(file.trouble or error) from None
-    if refused is not None:
-        raise (refused if file.trouble is None else file.refused(file.trouble)) from None

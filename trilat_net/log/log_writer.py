@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from ..core.ticks import TickRecord
 from ..errors import LogRefused, UsageError
@@ -241,11 +240,9 @@ class LogWriter:
             raise self._refused(error) from None
 
     def _refused(self, error: OSError) -> LogRefused:
-        refused = LogRefused(
-            f"the log cannot be written: {error.strerror}; what was flushed before is intact"
-        )
-        self._ended = self._ended or str(refused)
-        return refused
+        text = f"the log cannot be written: {error.strerror}; what was flushed before is intact"
+        self._ended = self._ended or text
+        return LogRefused(text)
 
 
 _FINISHED = "the log is finished"
@@ -304,36 +301,17 @@ class LogStorage:
         return int(self.splits), ""
 
 
-def make_log_storage(
-    path: Path,
-    *,
-    split_mib: float | None,
-    split_s: float | None,
-    choice: ChannelFilter,
-    force: bool,
-    carry_on: bool,
-    durable: bool,
-    views_hz: float = 0.0,
-) -> LogStorage:
-    """Returns the storage for the options of a command.
+def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
+    """Returns the limit of a part, as an option of a command states it in units of `scale`; None for none.
 
     Raises:
         UsageError: a part cannot be that small or that large.
     """
-    if split_mib is not None and not 1.0 <= split_mib <= 1e6:
-        raise UsageError(f"--split-size is a number of MiB from 1 to 1e6, not {split_mib:g}")
-    if split_s is not None and not 1.0 <= split_s <= 1e6:
-        raise UsageError(f"--split-duration is a number of seconds from 1 to 1e6, not {split_s:g}")
-    return LogStorage(
-        path,
-        force=force,
-        durable=durable,
-        split_bytes=None if split_mib is None else int(split_mib * (1 << 20)),
-        split_ns=None if split_s is None else int(split_s * 1e9),
-        carry_on=carry_on,
-        choice=choice,
-        views_hz=views_hz,
-    )
+    if number is None:
+        return None
+    if not 1.0 <= number <= 1e6:
+        raise UsageError(f"{option} is a number of {unit} from 1 to 1e6, not {number:g}")
+    return int(number * scale)
 
 
 class LogParts:
@@ -358,18 +336,18 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
+        self._opened = opened or (lambda path: LogFile(path, force=storage.force, durable=storage.durable))
         self.so_far: Callable[[], Mapping[str, str]] = dict
         self._storage, self._begin_log = storage, begin
-        self._opened = opened or self._open_file
         self._number, self._previous = storage.first()
-        if storage.force and storage.splits:
-            _remove(storage.path)
+        if storage.force and storage.splits:  # what was left of a log would seem to belong to the new one
+            for number in (0, *find_parts(storage.path)):
+                name = part_path(storage.path, number)
+                name.unlink(missing_ok=True)
+                active_path(name).unlink(missing_ok=True)
         self._since_ns: int | None = None
         self._before_bytes = 0
         self._begin()
-
-    def _open_file(self, path: Path) -> LogFile:
-        return LogFile(path, force=self._storage.force, durable=self._storage.durable)
 
     def _begin(self) -> None:
         """Begins a part."""
@@ -388,7 +366,7 @@ class LogParts:
         """Ends a part and begins the next one."""
         self._writer.finish(self.so_far())
         self._before_bytes += self._writer.written_bytes
-        self._close()
+        self._file.end()
         self._number += 1
         try:
             self._begin()
@@ -447,29 +425,8 @@ class LogParts:
         """Ends the last part; see `LogWriter.finish`."""
         self._writer.finish(accounts)
 
-    def _close(self) -> None:
-        try:
-            self._file.close()
-        except OSError as error:
-            raise self._file.refused(self._file.trouble or error) from None
-
     def __enter__(self) -> "LogParts":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Closes the last part, and says what is kept where the disk refused."""
-        self._close()
-        if isinstance(error, LogRefused) and self._file.trouble is not None:
-            raise self._file.refused(self._file.trouble) from None
-
-
-def _remove(path: Path) -> None:
-    """Removes a log that is replaced, and all its parts: what was left of them would seem to belong to it."""
-    for name in (path, *(part_path(path, number) for number in find_parts(path))):
-        name.unlink(missing_ok=True)
-        active_path(name).unlink(missing_ok=True)
+    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: object) -> None:
+        self._file.end(error)

@@ -6,7 +6,7 @@ format is left to other programs (`pymcap-cli doctor`).
 """
 
 from array import array
-from collections.abc import Mapping
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .mcap_reader import Progress
 from .mcap_records import (
+    DEFINITIONS,
     MAGIC,
     MESSAGE_HEAD,
     OP_MESSAGE,
@@ -103,54 +104,50 @@ class McapCheck:
 
     def __init__(self) -> None:
         self.whole, self.checksums, self.records, self.index = (ProblemList() for _ in range(4))
-        self._bytes = self._chunks = self._messages = self._crcs = 0
+        self._totals: Counter[str] = Counter()  # bytes, chunks, messages, checksums that were compared
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> bool:
         """Checks every byte of a file; returns False if it does not begin as an MCAP file."""
         scanner = RecordScanner(stream)
-        self._bytes += scanner.size
+        self._totals["bytes"] += scanner.size
         if not scanner.begins:
             self.whole.add(file, 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
             return False
         one = _FileCheck(file, scanner, self)
-        reported, last = 0, None
-        for last in scanner.frames():
-            one.take(last)
-            for damage in scanner.damaged[reported:]:
-                self.whole.add(file, damage.offset, str(damage))
-            reported = len(scanner.damaged)
+        end = 0
+        for frame in scanner.frames():
+            one.take(frame)
+            end = frame.end + len(MAGIC)
             if progress is not None:
-                progress(last.end, scanner.size)
-        for damage in scanner.damaged[reported:]:
+                progress(frame.end, scanner.size)
+        for damage in scanner.damaged:
             self.whole.add(file, damage.offset, str(damage))
         if scanner.torn is not None:
             self.whole.add(file, scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
-        elif last is not None and scanner.finished and last.end + len(MAGIC) < scanner.size:
-            end = last.end + len(MAGIC)
+        elif scanner.finished and 0 < end < scanner.size:
             self.whole.add(file, end, f"{scanner.size - end} bytes follow the end mark")
         if scanner.finished and not scanner.damaged:
             one.compare_end()
-        self._chunks += one.chunks
-        self._messages += one.messages
-        self._crcs += one.crcs
+        self._totals += one.counts
         return True
 
     def findings(self) -> list[CheckFinding]:
         """Returns the results, a check each."""
-        built = f"{self._messages} messages in {self._chunks} chunks, built as the format says"
+        totals = self._totals
+        built = f"{totals['messages']} messages in {totals['chunks']} chunks, built as the format says"
         return [
-            self.whole.finding("whole", f"finished, {self._bytes / 1e6:.1f} MB"),
-            self.checksums.finding("checksums", f"{self._crcs} compared, all agree"),
+            self.whole.finding("whole", f"finished, {totals['bytes'] / 1e6:.1f} MB"),
+            self.checksums.finding("checksums", f"{totals['crcs']} compared, all agree"),
             self.records.finding("records", built),
             self.index.finding("index", "is what is there"),
         ]
 
 
 class _FileCheck:
-    """Check of one file; counts what it compares."""
+    """Check of one file; `counts` what it compares."""
 
     def __init__(self, file: str, scanner: RecordScanner, problems: McapCheck) -> None:
-        self.chunks = self.messages = self.crcs = 0
+        self.counts: Counter[str] = Counter()
         self._file, self._scanner, self._problems = file, scanner, problems
         self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
         self._found: dict[tuple[int, int], Any] = {}  # what an index should name: by its opcode and place
@@ -184,7 +181,7 @@ class _FileCheck:
             self._take_message_index(frame, content)
         elif opcode == OP_MESSAGE:
             self._take_message(frame, content, 0, len(content))
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        elif opcode in DEFINITIONS:
             self._define(frame, opcode, content)
         elif opcode in _OTHERS:
             self._take_other(frame, content)
@@ -200,17 +197,14 @@ class _FileCheck:
             case Opcode.ATTACHMENT:
                 if not has_right_crc(content):
                     raise UnreadableRecord("an attachment's CRC differs")
-                self.crcs += content[-4:] != bytes(4)
+                self.counts["crcs"] += content[-4:] != bytes(4)
                 self._found[Opcode.ATTACHMENT_INDEX, frame.offset] = frame.size, record.name
             case Opcode.METADATA_INDEX | Opcode.ATTACHMENT_INDEX:
                 self._indexed[frame.opcode, record.offset] = record.length, record.name
             case Opcode.CHUNK_INDEX:
                 times = record.message_start_time, record.message_end_time
-                self._indexed[frame.opcode, record.chunk_start_offset] = (
-                    record.chunk_length,
-                    *times,
-                    record.message_index_offsets,
-                )
+                entry = record.chunk_length, *times, record.message_index_offsets
+                self._indexed[frame.opcode, record.chunk_start_offset] = entry
             case _:
                 self._ends[frame.opcode] = frame.offset, record
 
@@ -235,15 +229,15 @@ class _FileCheck:
             if not self._unreadable:
                 text = f"messages of channel {channel}, which comes nowhere before"
                 self._add_records_problem(frame, text)
-        self.messages += 1
+        self.counts["messages"] += 1
         return channel, log_ns
 
     def _take_chunk(self, frame: RecordFrame, content: bytes) -> None:
         self._indexes = None
         head = self._scanner.head(frame)
-        self.chunks += 1
+        self.counts["chunks"] += 1
         data = unpack_chunk(content)
-        self.crcs += bool(head.crc)
+        self.counts["crcs"] += bool(head.crc)
         self._entries.clear()
         for opcode, begin, end in iterate_records(data):
             if opcode == OP_MESSAGE:
@@ -251,7 +245,7 @@ class _FileCheck:
                 entries = self._entries.setdefault(channel, array("Q"))
                 entries.append(log_ns)
                 entries.append(begin - RECORD_HEAD_BYTES)
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            elif opcode in DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
                 self._add_records_problem(frame, f"a chunk holds a record of kind {opcode}")
@@ -282,11 +276,11 @@ class _FileCheck:
             self._problems.records.add(self._file, self._scanner.size, "there is no end of the data")
             return
         offset, data_end = self._ends[Opcode.DATA_END]
-        self.crcs += bool(data_end.data_section_crc)
+        self.counts["crcs"] += bool(data_end.data_section_crc)
         if data_end.data_section_crc and self._scanner.crc(0, offset) != data_end.data_section_crc:
             self._problems.checksums.add(self._file, offset, "the CRC of the data differs")
         if footer is not None and footer.summary_crc:
-            self.crcs += 1
+            self.counts["crcs"] += 1
             if not self._scanner.is_summary_intact(footer):
                 offset, _ = self._ends[Opcode.FOOTER]
                 self._problems.checksums.add(self._file, offset, "the CRC of the index differs")
@@ -305,22 +299,19 @@ class _FileCheck:
         if Opcode.STATISTICS not in self._ends:
             return
         offset, statistics = self._ends[Opcode.STATISTICS]
-        counts: Mapping[str, tuple[int, int]] = {
-            "messages": (statistics.message_count, self.messages),
-            "schemas": (statistics.schema_count, self._count(self._defined, Opcode.SCHEMA)),
-            "channels": (statistics.channel_count, self._count(self._defined, Opcode.CHANNEL)),
-            "chunks": (statistics.chunk_count, self.chunks),
-            "attachments": (statistics.attachment_count, self._count(self._found, Opcode.ATTACHMENT_INDEX)),
-            "metadata": (statistics.metadata_count, self._count(self._found, Opcode.METADATA_INDEX)),
+        kinds = Counter(opcode for opcode, _ in (*self._defined, *self._found))
+        counts = {
+            "messages": (statistics.message_count, self.counts["messages"]),
+            "schemas": (statistics.schema_count, kinds[Opcode.SCHEMA]),
+            "channels": (statistics.channel_count, kinds[Opcode.CHANNEL]),
+            "chunks": (statistics.chunk_count, self.counts["chunks"]),
+            "attachments": (statistics.attachment_count, kinds[Opcode.ATTACHMENT_INDEX]),
+            "metadata": (statistics.metadata_count, kinds[Opcode.METADATA_INDEX]),
         }
         for name, (stated, there) in counts.items():
             if stated != there:
                 text = f"the statistics say {stated} {name}, there are {there}"
                 self._problems.index.add(self._file, offset, text)
-
-    @staticmethod
-    def _count(keys: Mapping[tuple[int, int], Any], opcode: int) -> int:
-        return sum(kind == opcode for kind, _ in keys)
 
 
 def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
@@ -329,13 +320,7 @@ def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 
 
-_OTHERS = frozenset(Opcode) - {
-    Opcode.CHUNK,
-    Opcode.MESSAGE,
-    Opcode.MESSAGE_INDEX,
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-}
+_OTHERS = frozenset(Opcode) - {Opcode.CHUNK, OP_MESSAGE, Opcode.MESSAGE_INDEX, *DEFINITIONS}
 _INDEXED_NAMES: dict[int, str] = {
     Opcode.CHUNK_INDEX: "chunk",
     Opcode.ATTACHMENT_INDEX: "attachment",

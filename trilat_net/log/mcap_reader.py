@@ -18,6 +18,7 @@ from ..errors import LogError
 from ..net import topics
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .mcap_records import (
+    DEFINITIONS,
     MESSAGE_HEAD,
     OP_MESSAGE,
     RECORD_HEAD,
@@ -31,9 +32,8 @@ from .mcap_records import (
     unpack_chunk,
 )
 
-_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _READ = frozenset(
-    {Opcode.CHUNK, Opcode.MESSAGE, *_DEFINITIONS, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.HEADER}
+    {Opcode.CHUNK, Opcode.MESSAGE, *DEFINITIONS, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.HEADER}
 )
 """Records that are read; indexes are of no use to a reader of the whole file."""
 
@@ -218,7 +218,7 @@ class McapReader:
                 payload = data[begin + head_bytes : end]
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
-            elif opcode in _DEFINITIONS:
+            elif opcode in DEFINITIONS:
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
         self._take_memory(memory, frame)

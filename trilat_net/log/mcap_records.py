@@ -31,6 +31,7 @@ RECORD_HEAD_BYTES = RECORD_HEAD.size
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """What precedes the payload of a message: channel, sequence, log time, publish time."""
 OP_MESSAGE = int(Opcode.MESSAGE)  # a member of an enumeration compares slowly
+DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
 """Bytes of a finished file's end: its last record and the end mark."""
 MAX_DAMAGED_PARTS = 100
@@ -216,7 +217,8 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the place of every record; parts that make no sense are skipped and listed in `damaged`."""
+        """Yields the place of every record, anew on every call; skips what makes no sense (`damaged`)."""
+        self.damaged, self.torn, self.finished = [], None, False
         offset = sure = len(MAGIC)
         while len(self.damaged) < MAX_DAMAGED_PARTS:
             try:

@@ -40,15 +40,17 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
     """Returns the tick of every record, shape (K,); records of every readable version are accepted."""
     if any(len(payload) > MAX_BYTES for payload in payloads):
         raise _explain(payloads)
-    pairs = _decode_numbers(payloads, "v", "tick").reshape(-1, 2)
+    pairs = decode_ints(payloads, "v", "tick").reshape(-1, 2)
     if not np.isin(pairs[:, 0], READABLE).all():
         raise _explain(payloads)
     return pairs[:, 1].copy()
 
 
-def decode_ints(payloads: Sequence[bytes], field: str) -> Ints:
-    """Returns a whole number of 64 bits of every record, shape (K,)."""
-    return _decode_numbers(payloads, field)
+def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
+    """Returns whole numbers of 64 bits of every record, one record after the other."""
+    found = _decode_fields(payloads, *fields)
+    values = found if len(fields) == 1 else chain.from_iterable(found)
+    return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
 
 def decode_vectors(payloads: Sequence[bytes], *fields: str) -> dict[str, Array]:
@@ -75,14 +77,7 @@ def decode_strings(payloads: Sequence[bytes], field: str) -> Strings:
 def decode_per_peer(
     payloads: Sequence[bytes], field: str, peers: Sequence[str], absent: int
 ) -> dict[str, Ints]:
-    """Returns a whole number of every record for every peer, shape (K,) each.
-
-    Args:
-        payloads: the records.
-        field: a field that holds a number per peer.
-        peers: names of the peers.
-        absent: number of a peer that a record does not name.
-    """
+    """Returns a field with a whole number per peer, shape (K,) each; `absent` where a record names none."""
     places = [f"peer{n}" for n in range(len(peers))]
     entry = msgspec.defstruct(
         "Peers",
@@ -107,15 +102,7 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
             for entry in arrivals:
                 yield from entry
 
-    rows = _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
-    return counts, rows
-
-
-def _decode_numbers(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Returns whole numbers of every record, one record after the other."""
-    found = _decode_fields(payloads, *fields)
-    values = found if len(fields) == 1 else chain.from_iterable(found)
-    return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
+    return counts, _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
 
 
 def _decode_fields(payloads: Sequence[bytes], *fields: str) -> Iterator[Any]:

@@ -6,10 +6,11 @@ modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebui
 a number, the one covered by a valid checksum wins, else the first.
 """
 
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,12 +19,13 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
-from .accounting import SessionAccounts, open_session_accounts
+from .accounting import open_session_accounts
 from .log_file import LogFile
 from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, collect_provenance, describe_unfinished
 from .mcap_reader import Progress
 from .mcap_records import (
     COMPRESSION_NAME_OFFSET,
+    DEFINITIONS,
     MAX_UNPACKED_BYTES,
     MAX_UNPACKED_RATIO,
     MAX_WINDOW_BYTES,
@@ -50,7 +52,6 @@ MAX_SALVAGE_BYTES = 64 << 20
 _PIECE_BYTES = 1 << 16
 _MAX_NUMBERS = 65_535
 """Channels, and schemas, that a file can have."""
-_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _MADE_AGAIN = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
@@ -145,15 +146,15 @@ def recover_log(
 
 
 def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None) -> Recovery:
-    survey = _Survey(RecordScanner(stream))
+    scanner = RecordScanner(stream)
+    survey = _Survey(scanner)
     if survey.why_empty:
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
     file = LogFile(result.output, force=force, working=working)
-    stream.seek(0)
     try:
-        _FileCopy(RecordScanner(stream), file, survey, result).run(progress)
+        _FileCopy(scanner, file, survey, result).run(progress)
         file.close()
     except BaseException:
         file.discard()
@@ -167,8 +168,7 @@ class _Survey:
     """Contents of a file besides messages, wherever they are.
 
     Attributes:
-        profile: the MCAP profile.
-        library: what made it.
+        profile, library: the MCAP profile, and what made the file.
         definitions: schemas and channels outside of chunks, opcode and content.
         metadata: the last of each name.
         attachments: the first of each name.
@@ -182,26 +182,22 @@ class _Survey:
         self.attachments: dict[str, bytes] = {}
         self.count: int | None = None
         footer = scanner.footer()
-        covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
-        summary_offset = (footer.summary_start or None) if footer is not None and covered else None
-        in_data: list[tuple[int, bytes]] = []
-        in_summary: list[tuple[int, bytes]] = []
+        is_covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
+        summary_offset = (footer.summary_start if footer is not None and is_covered else 0) or scanner.size
+        found: dict[tuple[bool, int], list[tuple[int, bytes]]] = defaultdict(list)  # in the summary or not
         content = False
         for frame in scanner.frames():
             content |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
-            if frame.opcode in _DEFINITIONS:
-                is_covered = summary_offset is not None and frame.offset >= summary_offset
-                entries = in_summary if is_covered else in_data
-                entries.append((frame.opcode, scanner.content(frame)))
+            if frame.opcode in DEFINITIONS:
+                entry = frame.opcode, scanner.content(frame)
+                found[frame.offset >= summary_offset, frame.opcode].append(entry)
             elif frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.STATISTICS):
                 with suppress(UnreadableRecord):
                     self._take(frame.opcode, parse_record(frame.opcode, scanner.content(frame)))
-        if summary_offset is None:
+        if summary_offset == scanner.size:
             self.count = None
         self.definitions = [
-            entry
-            for kind in _DEFINITIONS
-            for entry in ([e for e in in_summary if e[0] == kind] or [e for e in in_data if e[0] == kind])
+            entry for kind in DEFINITIONS for entry in found[True, kind] or found[False, kind]
         ]
         content |= scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == bytes([Opcode.CHUNK])
         self.why_empty = ""
@@ -222,101 +218,33 @@ class _Survey:
                 self.attachments.setdefault(record.name, record.data)
 
 
-class MessageCopier:
-    """Copier of messages into a file, with their channels and schemas.
-
-    Attributes:
-        lost: messages of channels that no record names, by the number of the channel.
-        bare: topics of channels whose schema no record names.
-        contradicted: numbers of channels and schemas that have two definitions; the first one holds.
-    """
-
-    def __init__(self, file: McapWriter, accounts: SessionAccounts | None) -> None:
-        self.lost: Counter[int] = Counter()
-        self.bare: list[str] = []
-        self.contradicted: set[int] = set()
-        self._file, self._accounts = file, accounts
-        self._schemas: dict[int, Any] = {}
-        self._channels: dict[int, Any] = {}
-        self._new_schemas: dict[int, int] = {}
-        self._new_channels: dict[int, tuple[int, str]] = {}
-
-    def define(self, opcode: int, content: bytes) -> None:
-        """Takes a schema or a channel; the first definition of a number holds.
-
-        Raises:
-            UnreadableRecord: it is none.
-        """
-        entry = parse_record(opcode, content)
-        known = self._schemas if opcode == Opcode.SCHEMA else self._channels
-        if known.setdefault(entry.id, entry) != entry:
-            self.contradicted.add(entry.id)
-
-    def open_all(self) -> None:
-        """Gives the file every channel that is known by now, with or without messages."""
-        for number in sorted(self._channels):
-            self._open_channel(number)
-
-    def take(self, opcode: int, content: bytes) -> None:
-        """Takes a record of a chunk, or a message outside of chunks.
-
-        Raises:
-            UnreadableRecord: it makes no sense.
-        """
-        if opcode in _DEFINITIONS:
-            self.define(opcode, content)
-        elif opcode == OP_MESSAGE:
-            if len(content) < MESSAGE_HEAD.size:
-                raise UnreadableRecord("a message is too short")
-            number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
-            new = self._new_channels.get(number) or self._open_channel(number)
-            if new is None:
-                self.lost[number] += 1
-                return
-            payload = content[MESSAGE_HEAD.size :]
-            self._file.add_message(new[0], log_ns, payload, publish_ns, sequence)
-            if self._accounts is not None:
-                self._accounts.take(new[1], sequence, payload)
-
-    def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Returns the number of a channel in the new file, and its topic; None if no record names it."""
-        known = self._channels.get(number)
-        if known is None or len(self._new_channels) >= _MAX_NUMBERS:
-            return None
-        schema = self._schemas.get(known.schema_id)
-        if schema is not None and schema.id not in self._new_schemas:
-            new = self._file.register_schema(schema.name, schema.encoding, schema.data)
-            self._new_schemas[schema.id] = new
-        if schema is None and known.schema_id:
-            self.bare.append(known.topic)
-        new_schema = self._new_schemas.get(known.schema_id, 0)
-        channel = self._file.register_channel(known.topic, known.message_encoding, new_schema, known.metadata)
-        self._new_channels[number] = channel, known.topic
-        if self._accounts is not None:
-            self._accounts.open(known.topic)
-        return channel, known.topic
-
-
 class _FileCopy:
-    """Copy of one file into another."""
+    """Copy of one file into another; of a number's definitions the first one holds."""
 
     def __init__(self, scanner: RecordScanner, file: LogFile, survey: _Survey, result: Recovery) -> None:
         self._scanner, self._survey, self._result = scanner, survey, result
         by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
         self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
-        self._copier = MessageCopier(self._out, self._accounts)
         self._data_end = scanner.size + 1
+        self._defined: dict[tuple[int, int], Any] = {}  # schemas and channels, by opcode and number
+        self._contradicted: set[int] = set()  # numbers that have two definitions
+        self._new_schemas: dict[int, int] = {}
+        self._new_channels: dict[int, tuple[int, str]] = {}  # number in the new file, and topic
+        self._bare: list[str] = []  # topics of channels whose schema no record names
+        self._unnamed: Counter[int] = Counter()  # messages of channels that no record names
         for opcode, content in survey.definitions:
             try:
-                self._copier.define(opcode, content)
+                self._define(opcode, content)
             except UnreadableRecord as error:
                 result.lose(f"a definition: {error}", len(content))
+        for kind, number in sorted(self._defined):
+            if kind == Opcode.CHANNEL:  # with or without messages
+                self._open_channel(number)
 
     def run(self, progress: Progress | None) -> None:
         """Copies all that can be read, and writes the end of the file."""
         scanner = self._scanner
-        self._copier.open_all()
         reported = 0
         for frame in scanner.frames():
             reported = self._report_damaged(reported)
@@ -329,6 +257,8 @@ class _FileCopy:
         self._report_damaged(reported)
         if scanner.torn is not None:
             self._take_torn(scanner.torn)
+        self._out.flush()
+        self._report_unnamed()
         self._finish()
 
     def _report_damaged(self, reported: int) -> int:
@@ -340,7 +270,7 @@ class _FileCopy:
     def _take(self, frame: RecordFrame) -> None:
         """Copies one record of the file."""
         opcode = frame.opcode
-        if opcode == Opcode.HEADER or opcode in _DEFINITIONS:
+        if opcode == Opcode.HEADER or opcode in DEFINITIONS:
             return
         content = self._scanner.content(frame)
         if opcode in _MADE_AGAIN:
@@ -348,9 +278,9 @@ class _FileCopy:
         elif opcode == Opcode.CHUNK:
             data = unpack_chunk(content)
             for inner, begin, end in iterate_records(data):
-                self._copier.take(inner, data[begin:end])
+                self._take_inner(inner, data[begin:end])
         elif opcode == OP_MESSAGE:
-            self._copier.take(opcode, content)
+            self._take_inner(opcode, content)
         elif opcode == Opcode.METADATA:
             entry = parse_record(opcode, content)
             if entry.name != RECOVERED_METADATA and (entry.name != ACCOUNTS or self._accounts is None):
@@ -374,6 +304,46 @@ class _FileCopy:
         elif frame.offset < self._data_end:
             raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
+    def _take_inner(self, opcode: int, content: bytes) -> None:
+        """Takes a record of a chunk, or a message outside of chunks."""
+        if opcode in DEFINITIONS:
+            self._define(opcode, content)
+        elif opcode == OP_MESSAGE:
+            if len(content) < MESSAGE_HEAD.size:
+                raise UnreadableRecord("a message is too short")
+            number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
+            new = self._new_channels.get(number) or self._open_channel(number)
+            if new is None:
+                self._unnamed[number] += 1
+                return
+            payload = content[MESSAGE_HEAD.size :]
+            self._out.add_message(new[0], log_ns, payload, publish_ns, sequence)
+            if self._accounts is not None:
+                self._accounts.take(new[1], sequence, payload)
+
+    def _define(self, opcode: int, content: bytes) -> None:
+        entry = parse_record(opcode, content)
+        if self._defined.setdefault((opcode, entry.id), entry) != entry:
+            self._contradicted.add(entry.id)
+
+    def _open_channel(self, number: int) -> tuple[int, str] | None:
+        """Returns the number of a channel in the new file, and its topic; None if no record names it."""
+        known = self._defined.get((Opcode.CHANNEL, number))
+        if known is None or len(self._new_channels) >= _MAX_NUMBERS:
+            return None
+        schema = self._defined.get((Opcode.SCHEMA, known.schema_id))
+        if schema is not None and schema.id not in self._new_schemas:
+            new = self._out.register_schema(schema.name, schema.encoding, schema.data)
+            self._new_schemas[schema.id] = new
+        if schema is None and known.schema_id:
+            self._bare.append(known.topic)
+        new_schema = self._new_schemas.get(known.schema_id, 0)
+        channel = self._out.register_channel(known.topic, known.message_encoding, new_schema, known.metadata)
+        self._new_channels[number] = channel, known.topic
+        if self._accounts is not None:
+            self._accounts.open(known.topic)
+        return channel, known.topic
+
     def _take_torn(self, torn: Damage) -> None:
         """Saves what can be saved of the end that was cut off."""
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
@@ -383,11 +353,10 @@ class _FileCopy:
             self._result.lose(str(torn), torn.length)
             return
         before = self._out.messages
+        content = self._scanner.read(torn.offset + RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
         with suppress(UnreadableRecord):  # what follows makes no sense, and is lost with the rest
-            for entry in salvage_records(
-                self._scanner.read(torn.offset + RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
-            ):
-                self._copier.take(*entry)
+            for entry in _salvage_records(content):
+                self._take_inner(*entry)
         self._result.salvaged = self._out.messages - before
         self._result.lose(
             f"the end of a chunk that was cut off at byte {torn.offset}; of its {torn.length} bytes "
@@ -395,22 +364,23 @@ class _FileCopy:
             torn.length,
         )
 
+    def _report_unnamed(self) -> None:
+        """Lists as lost what nothing in the file explains, and messages that it says it has."""
+        result, stated = self._result, self._survey.count
+        for number, count in self._unnamed.items():
+            result.lose(f"{count} messages of channel {number}, which no record names")
+        for topic in self._bare:
+            result.lose(f"the schema of {topic}")
+        for number in self._contradicted:
+            result.lose(f"what channel or schema {number} is: the file says it in two ways")
+        if stated is not None and self._out.messages < stated and result.lossless:
+            result.lose(f"{stated - self._out.messages} of the {stated} messages that it says it has")
+
     def _finish(self) -> None:
         """Writes the accounts, the losses, and the index."""
-        result, copier, accounts = self._result, self._copier, self._accounts
-        self._out.flush()
-        for number, count in copier.lost.items():
-            result.lose(f"{count} messages of channel {number}, which no record names")
-        for topic in copier.bare:
-            result.lose(f"the schema of {topic}")
-        for number in copier.contradicted:
-            result.lose(f"what channel or schema {number} is: the file says it in two ways")
-        expected = self._survey.count
-        if expected is not None and self._out.messages < expected and result.lossless:
-            result.lose(f"{expected - self._out.messages} of the {expected} messages that it says it has")
+        result, accounts = self._result, self._accounts
         result.finished = self._scanner.finished
-        result.messages = self._out.messages
-        result.duration_s = self._out.duration_s
+        result.messages, result.duration_s = self._out.messages, self._out.duration_s
         if accounts is not None:
             result.missing = list(accounts.missing())
             result.sites = accounts.records()
@@ -421,7 +391,7 @@ class _FileCopy:
         self._out.finish()
 
 
-def salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
+def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
     """Yields the complete records of a chunk's content that was cut off: opcode and content."""
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     waiting = bytearray()
@@ -444,20 +414,14 @@ def _unpack_pieces(content: bytes) -> Iterator[bytes]:
     """Yields what is left of a chunk's records, unpacked, up to where the data make no sense."""
     name_offset = COMPRESSION_NAME_OFFSET + 4
     letters = int.from_bytes(content[COMPRESSION_NAME_OFFSET:name_offset], "little")
-    compression = content[name_offset : name_offset + letters]
-    data = content[name_offset + letters + 8 :]
+    data = BytesIO(content[name_offset + letters + 8 :])
+    openers: dict[bytes, Callable[[BytesIO], Any]] = {
+        b"": lambda data: data,
+        b"zstd": zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).stream_reader,
+        b"lz4": lz4.frame.open,
+    }
+    opener = openers.get(content[name_offset : name_offset + letters])
     with suppress(zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError):
-        if not compression:
-            yield data
-        elif compression == b"zstd":
-            with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).stream_reader(data) as reader:
-                while piece := reader.read(_PIECE_BYTES):
-                    yield piece
-        elif compression == b"lz4":
-            unpacker = lz4.frame.LZ4FrameDecompressor()
-            piece = unpacker.decompress(data, max_length=_PIECE_BYTES)
-            while piece:
-                yield piece
-                if unpacker.eof or unpacker.needs_input:
-                    return
-                piece = unpacker.decompress(b"", max_length=_PIECE_BYTES)
+        stream = opener(data) if opener is not None else BytesIO()
+        while piece := stream.read1(_PIECE_BYTES):
+            yield piece

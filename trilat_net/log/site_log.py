@@ -7,9 +7,8 @@ stays bounded for a log of any length: long sequences of records are decoded in 
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar, overload
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 
@@ -20,9 +19,10 @@ from ..errors import LogError, WireError
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from . import record_columns
-from .record_columns import Ints, Strings
+from .record_columns import Ints
 
 M = TypeVar("M")
+T = TypeVar("T")
 
 MAX_DECODED_RECORDS = 1 << 16
 """Records of a site that are held decoded, at most: a minute at 1 kHz, some 150 MB."""
@@ -136,6 +136,18 @@ class TimedMessages(NamedTuple, Generic[M]):
     publish_ns: Ints
 
 
+def _decode_vector(payloads: Sequence[bytes], field: str) -> Array:
+    return record_columns.decode_vectors(payloads, field)[field]
+
+
+class _RecordField(cached_property[T]):
+    """A field of every record as an array, by the attribute's name; it is decoded on first access."""
+
+    def __init__(self, decode_column: Callable[[Sequence[bytes], str], T], meaning: str) -> None:
+        super().__init__(lambda site: site._read(decode_column, self.attrname))
+        self.__doc__ = meaning
+
+
 class SiteLog:
     """The records of one site, in tick order.
 
@@ -167,8 +179,7 @@ class SiteLog:
         self.name, self.peers, self.rate_hz = name, peers, rate_hz
         self._source = source
         self.payloads = payloads
-        with self._reading():
-            self.tick: Ints = record_columns.decode_ticks(payloads)
+        self.tick = self._read(record_columns.decode_ticks)
         zeros = np.zeros(len(payloads), dtype=np.int64)
         self._times = times or MessageTimes(zeros, zeros)
         if (self.tick[1:] < self.tick[:-1]).any():
@@ -187,32 +198,28 @@ class SiteLog:
         records = f"{len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
         return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
 
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
+    def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
+        """Returns what a decoder makes of the records."""
         try:
-            yield
+            return decode_column(self.payloads, *arguments)
         except WireError as error:
             raise LogError(f"{self._source}: a record of {self.name} cannot be read: {error}") from None
 
-    def _vectors(self, field: str) -> Array:
-        with self._reading():
-            return record_columns.decode_vectors(self.payloads, field)[field]
-
     def prepare(self, *fields: str) -> None:
         """Decodes several vectors by their names in one pass, three times as fast as one by one."""
-        absent = [field for field in fields if field not in self.__dict__]
-        if absent:
-            with self._reading():
-                self.__dict__.update(record_columns.decode_vectors(self.payloads, *absent))
+        if absent := [field for field in fields if field not in self.__dict__]:
+            self.__dict__.update(self._read(record_columns.decode_vectors, *absent))
 
     def numbers(self, field: str) -> Ints:
         """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
-        with self._reading():
-            return record_columns.decode_ints(self.payloads, field)
+        return self._read(record_columns.decode_ints, field)
 
     def record(self, n: int) -> State:
         """Returns the record at a place, decoded and checked alone; -1 is the last one."""
         return self._decode([self.payloads[n]])[0]
+
+    def _decode(self, payloads: Sequence[bytes]) -> list[State]:
+        return self._read(lambda _: [decode(payload, State, READABLE) for payload in payloads])
 
     @cached_property
     def states(self) -> Sequence[State]:
@@ -226,19 +233,34 @@ class SiteLog:
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
-    def _decode(self, payloads: Sequence[bytes]) -> list[State]:
-        with self._reading():
-            return [decode(payload, State, READABLE) for payload in payloads]
-
     @property
     def missing(self) -> int:
         """How many ticks before the last record have none."""
         return int(self.tick[-1] - np.count_nonzero(np.diff(self.tick))) if len(self) else 0
 
-    @cached_property
-    def t_ns(self) -> Ints:
-        """Nominal time since the epoch, shape (K,), ns."""
-        return self.numbers("t_ns")
+    mode = _RecordField(
+        record_columns.decode_strings, 'Mode, shape (K,): "run", "hold", "brake", "return" or "diverged".'
+    )
+    q = _RecordField(_decode_vector, "Joint angles, shape (K, 2), rad.")
+    qd = _RecordField(_decode_vector, "Joint velocities, shape (K, 2), rad/s.")
+    q_des = _RecordField(_decode_vector, "Reference of Eq. (6), shape (K, 2), rad.")
+    qd_des = _RecordField(_decode_vector, "Its derivative, shape (K, 2), rad/s.")
+    tau = _RecordField(_decode_vector, "Control torque of Eq. (13), shape (K, 2), N m.")
+    tau_x = _RecordField(
+        _decode_vector,
+        "Exogenous torque in the sign of Eq. (8), shape (K, 2), N m; ON the arm acts its negative.",
+    )
+    theta_hat = _RecordField(
+        _decode_vector, "Estimate of the parameters, Eq. (15), shape (K, 5), kg m^2 and kg m as in Eq. (24)."
+    )
+    t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
+    late_us = _RecordField(
+        record_columns.decode_ints, "Wake-up minus deadline, shape (K,), us; 0 in virtual time."
+    )
+    sent_ns = _RecordField(
+        record_columns.decode_ints,
+        "When each record was sent, by the site's own clock since the epoch on it, shape (K,), ns.",
+    )
 
     @cached_property
     def t_s(self) -> Array:
@@ -255,56 +277,10 @@ class SiteLog:
         """When each record was sent, by its own stamp, shape (K,), Unix ns."""
         return self._times.publish_ns
 
-    @cached_property
-    def mode(self) -> Strings:
-        """Mode of the site, shape (K,): "run", "hold", "brake", "return" or "diverged"."""
-        with self._reading():
-            return record_columns.decode_strings(self.payloads, "mode")
-
-    @cached_property
-    def q(self) -> Array:
-        """Joint angles, shape (K, 2), rad."""
-        return self._vectors("q")
-
-    @cached_property
-    def qd(self) -> Array:
-        """Joint velocities, shape (K, 2), rad/s."""
-        return self._vectors("qd")
-
-    @cached_property
-    def q_des(self) -> Array:
-        """Reference of Eq. (6), shape (K, 2), rad."""
-        return self._vectors("q_des")
-
-    @cached_property
-    def qd_des(self) -> Array:
-        """Its derivative, shape (K, 2), rad/s."""
-        return self._vectors("qd_des")
-
     @property
     def e(self) -> Array:
         """Position error q - q_des, Eq. (9), shape (K, 2), rad."""
         return self.q - self.q_des
-
-    @cached_property
-    def tau(self) -> Array:
-        """Control torque of Eq. (13), shape (K, 2), N m."""
-        return self._vectors("tau")
-
-    @cached_property
-    def tau_x(self) -> Array:
-        """Exogenous torque in the sign of Eq. (8), shape (K, 2), N m; ON the arm acts its negative."""
-        return self._vectors("tau_x")
-
-    @cached_property
-    def theta_hat(self) -> Array:
-        """Estimate of the parameters, Eq. (15), shape (K, 5), kg m^2 and kg m as in Eq. (24)."""
-        return self._vectors("theta_hat")
-
-    @cached_property
-    def late_us(self) -> Ints:
-        """Wake-up minus deadline, shape (K,), us; 0 in virtual time."""
-        return self.numbers("late_us")
 
     @cached_property
     def busy_us(self) -> Ints:
@@ -312,26 +288,18 @@ class SiteLog:
         return self.numbers("busy_us")[1:]
 
     @cached_property
-    def sent_ns(self) -> Ints:
-        """When each record was sent, by the site's own clock since the epoch on it, shape (K,), ns."""
-        return self.numbers("sent_ns")
-
-    @cached_property
     def used(self) -> dict[str, Ints]:
         """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
-        with self._reading():
-            return record_columns.decode_per_peer(self.payloads, "used", self.peers, absent=-1)
+        return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
         """How many samples each record took in, shape (K,), and all of them as in `rx`, shape (N, 3)."""
-        with self._reading():
-            return record_columns.decode_arrivals(self.payloads)
+        return self._read(record_columns.decode_arrivals)
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
-        with self._reading():
-            lists = record_columns.decode_strings(self.payloads, "cmd")
+        lists = self._read(record_columns.decode_strings, "cmd").tolist()
         return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
 
     def changes(self) -> dict[int, list[str]]:
@@ -345,5 +313,4 @@ class SiteLog:
         """
         used = self.used[peer]
         age_ns = self.t_ns - used * NS_PER_S // rate_hz
-        age_s: Array = np.where(used >= 0, age_ns / NS_PER_S, np.nan)
-        return age_s
+        return np.where(used >= 0, age_ns / NS_PER_S, np.nan)
