@@ -7,8 +7,8 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 import numpy as np
 
 from .jit import leaf
-from .kernel import act_stages, follow_stages, link_arrays, torque_stage
-from .link import LinkArrays, accept_sample
+from .kernel import act_stages, reference_stages, torque_stage
+from .link import LinkArrays, accept_sample, recall_sample
 from .site_arrays import RECORD_Q_DES, RECORD_TAU_X, ROW_FLOATS, SiteArrays
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .two_link_arm import JOINTS
@@ -64,22 +64,6 @@ def _update_peaks(row: Array, t_ns: int, apart_rad: float, progress: Row, peaks:
 
 
 @leaf
-def _select_site(arrays: SiteArrays, i: int) -> SiteArrays:
-    """Returns the arrays of one site of several that are stacked."""
-    return SiteArrays(
-        arrays.site[i],
-        arrays.links[i],
-        arrays.models[i],
-        arrays.samples[i],
-        arrays.calendars[i],
-        arrays.points,
-        arrays.ramps[i],
-        arrays.actors[i],
-        arrays.table,
-    )
-
-
-@leaf
 def run_until(
     last_ns: int,
     apart_rad: float,
@@ -113,19 +97,26 @@ def run_until(
             if own.t_ns != t_ns:
                 continue
             k, rate_hz = own.tick, own.rate_hz
-            site = _select_site(arrays, i)
+            site, links = arrays.site[i], arrays.links[i]
             for p in range(count - 1):
                 j = p if p < i else p + 1
                 peer: Row = progress[j]
-                link = link_arrays(site, p)
+                link = LinkArrays(
+                    links[p : p + 1],
+                    arrays.models[i, p],
+                    arrays.samples[i, p],
+                    arrays.calendars[i, p],
+                    arrays.points,
+                )
                 taken[i, p] = _receive(k, t_ns, rate_hz, peer.tick, taken[i, p], sent[j], link)
-            follow_stages(k, t_ns, site)
-            torque_stage(site.site)
+                recall_sample(k, rate_hz, link)
+            reference_stages(k, t_ns, site, links, arrays.ramps[i])
+            torque_stage(site)
             record: Row = sent[i, k & (sent.shape[1] - 1)]
             record.t_ns = t_ns
-            act_stages(k, t_ns, site, record.row)
+            act_stages(k, t_ns, site, arrays.actors[i], arrays.table, record.row)
             _update_peaks(record.row, t_ns, apart_rad, own, peaks[i])
-            if site.site[0].mode == _DIVERGED:
+            if site[0].mode == _DIVERGED:
                 own.diverged_ns = t_ns
                 last_ns = t_ns
             own.tick = k + 1

@@ -206,12 +206,10 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 
 @leaf
-def follow_stages(k: int, t_ns: int, arrays: SiteArrays) -> None:
-    """Stages 2 to 5 of a tick, with its arrivals in their links."""
-    s: Row = arrays.site[0]
-    for j in range(arrays.links.shape[0]):  # 2 recall
-        recall_sample(k, s.rate_hz, link_arrays(arrays, j))
-    update_reference(t_ns, s, arrays.links, arrays.ramps)  # 3 reference
+def reference_stages(k: int, t_ns: int, site: RowArray, links: RowArray, ramps: Array) -> None:
+    """Stages 3 to 5 of a tick, with the samples that it releases in use."""
+    s: Row = site[0]
+    update_reference(t_ns, s, links, ramps)  # 3 reference
     _update_errors(s)  # 4 errors
     _update_estimate(k, s)  # 5 estimate
 
@@ -220,19 +218,24 @@ def follow_stages(k: int, t_ns: int, arrays: SiteArrays) -> None:
 def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
     """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate."""
     accept_stage(k, count, arrays, buffers)
-    follow_stages(k, t_ns, arrays)
+    rate_hz = arrays.site[0].rate_hz
+    for j in range(arrays.links.shape[0]):  # 2 recall
+        recall_sample(k, rate_hz, link_arrays(arrays, j))
+    reference_stages(k, t_ns, arrays.site, arrays.links, arrays.ramps)
 
 
 @leaf
-def act_stages(k: int, t_ns: int, arrays: SiteArrays, record: Array) -> None:
+def act_stages(
+    k: int, t_ns: int, site: RowArray, actors: TorqueSourceRows, table: TorqueTable, record: Array
+) -> None:
     """Stages 7 and 8 of a tick, with the torque in place: the record, and the step to the next tick."""
-    s: Row = arrays.site[0]
-    _update_external_torque(t_ns, s, arrays.actors, arrays.table)
+    s: Row = site[0]
+    _update_external_torque(t_ns, s, actors, table)
     if not (abs(s.qd[0]) <= s.qd_limit and abs(s.qd[1]) <= s.qd_limit):
         s.mode = _DIVERGED
     _write_record(s, record)  # 7 emit
     if s.mode != _DIVERGED:  # 8 advance
-        _advance(k, t_ns, s, arrays.actors, arrays.table)
+        _advance(k, t_ns, s, actors, table)
 
 
 @leaf
@@ -261,7 +264,7 @@ def site_tick(
     arrays = SiteArrays(site, links, models, samples, calendars, points, ramps, actors, table)
     sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, record))
     torque_stage(site)  # 6 torque
-    act_stages(k, t_ns, arrays, record)
+    act_stages(k, t_ns, site, actors, table, record)
 
 
 @leaf

@@ -103,7 +103,8 @@ class Site:
         else:
             sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
             memory = self._call_user_law(self._user_law, tick.k)
-            act_stages(tick.k, t_ns, self._arrays, self._buffers.record)
+            a = self._arrays
+            act_stages(tick.k, t_ns, a.site, a.actors, a.table, self._buffers.record)
         row = self._buffers.record.tolist()
         n = JOINTS
         mode = self._site["mode"].item()
