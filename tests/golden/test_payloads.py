@@ -23,7 +23,14 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("scenario", BEFORE["sim"])
+PUSHED = ("4g", "contact", "paper", "two_sites")
+"""What a push looks at: random delays, force reflection at a wall, the paper's hands, two sites."""
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in BEFORE["sim"]],
+)
 def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, tmp_path: Path) -> None:
     path = tmp_path / "sim.mcap"
     subprocess.run([*COMMAND, "sim", scenario, "-o", str(path)], check=True, capture_output=True)

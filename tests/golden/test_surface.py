@@ -22,7 +22,14 @@ def test_every_command_and_option_is_still_there() -> None:
     assert not {c: gone for c, names in BEFORE["options"].items() if (gone := set(names) - set(now[c]))}
 
 
-@pytest.mark.parametrize("case", BEFORE["json"], ids=lambda case: " ".join(case["asked"][:2]))
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.long if case["asked"][:2] == ["report", "live-4g.mcap"] else ())
+        for case in BEFORE["json"]
+    ],
+    ids=lambda case: " ".join(case["asked"][:2]),
+)
 def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path) -> None:
     asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
     made = subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True, text=True)

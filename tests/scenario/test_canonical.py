@@ -79,7 +79,7 @@ overrides = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(changed=overrides)
 def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) -> None:
     scenario = parse_scenario(TEXT, overrides=changed)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.theory.figures_of_runs import Overrides, measured, printed, value
-from tests.virtual_runs import run, trajectories
+from tests.virtual_runs import sampled
+from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
@@ -15,20 +16,29 @@ EDGE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("delay_ms", "duration_s", "settled_s"), [(0.0, 30.0, 22.2), (200.0, 20.0, 11.9), (400.0, 10.0, 5.5)]
-)
-def test_some_delay_helps_free_motion(delay_ms: float, duration_s: float, settled_s: float) -> None:
-    made = measured("free", {"link.delay_ms": delay_ms, "duration_s": duration_s})
-    assert made.synchronised_at_s == printed(settled_s, 0.1)
+@pytest.mark.parametrize(("delay_ms", "settled_s"), [(0.0, 22.2), (200.0, 11.9), (400.0, 5.5)])
+def test_some_delay_helps_free_motion(delay_ms: float, settled_s: float) -> None:
+    made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
+    made.advance(30.0)
+    assert made.settled_s == printed(settled_s, 0.1)
+
+
+@pytest.mark.parametrize(("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)])
+def test_errors_and_speeds_decay_as_the_theorem_says(name: str, error: float, speed: float) -> None:
+    last = sampled(load_scenario(name), (20.0,))[:, -1]
+    assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
+    assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
 
 
 def test_the_hands_of_the_paper_hardly_move_joint_1_and_leave_nothing_behind() -> None:
-    pushed = run("paper", {"duration_s": 20.0}).stack("q")
-    alone = trajectories(load_scenario("paper", {"duration_s": 20.0}).without_hands()).stack("q")
+    paper = load_scenario("paper")
+    pushed, alone = (
+        sampled(made, np.arange(0.01, 20.01, 0.01))[..., :2] for made in (paper, paper.without_hands())
+    )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
     assert np.abs(pushed - alone)[..., 0].max() <= 0.003
     assert np.abs(pushed - alone)[:, -1].max() <= 2e-4
+    assert np.abs((pushed - alone).sum(-1)).max() == pytest.approx(0.05, abs=0.01)
 
 
 def test_without_a_box_the_slave_returns() -> None:
