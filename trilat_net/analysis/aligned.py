@@ -26,22 +26,20 @@ RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 
 
 class AlignedRecords(NamedTuple):
-    """A site's records on every tick from its first to its last; rows are ticks.
+    """A site's records on every tick from its first to its last; K rows, one per tick.
 
     Attributes:
         site: its name.
         rate_hz: its tick rate, Hz.
         first: the tick of row 0.
-        known: True if there is a record of that tick, shape (K,).
-        follows: True if the site followed its peers then: no hold, no brake, no return, shape (K,).
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-        q_des: reference, shape (K, 2), rad.
-        qd_des: its derivative, shape (K, 2), rad/s.
+        known: True if there is a record of that tick.
+        follows: True if the site followed its peers then: no hold, no brake, no return.
+        q, qd: joint angles, shape (K, 2), rad, and velocities, rad/s.
+        q_des, qd_des: the same of the reference.
         tau: control torque, shape (K, 2), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
         theta_hat: estimate, shape (K, 5).
-        used: per peer the tick of the sample in use, shape (K,); -1 before the first.
+        used: per peer the tick of the sample in use; -1 before the first.
     """
 
     site: str
@@ -66,15 +64,13 @@ class AlignedRecords(NamedTuple):
     @property
     def t_s(self) -> Array:
         """Nominal time of every row, shape (K,), s."""
-        times: Array = np.arange(self.first, self.first + len(self.known)) / self.rate_hz
-        return times
+        return np.arange(self.first, self.first + len(self.known)) / self.rate_hz
 
     @property
     def nominal_s(self) -> Array:
         """The same of whole nanoseconds, as the core compares them with begin and end of a torque, s."""
         tick = np.arange(self.first, self.first + len(self.known), dtype=np.int64)
-        times: Array = (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
-        return times
+        return (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
@@ -84,8 +80,7 @@ class AlignedRecords(NamedTuple):
     @property
     def known_periods(self) -> Bools:
         """True if both ends of a period are recorded, shape (K - 1,)."""
-        both: Bools = self.known[:-1] & self.known[1:]
-        return both
+        return self.known[:-1] & self.known[1:]
 
     def held_torque(self, limit_nm: float, *, digital: bool) -> Array:
         """Returns the torque that the controller holds over every period, shape (K - 1, 2), N m.
@@ -108,15 +103,15 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     """Returns the records of the sites that have any, in scenario order.
 
     The record that says `diverged` is left out: it may hold zeros in place of numbers that are not finite.
-
-    Args:
-        log: the log.
-        common: end where the first site ends, as sums over all sites need it; {} unless every site has two
-            ticks until then.
+    With `common` all end where the first site ends, as sums over all sites need it: then {} unless every site
+    has two ticks until there.
     """
-    rows = {site: _healthy_rows(log[site]) for site in log.sites}
+    rows: dict[str, Ints] = {}
+    for site in log.sites:
+        first = np.unique(log[site].tick, return_index=True)[1]
+        rows[site] = first[log[site].mode[first] != "diverged"]
     if not common:
-        return {site: fill_tick_grid(log[site], kept) for site, kept in rows.items() if len(kept)}
+        return {site: _fill_tick_grid(log[site], kept) for site, kept in rows.items() if len(kept)}
     if min(map(len, rows.values())) < 2:
         return {}
     begin_s = max(log[site].tick[kept[0]] / log[site].rate_hz for site, kept in rows.items())
@@ -124,25 +119,12 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     if end_s <= begin_s:
         return {}
     last = {site: int(np.floor(end_s * log[site].rate_hz + 1e-6)) for site in rows}
-    found = {site: fill_tick_grid(log[site], kept, last[site]) for site, kept in rows.items()}
+    found = {site: _fill_tick_grid(log[site], kept, last[site]) for site, kept in rows.items()}
     return found if min(len(records.known) for records in found.values()) > 1 else {}
 
 
-def _healthy_rows(part: SiteLog) -> Ints:
-    """Returns the first row of every tick at which the site had not diverged."""
-    first: Ints = np.unique(part.tick, return_index=True)[1]
-    healthy: Ints = first[part.mode[first] != "diverged"]
-    return healthy
-
-
-def fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
-    """Returns records on every tick from the first of them on, those that are missing filled in and marked.
-
-    Args:
-        part: the site's records.
-        rows: which of them, one for a tick, in order, at least one.
-        last: the last tick, if before that of the last row.
-    """
+def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
+    """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
     part.prepare(*RECORD_COLUMNS)
     tick = part.tick[rows]
     first = int(tick[0])
@@ -151,26 +133,24 @@ def fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Aligne
     before = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[before] == grid
     follows: Bools = (part.mode[rows] == "run")[before]
-    columns = {name: _interpolate(getattr(part, name)[rows], tick, grid, known) for name in RECORD_COLUMNS}
+    columns = {name: getattr(part, name)[rows] for name in RECORD_COLUMNS}
+    for name, values in columns.items():
+        columns[name] = (
+            values[: len(grid)]
+            if known.all()
+            else np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
+        )
     used = {peer: part.used[peer][rows][before] for peer in part.peers}
     return AlignedRecords(part.name, part.rate_hz, first, known, follows, used=used, **columns)
 
 
-def _interpolate(values: Array, tick: Ints, grid: Ints, known: Bools) -> Array:
-    """Returns values on the grid; what is missing is interpolated."""
-    if known.all():
-        return values[: len(grid)]
-    return np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
-
-
 class PeerMotion(NamedTuple):
-    """Motion of a peer at given times.
+    """Motion of a peer at K times.
 
     Attributes:
-        q: shape (K, 2), rad.
-        qd: shape (K, 2), rad/s.
+        q, qd: shape (K, 2), rad and rad/s.
         squares: integral of qd squared since row 0, per joint, shape (K, 2), rad^2/s.
-        known: True if it follows from records, shape (K,).
+        known: True if it follows from records.
     """
 
     q: Array
@@ -183,7 +163,7 @@ class PeerTrajectory:
     """A site's motion as a function of time: its records, polynomials between them, rest before them (L7)."""
 
     def __init__(self, records: AlignedRecords) -> None:
-        self._records = records
+        self.records = records
         squares = records.qd**2
         steps = 0.5 * records.h_s * (squares[1:] + squares[:-1])
         self._squares: Array = np.vstack([np.zeros(JOINTS), np.cumsum(steps, axis=0)])
@@ -194,7 +174,7 @@ class PeerTrajectory:
         q is the cubic through angles and velocities, qd runs straight from record to record, and the
         integral is the exact one of the trapezoid rule.
         """
-        records, h = self._records, self._records.h_s
+        records, h = self.records, self.records.h_s
         place = t_s * records.rate_hz - records.first
         nearest = np.round(place)
         place = np.where(np.abs(place - nearest) < 1e-5, nearest, place)
@@ -208,7 +188,7 @@ class PeerTrajectory:
         x0 = x[:, 0]
         known = (records.known[low] | (x0 == 1.0)) & (records.known[low + 1] | (x0 == 0.0))
         known &= (place >= 0.0) | (records.first == 0)
-        q = np.where((x == 1.0), qb, q)
+        q = np.where(x == 1.0, qb, q)
         at_rest = place < 0.0
         qd[at_rest], squares[at_rest] = 0.0, 0.0
         return PeerMotion(q, qd, squares, known)
@@ -218,8 +198,7 @@ class DelayedPeer(NamedTuple):
     """A peer as a site sees it after its link.
 
     Attributes:
-        now: the peer at the site's ticks, K rows.
-        seen: the peer at the stamp of the sample in use, K rows.
+        now, seen: the peer at the site's ticks, and at the stamps of the samples in use, K rows each.
         kept: the peer at the end of a period if that stamp moves at rate one, K - 1 rows.
         stamp_s: the stamp of the sample in use, shape (K,), s; NaN before the first.
     """
@@ -241,17 +220,11 @@ _BEFORE_EPOCH_S = -1.0
 """Any time before the epoch: the start pose, at rest (L7)."""
 
 
-def view_delayed_peer(records: AlignedRecords, peer: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns what a site sees of a peer.
-
-    Args:
-        records: the site's.
-        peer: the peer's records.
-        past: the same as a function of time.
-    """
-    used = records.used[peer.site]
+def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
+    """Returns what a site sees of a peer whose motion is given, by the site's records."""
+    used = records.used[past.records.site]
     began = used >= 0
-    stamp_s = np.where(began, used / peer.rate_hz, _BEFORE_EPOCH_S)
+    stamp_s = np.where(began, used / past.records.rate_hz, _BEFORE_EPOCH_S)
     kept_s = np.where(began, stamp_s + records.h_s, _BEFORE_EPOCH_S)[:-1]
     stamps = np.where(began, stamp_s, np.nan)
     return DelayedPeer(past.at(records.t_s), past.at(stamp_s), past.at(kept_s), stamps)

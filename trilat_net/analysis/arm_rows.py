@@ -13,13 +13,7 @@ from ..core.vectors import Array
 
 
 def inertia_product_rows(theta: Array, q: Array, x: Array) -> Array:
-    """Returns M(q) x.
-
-    Args:
-        theta: the arm's parameters, shape (5,).
-        q: joint angles, shape (K, 2), rad.
-        x: the factor of M, shape (K, 2).
-    """
+    """Returns M(q) x of rows of q, rad, and of x, shape (K, 2) each; theta of the arm has shape (5,)."""
     bend = theta[1] * np.cos(q[:, 1])
     cross = theta[2] + bend
     first = (theta[0] + 2.0 * bend) * x[:, 0] + cross * x[:, 1]
@@ -29,12 +23,8 @@ def inertia_product_rows(theta: Array, q: Array, x: Array) -> Array:
 def regressor_rows(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
     """Returns Y(q, qd, v, a) with Y theta = M(q) a + C(q, qd) v + G(q), Eq. (12), shape (K, 2, 5).
 
-    Args:
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-        v: reference velocity, shape (K, 2), rad/s.
-        a: reference acceleration, shape (K, 2), rad/s^2.
+    Gravitational acceleration g in m/s^2; q, qd, reference velocity v and acceleration a of shape (K, 2), in
+    rad, rad/s and rad/s^2.
     """
     Y = np.zeros((len(q), 2, 5))
     c2, s2 = np.cos(q[:, 1]), np.sin(q[:, 1])
@@ -50,11 +40,9 @@ def regressor_rows(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
 
 
 class EndEffectorRows(NamedTuple):
-    """Position, velocity and Jacobian of the end effector.
+    """Position and velocity of the end effector, shape (K, 2), m and m/s.
 
     Attributes:
-        at: shape (K, 2), m.
-        speed: shape (K, 2), m/s.
         J: its Jacobian, shape (K, 2, 2), m/rad: rows x and y, columns the joints.
     """
 
@@ -64,13 +52,7 @@ class EndEffectorRows(NamedTuple):
 
 
 def compute_end_effector(lengths: tuple[float, float], q: Array, qd: Array) -> EndEffectorRows:
-    """Returns the end effector of an arm.
-
-    Args:
-        lengths: of the two links, m.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-    """
+    """Returns the end effector of an arm: lengths of its links, m; q and qd, shape (K, 2), rad and rad/s."""
     inner, outer = q[:, 0], q[:, 0] + q[:, 1]
     elbow = lengths[0] * np.stack([np.cos(inner), np.sin(inner)], axis=1)
     reach = lengths[1] * np.stack([np.cos(outer), np.sin(outer)], axis=1)

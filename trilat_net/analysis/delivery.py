@@ -26,11 +26,10 @@ Bools = NDArray[np.bool_]
 
 
 class PredictedDelivery(NamedTuple):
-    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it.
+    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it; times since the epoch.
 
     Attributes:
-        stamp_ns: of each, ns since the epoch, shape (M,).
-        due_ns: when each is due, ns since the epoch, shape (M,); `LOST` for a lost one.
+        stamp_ns, due_ns: the stamp of each, and when it is due, shape (M,), ns; `LOST` for a lost one.
         drawn_ns: the same by the model's own delay alone, without duplicates, order and play-out.
         measured: True if nothing is injected: a sample is due at once, shape (M,).
         copies: duplicates that the link makes.
@@ -52,20 +51,17 @@ class PredictedDelivery(NamedTuple):
     def drawn_ms(self) -> Array:
         """The injected delays of the samples that are not lost, ms."""
         kept = ~self.lost & ~self.measured
-        delays: Array = (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
-        return delays
+        return (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
         """Returns the receiver's tick at which each comes into use if it has arrived, shape (M,); or LOST."""
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
-        release: Ints = np.where(self.lost, LOST, ticks)
-        return release
+        return np.where(self.lost, LOST, ticks)
 
 
 def first_ticks(due_ns: Ints, rate_hz: int) -> Ints:
     """Returns the first ticks at or after times, ns; `core.ticks.first_tick_at` for arrays."""
-    ticks: Ints = -(-due_ns * rate_hz // NS_PER_S)
-    return ticks
+    return -(-due_ns * rate_hz // NS_PER_S)
 
 
 def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
@@ -82,19 +78,17 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
         for command in commands
         if command.peer == index and command.model is not None
     ]
-    models, points = _models(setup, ordered)
-    due_ns, copies = _due(setup, models, points, count)
+    models, points = _list_models(setup, ordered)
+    due_ns, copies = _schedule(setup, models, points, count)
     alone = models.copy()
     alone["duplicate"], alone["in_order"], alone["playout_us"] = 0.0, 0, 0
-    drawn_ns = due_ns if np.array_equal(alone, models) else _due(setup, alone, points, count)[0]
+    drawn_ns = due_ns if np.array_equal(alone, models) else _schedule(setup, alone, points, count)[0]
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
-    in_force = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
-    return PredictedDelivery(
-        stamp_ns, due_ns, drawn_ns, models["kind"][in_force] == DelayKind.MEASURED, copies
-    )
+    kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
+    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, copies)
 
 
-def _due(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
+def _schedule(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
     """Returns when each sample is due, and the number of copies; by a row of the core's link."""
     row: Row = np.zeros(1, LINK_DTYPE)[0]
     row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(models)
@@ -109,7 +103,7 @@ def _due(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -
     return due_ns, int(row.copies)
 
 
-def _models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void], Ints]:
+def _list_models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void], Ints]:
     """Returns a link's models in the order of their first stamps, and its points: traces, then outages.
 
     Ordered changes hold from a time at which no sample had been decided, so all can stand there at once.
@@ -126,12 +120,11 @@ def _models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void
 
 
 class Arrivals(NamedTuple):
-    """Arrivals over a link, in the order of the records.
+    """Arrivals over a link, in the order of the records, shape (A,).
 
     Attributes:
-        tick: the receiver's tick, shape (A,).
-        sample: the sample's own tick, shape (A,).
-        delay_us: its one-way delay in the record, shape (A,), us.
+        tick, sample: the receiver's tick, and the sample's own.
+        delay_us: its one-way delay in the record.
         refused: number of others with a stamp out of range, or of a tick that their sender never makes.
     """
 
@@ -156,29 +149,18 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
     for index, peer in enumerate(part.peers):
         here = entries[:, 0] == index
         at, sample, delay_us = tick[here], entries[here, 1], entries[here, 2]
-        known = _in_range(at, sample, part.rate_hz, log.scenario.sites[peer].rate_hz)
-        known &= sample < log.scenario.ticks(peer)
+        # a link accepts no stamp before the epoch, and none further ahead than the limit
+        latest_ns = at * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
+        peer_hz = log.scenario.sites[peer].rate_hz
+        limit = ((latest_ns + 1) * peer_hz - 1) // NS_PER_S  # in ticks: a stamp itself might overflow
+        known = (sample >= 0) & (sample <= limit) & (sample < log.scenario.ticks(peer))
         refused = len(at) - int(np.count_nonzero(known))
         found[peer] = Arrivals(at[known], sample[known], delay_us[known], refused)
     return found
 
 
-def _in_range(tick: Ints, sample: Ints, rate_hz: int, peer_rate_hz: int) -> Bools:
-    """Returns the stamps that a link accepts: none before the epoch, none more than the limit ahead."""
-    latest_ns = tick * NS_PER_S // rate_hz + AHEAD_LIMIT_NS
-    limit = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S  # in ticks: a stamp itself might overflow
-    known: Bools = (sample >= 0) & (sample <= limit)
-    return known
-
-
 def count_sent(log: Log, peer: str, newest: int) -> int:
-    """Returns how many samples a peer has sent, as far as the log shows.
-
-    Args:
-        log: the log.
-        peer: the sender.
-        newest: the newest of its samples that arrived anywhere; -1 for none.
-    """
+    """Returns how many samples a peer has sent, as far as the log shows; `newest` of them came, or -1."""
     part = log[peer]
     stated = [event.ticks for event in log.events if event.kind == "end" and event.member == peer]
     recorded = int(part.tick[-1]) + 1 if len(part) else 0
@@ -189,13 +171,8 @@ def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> 
     """Returns for which samples it is known whether they arrived, shape (M,).
 
     Known are those that arrived, those older than the newest that arrived, and those older than the slowest
-    took; except those that may have arrived in a tick whose record is missing.
-
-    Args:
-        log: the log.
-        site: the receiver.
-        stamp_ns: the stamps of the samples 0 to M - 1, ns since the epoch.
-        came: their first arrivals.
+    took; except those that may have arrived in a tick whose record is missing. Given are the stamps of the
+    samples 0 to M - 1, ns since the epoch, and their first arrivals.
     """
     part, count = log[site], len(stamp_ns)
     if not len(part):

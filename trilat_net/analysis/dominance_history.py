@@ -58,14 +58,7 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:
-    """Returns dominance factors at times.
-
-    Args:
-        start: at the epoch, shape (P,).
-        ramps: what changes them.
-        t_s: the times, ascending, shape (K,), s.
-        h_s: the period between them, s.
-    """
+    """Returns dominance factors, at the epoch `start`, shape (P,), at ascending times, `h_s` apart, s."""
     alpha, rate = np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), len(start)))
     before, start_s, end_s, after = start, 0.0, 0.0, start
     for ramp in sorted(ramps, key=lambda ramp: ramp.start_ns):

@@ -4,6 +4,7 @@ Invariant: keys end in their unit; a quantity that the log does not determine is
 estimates are those in force while the session ran, without later improvement.
 """
 
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -13,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from ..core.ticks import NS_PER_S
 from ..log.log_reader import Log
-from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns
 
@@ -22,13 +22,11 @@ class ClockSummary(NamedTuple):
     """The clock of a link's sender against the receiver's.
 
     Attributes:
-        offset_us: the sender's clock minus the receiver's, by the last statistics, us.
-        offset_first_us: the same by the first ones.
-        drift_ppm: growth of the offset, us/s, by the last estimate; None without one.
-        drift_bound_ppm: bound of its error.
-        bound_us: bound of the error of the offset in force, by the last statistics, us.
-        bound_p50_us: the median of that.
-        bound_max_us: its largest.
+        offset_us, offset_first_us: the sender's clock minus the receiver's, by the last and first estimate.
+        drift_ppm, drift_bound_ppm: growth of the offset, us/s, by the last estimate, and the bound of its
+            error; None without one.
+        bound_us, bound_p50_us, bound_max_us: bound of the error of the offset in force, by the last
+            statistics, us, the median of it and the largest.
         rtt_min_us: smallest round trip; None without one.
         faults: samples that arrived before they were sent by more than the bound: a clock has stepped.
     """
@@ -81,12 +79,15 @@ def describe_session(log: Log) -> JsonObject:
     session, scenario = log.session, log.scenario
     epoch_ns = _number(session.get("epoch_unix_ns", ""))
     seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
-    live = log.driver == "live" and epoch_ns is not None
+    began_utc = None
+    if log.driver == "live" and epoch_ns is not None:
+        began_at = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
+        began_utc = began_at.strftime("%Y-%m-%d %H:%M:%S")
     return {
         "session": session["session"],
         "driver": log.driver,
         "complete": log.complete,
-        "began_utc": _date(epoch_ns) if live and epoch_ns is not None else None,
+        "began_utc": began_utc,
         "epoch_unix_ns": epoch_ns,
         "recorded_s": max(seconds, default=0.0),
         "ended": {event.member: event.ticks for event in log.events if event.kind == "end"},
@@ -100,19 +101,14 @@ def describe_session(log: Log) -> JsonObject:
             "sites": list(log.sites),
         },
         **{key: session.get(key) for key in _PROVENANCE},
-        "versions": {
-            key.removeprefix("version_"): value
-            for key, value in session.items()
-            if key.startswith("version_")
-        },
+        "versions": {key[8:]: value for key, value in session.items() if key.startswith("version_")},
         "accounts": log.accounts,
     }
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
     """Returns the facts of a site's records and of its loop."""
-    part, spec = log[site], log.scenario.sites[site]
-    timed = log.driver == "live"
+    part, spec, timed = log[site], log.scenario.sites[site], log.driver == "live"
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
@@ -131,25 +127,21 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     clock = summarise_clock(log, peer, site)
     stats = log.link_stats(site)[-1:]
     counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
+    one_way_us = np.zeros(0, dtype=np.int64)  # none is measured in virtual time
+    if (
+        log.driver == "live"
+        and (_number(log.session.get("schema_version", "")) or 0) >= ONE_WAY_SCHEMA_VERSION
+    ):
+        came = log[site].arrivals[1]
+        one_way_us = came[came[:, 0] == log[site].peers.index(peer), 2]
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
         "age_ms": percentiles(sample_ages_ns(log, peer, site), unit=1e6),
-        "one_way_ms": percentiles(_one_way_us(log, peer, site), unit=1e3),
+        "one_way_ms": percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock is None else clock.offset_us,
         "clock_bound_us": None if clock is None else clock.bound_us,
         **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
     }
-
-
-def _one_way_us(log: Log, peer: str, site: str) -> Ints:
-    """Returns the measured one-way delay of everything that came over a link, us; none in virtual time."""
-    part = log[site]
-    version = _number(log.session.get("schema_version", "")) or 0
-    if log.driver != "live" or version < ONE_WAY_SCHEMA_VERSION:
-        return np.zeros(0, dtype=np.int64)
-    _, came = part.arrivals
-    delays: Ints = came[came[:, 0] == part.peers.index(peer), 2]
-    return delays
 
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
@@ -166,6 +158,11 @@ def percentiles(
     return dict(zip(shares, found, strict=True))
 
 
+def finite_or_none(value: float) -> float | None:
+    """Returns a number for JSON; None for NaN and infinity, which it has no words for."""
+    return value if math.isfinite(value) else None
+
+
 def made_ticks(log: Log, site: str) -> int | None:
     """Returns the number of ticks that a site made, by its own event; None without one."""
     return next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
@@ -178,8 +175,3 @@ def count_overruns(part: SiteLog) -> int:
 
 def _number(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
-
-
-def _date(epoch_ns: int) -> str:
-    at_s = min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S
-    return datetime.fromtimestamp(at_s, UTC).strftime("%Y-%m-%d %H:%M:%S")

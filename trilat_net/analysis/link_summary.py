@@ -19,7 +19,6 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from .delivery import (
     Arrivals,
-    Bools,
     PredictedDelivery,
     count_sent,
     mark_judged_samples,
@@ -48,13 +47,7 @@ class ValueStatistics(NamedTuple):
 
 
 class AgeHistogram(NamedTuple):
-    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`.
-
-    Attributes:
-        first_ms: begin of the first bin, ms.
-        width_ms: width of a bin, ms.
-        ticks: in each bin.
-    """
+    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`."""
 
     first_ms: float
     width_ms: float
@@ -90,11 +83,9 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """One directed link in a run; what the log does not determine is None.
+    """One directed link in a run, peer -> site; what the log does not determine is None.
 
     Attributes:
-        peer: the sender.
-        site: the receiver.
         stated: its models in force, from the start and after every change.
         drawn_ms: the delays that its model gave to the samples, before order and play-out.
         age_ms: the effective delay, over the ticks from the first sample in use on.
@@ -153,14 +144,14 @@ def summarise_links(log: Log) -> list[LinkSummary]:
         peer: max(int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there)
         for peer in log.sites
     }
-    summaries = []
-    for site in log.sites:
-        for peer, over_link in came[site].items():
-            states = list_stated_models(log, f"{peer}->{site}", changed)
-            summaries.append(
-                _summarise_link(log, peer, site, states, count_sent(log, peer, newest[peer]), over_link)
-            )
-    return summaries
+    sent = {peer: count_sent(log, peer, tick) for peer, tick in newest.items()}
+    return [
+        _summarise_link(
+            log, list_stated_models(log, f"{peer}->{site}", changed), peer, site, sent[peer], over
+        )
+        for site in log.sites
+        for peer, over in came[site].items()
+    ]
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
@@ -168,8 +159,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
     part, used = log[site], log[site].used[peer]
     known = used >= 0
     stamp_ns = used[known] * NS_PER_S // log.scenario.sites[peer].rate_hz
-    age_ns: Ints = part.tick[known] * NS_PER_S // part.rate_hz - stamp_ns
-    return age_ns
+    return part.tick[known] * NS_PER_S // part.rate_hz - stamp_ns
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
@@ -193,56 +183,44 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
 
 
 def _summarise_link(
-    log: Log, peer: str, site: str, states: list[StatedModel], count: int, came: Arrivals
+    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, came: Arrivals
 ) -> LinkSummary:
     part, used = log[site], log[site].used[peer]
-    fate = predict_delivery(log, peer, site, count)
+    fate = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
-    first = came.first
-    known = mark_judged_samples(log, site, fate.stamp_ns, first)
-    loss, burst = _losses(fate, first, known)
+    known = mark_judged_samples(log, site, fate.stamp_ns, came.first)
+    gone = np.ones(len(known), dtype=np.bool_)  # judged samples that could not come into use
+    gone[came.first.sample] = False
+    gone = (gone | fate.lost) & known
+    lost, judged = int(np.count_nonzero(gone)), int(np.count_nonzero(known))
+    bursts = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
+    pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
     stamped = log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION
-    in_use = np.flatnonzero(used >= 0)
+    first_use_s = silence_ms = None
+    if (used >= 0).any():
+        first_use_s = float(part.t_s[np.flatnonzero(used >= 0)[0]])
+        ticks = np.append(part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1)
+        silence_ms = float(np.diff(ticks * NS_PER_S // part.rate_hz).max()) / 1e6
     return LinkSummary(
         peer,
         site,
         states,
-        compute_statistics(fate.drawn_ms),
-        compute_statistics(age_ns / 1e6),
-        bin_ages(age_ns),
-        float(part.t_s[in_use[0]]) if len(in_use) else None,
-        _share_without_new(part, used),
-        _longest_silence_ms(part, used),
-        _counts(part, used, fate, came, known) if len(part) else None,
-        loss,
-        burst,
-        compute_statistics(came.delay_us) if stamped else None,
+        drawn_ms=compute_statistics(fate.drawn_ms),
+        age_ms=compute_statistics(age_ns / 1e6),
+        ages=bin_ages(age_ns),
+        first_use_s=first_use_s,
+        ticks_without_new=float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None,
+        silence_ms=silence_ms,
+        counts=_count_samples(part, used, fate, came, judged) if len(part) else None,
+        loss=lost / judged if judged else None,
+        burst=lost / bursts if bursts else None,
+        one_way_us=compute_statistics(came.delay_us) if stamped else None,
     )
 
 
-def _share_without_new(part: SiteLog, used: Ints) -> float | None:
-    pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
-    return float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None
-
-
-def _longest_silence_ms(part: SiteLog, used: Ints) -> float | None:
-    if not (used >= 0).any():
-        return None
-    ticks = np.append(part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1)
-    return float(np.diff(ticks * NS_PER_S // part.rate_hz).max()) / 1e6
-
-
-def _losses(fate: PredictedDelivery, first: Arrivals, known: Bools) -> tuple[float | None, float | None]:
-    """Returns the share of the judged samples that could not come into use, and how many in a row."""
-    gone = np.ones(len(known), dtype=np.bool_)
-    gone[first.sample] = False
-    gone = (gone | fate.lost) & known
-    lost, total = int(np.count_nonzero(gone)), int(np.count_nonzero(known))
-    runs = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
-    return lost / total if total else None, lost / runs if runs else None
-
-
-def _counts(part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, known: Bools) -> SampleCounts:
+def _count_samples(
+    part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, judged: int
+) -> SampleCounts:
     first = came.first
     release = fate.release(part.rate_hz)[first.sample]
     lost = fate.lost[first.sample]
@@ -251,12 +229,11 @@ def _counts(part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, 
     at = np.maximum(release, first.tick)
     place = np.minimum(np.searchsorted(part.tick, at), len(part) - 1)
     superseded = ~lost & (part.tick[place] == at) & (used[place] != first.sample)
-    judged_count = int(np.count_nonzero(known))
     return SampleCounts(
-        sent=len(known),
-        judged=judged_count,
+        sent=len(fate.stamp_ns),
+        judged=judged,
         arrived=len(first.sample),
-        missing=judged_count - len(first.sample),
+        missing=judged - len(first.sample),
         lost=int(np.count_nonzero(lost)),
         late=int(np.count_nonzero(late)),
         superseded=int(np.count_nonzero(superseded)),

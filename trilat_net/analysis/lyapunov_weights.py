@@ -80,12 +80,7 @@ def find_kd_scales(Kd: Array) -> Array | None:
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Returns beta_i = pi_i / c_i; if the Kd differ in shape, pi alone, which lets V rise.
-
-    Args:
-        alpha: the dominance matrix, shape (N, N).
-        Kd: per site and joint, shape (N, n), N m s/rad.
-    """
+    """Returns beta_i = pi_i / c_i; if the Kd, shape (N, n), differ in shape, pi alone, which lets V rise."""
     scales = find_kd_scales(Kd)
     beta = left_perron_vector(alpha) / (1.0 if scales is None else scales)
     return LyapunovWeights(beta * (len(beta) / beta.sum()), find_closed_groups(alpha), scales)

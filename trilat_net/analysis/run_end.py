@@ -99,7 +99,6 @@ class EnvelopeFit(NamedTuple):
     """Trend of an envelope over the second half of a run.
 
     Attributes:
-        trend: the class.
         rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t). NaN if there
             are too few points.
     """
@@ -107,16 +106,25 @@ class EnvelopeFit(NamedTuple):
     trend: EnvelopeTrend
     rate_per_s: float
 
+    @property
+    def text(self) -> str:
+        """The trend as a verb."""
+        return "shows no trend" if self.trend is EnvelopeTrend.UNDECIDED else self.trend.value
+
+    @property
+    def rate_text(self) -> str:
+        """The rate of what grows or decays; else the trend as a verb."""
+        changes = self.trend in (EnvelopeTrend.GROWS, EnvelopeTrend.DECAYS)
+        return f"{self.rate_per_s:+.3g}/s" if changes else self.text
+
 
 class RunEnd(NamedTuple):
-    """End of a run.
+    """End of a run, of all of its sites or of some.
 
     Attributes:
         behaviour: the class.
-        error: trend of the largest |e|.
-        speed: trend of the largest |qd|.
-        end_error_rad: largest |e| of the last second.
-        end_speed_rad_s: largest |qd| of the last second.
+        error, speed: trends of the largest |e| and |qd|.
+        end_error_rad, end_speed_rad_s: largest |e| and |qd| of the last second.
         diverged_at_s: when the first site left its limits, or None.
         frequency_hz: frequency of a bounded oscillation; None without one.
         missing_sites: sites without any record, which leave the run undecided.
@@ -140,29 +148,17 @@ class RunEnd(NamedTuple):
             return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
         if self.missing_sites:
             return f"undecided: no record of {', '.join(self.missing_sites)}"
-        if behaviour is EndBehaviour.CONVERGED and self.end_error_rad > SETTLED_ERROR_RAD:
-            return f"at rest, and the sites do not agree: {end}"
         if behaviour is EndBehaviour.CONVERGED:
-            return f"converged: {end}"
+            apart = self.end_error_rad > SETTLED_ERROR_RAD
+            return f"{'at rest, and the sites do not agree' if apart else 'converged'}: {end}"
         if behaviour is EndBehaviour.BOUNDED:
             hertz = self.frequency_hz
             word = "bounded motion" if hertz is None else f"bounded oscillation at {hertz:.3g} Hz"
-            slowly = f" (|qd| {_describe_rate(speed)})" if speed.trend is EnvelopeTrend.DECAYS else ""
+            slowly = f" (|qd| {speed.rate_text})" if speed.trend is EnvelopeTrend.DECAYS else ""
             return f"{word}{slowly}: {end}"
         if behaviour is EndBehaviour.UNDECIDED:
-            trends = f"|e| {_describe_trend(error)}, |qd| {_describe_trend(speed)}"
-            return f"undecided, record longer: {trends}; {end}"
-        return f"{behaviour.value} (|e| {_describe_rate(error)}, |qd| {_describe_rate(speed)}): {end}"
-
-
-def _describe_trend(fit: EnvelopeFit) -> str:
-    return "shows no trend" if fit.trend is EnvelopeTrend.UNDECIDED else fit.trend.value
-
-
-def _describe_rate(fit: EnvelopeFit) -> str:
-    if fit.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
-        return _describe_trend(fit)
-    return f"{fit.rate_per_s:+.3g}/s"
+            return f"undecided, record longer: |e| {error.text}, |qd| {speed.text}; {end}"
+        return f"{behaviour.value} (|e| {error.rate_text}, |qd| {speed.rate_text}): {end}"
 
 
 def classify_log_end(log: Log) -> RunEnd:
@@ -178,7 +174,7 @@ def classify_log_end(log: Log) -> RunEnd:
 
 
 def classify_run_end(maxima: Sequence[Array], span_s: float, diverged_at_s: float | None = None) -> RunEnd:
-    """Returns the end of a run from the maxima of its buckets.
+    """Returns the end of a run of `span_s` from the maxima of the buckets of all of its sites, or of some.
 
     Args:
         maxima: per site the largest |e|, rad, and |qd|, rad/s, of every bucket since the epoch, shape (K, 2);
@@ -252,9 +248,7 @@ def _frequency_hz(parts: list[SiteLog]) -> float | None:
 def fit_envelope(t_s: Array, error_rad: Array) -> EnvelopeFit:
     """Returns the trend of an envelope; the module's docstring defines it.
 
-    Args:
-        t_s: times, ascending, shape (K,), s.
-        error_rad: the largest |e| at each time, or since the time before, shape (K,), rad.
+    Times ascend, shape (K,), s; the largest |e| is that at each time, or since the time before.
     """
     fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
     for windows in _T_QUANTILES:
@@ -283,8 +277,13 @@ def _window_maxima(t_s: Array, error_rad: Array, windows: int) -> Array | None:
 
 
 def _fit_maxima(maxima: Array, window_s: float) -> EnvelopeFit:
-    n = len(maxima)
-    slope, bound = _fit_line(np.log(maxima))
+    """Returns the class of the maxima of equal windows, by a line through their logarithms."""
+    n, values = len(maxima), np.log(maxima)
+    x = np.arange(n) - 0.5 * (n - 1)
+    spread = float(x @ x)
+    slope = float(x @ values) / spread
+    residual = values - values.mean() - slope * x
+    bound = _T_QUANTILES[n] * math.sqrt(float(residual @ residual) / (n - 2) / spread)
     steps = np.diff(np.log(maxima.reshape(4, -1).max(axis=1)))
     lasts = steps[-1] >= 0.75 * steps[0] or (steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0])
     if maxima.max() <= FLOOR_RAD:
@@ -300,14 +299,3 @@ def _fit_maxima(maxima: Array, window_s: float) -> EnvelopeFit:
     else:
         trend = EnvelopeTrend.UNDECIDED
     return EnvelopeFit(trend, float(slope / window_s))
-
-
-def _fit_line(values: Array) -> tuple[float, float]:
-    """Returns the slope of a straight line through equidistant values, per step, and its uncertainty."""
-    n = len(values)
-    x = np.arange(n) - 0.5 * (n - 1)
-    spread = float(x @ x)
-    slope = float(x @ values) / spread
-    residual = values - values.mean() - slope * x
-    deviation = math.sqrt(float(residual @ residual) / (n - 2) / spread)
-    return slope, _T_QUANTILES[n] * deviation

@@ -66,8 +66,7 @@ def sites_with_operator(log: Log) -> list[str]:
 def largest_remaining_error(part: SiteLog) -> Array:
     """Returns the largest error of any joint from each record to the last, shape (K,), rad."""
     largest = np.abs(joint_errors(part)).max(axis=1, initial=0.0)
-    remaining: Array = np.maximum.accumulate(largest[::-1])[::-1]
-    return remaining
+    return np.maximum.accumulate(largest[::-1])[::-1]
 
 
 def settling_time_s(part: SiteLog) -> float | None:

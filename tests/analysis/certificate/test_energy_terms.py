@@ -56,7 +56,7 @@ class Situation:
             for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
         }
         self.track = moving(random, "s", used, 2, NOW)
-        self.views = [view_delayed_peer(self.track, peer, PeerTrajectory(peer)) for peer in self.peers]
+        self.views = [view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers]
         self.track.q_des[:] = sum(a * v.seen.q for a, v in zip(self.alpha, self.views, strict=True))
         alpha = np.tile(self.alpha, (2, 1))
         self.shares = DominanceHistory(alpha, np.zeros((2, 2)), alpha[:1])
@@ -136,7 +136,7 @@ def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: 
     peer.qd[:], peer.q[:] = speed, speed * t_s[:, np.newaxis]
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
-    one = view_delayed_peer(site.track, peer, PeerTrajectory(peer))
+    one = view_delayed_peer(site.track, PeerTrajectory(peer))
     later = PeerTrajectory(peer).at(one.stamp_s - np.array([0.0, grown_s]))
     site.views[0] = one._replace(seen=later)
     site.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(site.alpha, site.views, strict=True))

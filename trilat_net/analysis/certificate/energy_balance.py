@@ -5,7 +5,7 @@ V(0) + dissipation - work vanishes for the weighted sum, whatever the operators 
 was not produced by the equations that it claims.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -45,9 +45,9 @@ class SiteEnergy:
     Attributes:
         motion: what they are computed from.
         parts: its functional.
-        dissipation: `damping` and `disagreement`.
+        dissipation: by kind.
         transfer: to the sites that follow it, less what it gets from those that it follows.
-        work: of `hands`, `walls`, per link "j->i", `shares`, `rule`, `torque limit`, `estimates`.
+        work: by source.
         sampling: the work of the scheme that samples the continuous law.
         judged: True if a period follows from records alone, shape (K - 1,).
     """
@@ -66,12 +66,12 @@ class SiteEnergy:
         change = np.diff(self.parts.total) + self.transfer.total
         change += np.sum([one.total for one in self.dissipation.values()], axis=0)
         change -= np.sum([one.total for one in self.work.values()], axis=0)
-        return accumulate(np.where(self.judged, change, 0.0))
+        return _accumulate(change, self.judged)
 
     @cached_property
     def unexplained(self) -> Array:
         """The residual without the work of the scheme, shape (K,), J."""
-        return self.residual - accumulate(np.where(self.judged, self.sampling.total, 0.0))
+        return self.residual - _accumulate(self.sampling.total, self.judged)
 
     @property
     def followed(self) -> set[str]:
@@ -103,20 +103,18 @@ class SiteEnergy:
         coupled = 0.0
         for torque in (records.tau, records.tau_x):
             together = records.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
-            coupled += 2.0 * float(np.abs(accumulate(np.where(self.judged, together, 0.0))).max())
+            coupled += 2.0 * float(np.abs(_accumulate(together, self.judged)).max())
         return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + coupled
 
 
-def accumulate(amounts: Array) -> Array:
-    """Returns the sum of all amounts before each row, from 0 on."""
-    return np.concatenate([[0.0], np.cumsum(amounts)])
+def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
+    """Returns the sum of all judged amounts before each row, from 0 on."""
+    counted = amounts if judged is None else np.where(judged, amounts, 0.0)
+    return np.concatenate([[0.0], np.cumsum(counted)])
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Returns the energies of all sites, in scenario order; {} if at no time all are known.
-
-    Args:
-        log: a log all of whose sites have a functional.
+    """Returns the energies of a log's sites, each of which has a functional; {} if at no time all are known.
 
     Raises:
         LogError: a record names a change that is none.
@@ -130,36 +128,29 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
             own,
             derive_site_constants(spec),
             trace_dominance(log, site, own.t_s),
-            {peer: view_delayed_peer(own, records[peer], pasts[peer]) for peer in own.used},
+            {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
             split_torque(own, spec),
             Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL,
         )
-        energies[site] = compute_site_energy(motion)
-    times = find_common_times(energies.values()) if energies else np.zeros(0)
-    return energies if len(times) > 1 else {}
+        views = enumerate(motion.peers.values())
+        known = [own.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
+        energies[site] = SiteEnergy(
+            motion,
+            evaluate_functional(motion),
+            compute_dissipation(motion),
+            compute_transfer(motion),
+            compute_work(motion),
+            compute_sampling_work(motion),
+            np.logical_and.reduce(known),
+        )
+    return energies if energies and len(_find_common_times(energies)) > 1 else {}
 
 
-def compute_site_energy(motion: SiteMotion) -> SiteEnergy:
-    """Returns the energies of one site."""
-    views = enumerate(motion.peers.values())
-    known = [motion.records.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
-    return SiteEnergy(
-        motion,
-        evaluate_functional(motion),
-        compute_dissipation(motion),
-        compute_transfer(motion),
-        compute_work(motion),
-        compute_sampling_work(motion),
-        np.logical_and.reduce(known),
-    )
-
-
-def find_common_times(energies: Iterable[SiteEnergy]) -> Array:
+def _find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
     """Returns the ticks of the fastest site from when every V_i is known to the end of the records, s."""
-    energies = list(energies)
-    records = [energy.motion.records for energy in energies]
+    records = [energy.motion.records for energy in energies.values()]
     times = max(records, key=lambda own: own.rate_hz).t_s
-    begin_s = max(energy.begin_s for energy in energies)
+    begin_s = max(energy.begin_s for energy in energies.values())
     end_s = min(own.t_s[-1] for own in records)
     common: Array = times[(times >= begin_s - 1e-9) & (times <= end_s + 1e-9)]
     return common
@@ -167,19 +158,19 @@ def find_common_times(energies: Iterable[SiteEnergy]) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The functional of a group of sites over time, at the ticks of its fastest; energies in J.
+    """The functional of a group of sites over time, at the ticks of its fastest; shape (T,) and J by default.
 
-    Dissipation, work and transfer count in judged periods alone.
+    Dissipation, work and transfer count in judged periods alone, from the beginning to the tick.
 
     Attributes:
-        t_s: shape (T,), s.
+        t_s: the ticks, s.
         beta: the weights over time, shape (T, N).
-        sites: per site beta_i V_i, each shape (T,).
-        parts: of all sites: kinetic, parameter, position, delay, each shape (T,).
-        dissipation: until then, by kind, each shape (T,).
-        work: until then, by source, each shape (T,).
-        sampling: the work of the scheme until then; no part of the balance, see `unexplained`, shape (T,).
-        transfer: what the weights did not cancel until then, 0 if they are right, shape (T,).
+        sites: per site beta_i V_i.
+        parts: of all sites: kinetic, parameter, position, delay.
+        dissipation: by kind.
+        work: by source.
+        sampling: the work of the scheme; no part of the balance, see `unexplained`.
+        transfer: what the weights did not cancel, 0 if they are right.
         judged: True if the period before a tick follows from records alone, shape (T - 1,).
     """
 
@@ -220,8 +211,7 @@ class EnergyBalance:
     @property
     def external_work(self) -> Array:
         """The work of operator and environment until then, shape (T,), J."""
-        work: Array = self.work["hands"] + self.work["walls"]
-        return work
+        return self.work["hands"] + self.work["walls"]
 
     @property
     def external_sources(self) -> list[str]:
@@ -239,17 +229,15 @@ class EnergyBalance:
         return float(np.abs(self.residual).max()) / self.scale if self.scale > ZERO_ENERGY_J else 0.0
 
     def _over_judged(self, values: Array) -> Array:
-        return accumulate(np.where(self.judged, np.diff(values), 0.0))
+        return _accumulate(np.diff(values), self.judged)
 
 
 def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = False) -> EnergyBalance:
-    """Returns the balance of a group of sites of which none follows a site outside.
+    """Returns the balance of a group of sites, in scenario order, of which none follows a site outside.
 
-    Args:
-        energies: of every site of the group, in scenario order.
-        ones: True to weigh every site alike, as the paper does; then it need not close.
+    With `ones` every site weighs the same, as in the paper; then it need not close.
     """
-    times, weights = find_common_times(energies.values()), _Weights(energies, ones=ones)
+    times, weights = _find_common_times(energies), _Weights(energies, ones=ones)
     columns, sites, unjudged = [], {}, np.zeros(len(times))
     sums: dict[tuple[str, str], Array] = {}
     for n, (site, energy) in enumerate(energies.items()):
@@ -261,11 +249,16 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
             sums[key] = sums[key] + values if key in sums else values
         columns.append(_resample(times, records.t_s, left))
         sites[site] = _resample(times, records.t_s, left * energy.parts.total)
-        unjudged += np.abs(_resample(times, records.t_s, accumulate((~energy.judged).astype(np.float64))))
+        unjudged += np.abs(_resample(times, records.t_s, _accumulate((~energy.judged).astype(np.float64))))
     judged: Bools = np.diff(unjudged) == 0.0
 
     def of_kind(kind: str) -> dict[str, Array]:
-        return {name: _cut(values, judged) for (group, name), values in sums.items() if group == kind}
+        """The growth of running sums, without that while records are missing."""
+        return {
+            name: x - x[0] if judged.all() else _accumulate(np.diff(x), judged)
+            for (group, name), x in sums.items()
+            if group == kind
+        }
 
     return EnergyBalance(
         times,
@@ -283,34 +276,25 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
 def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str, str], Array]:
     """Returns what a site adds to the balance at its own ticks, by kind and name.
 
-    A change of the weight itself does work on V_i, booked as `shares`: along a ramp, and at a step.
-
-    Args:
-        energy: of the site.
-        left: its weight at every tick, shape (K,).
-        right: its weight at the end of every period, before a step, shape (K - 1,).
+    Its weight is `left` at every tick, shape (K,), and `right` at the end of every period, before a step. A
+    change of the weight itself does work on V_i, booked as `shares`: along a ramp, and at a step.
     """
 
     def weigh(one: Increment) -> Array:
-        return accumulate(left[:-1] * one.left + right * (one.right + one.jump))
+        return _accumulate(left[:-1] * one.left + right * (one.right + one.jump))
 
     V = energy.parts.total
     reweighted = (right - left[:-1]) * 0.5 * (V[:-1] + V[1:]) + (left[1:] - right) * V[1:]
     weighted = {("parts", name): left * part for name, part in energy.parts._asdict().items()}
     weighted |= {("dissipation", name): weigh(one) for name, one in energy.dissipation.items()}
     weighted |= {("work", name): weigh(one) for name, one in energy.work.items()}
-    weighted["work", "shares"] = weighted["work", "shares"] + accumulate(reweighted)
+    weighted["work", "shares"] = weighted["work", "shares"] + _accumulate(reweighted)
     return weighted | {("sampling", ""): weigh(energy.sampling), ("transfer", ""): weigh(energy.transfer)}
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
     same = len(t_s) == len(times) and t_s[0] == times[0]
     return values if same else np.interp(times, t_s, values)
-
-
-def _cut(values: Array, judged: Bools) -> Array:
-    """Returns the growth of a running sum, without its growth while records are missing."""
-    return values - values[0] if judged.all() else accumulate(np.where(judged, np.diff(values), 0.0))
 
 
 class _Weights:
@@ -327,34 +311,27 @@ class _Weights:
         """Returns beta at every tick, shape (K, N), and at the end of every period, before a step there."""
         key = records.first, len(records.known), records.rate_hz
         if key not in self._along:
-            t_s = records.t_s
-            self._along[key] = self._at(t_s), self._at(t_s[:-1], records.h_s)
+            self._along[key] = self._at(records.t_s), self._at(records.t_s[:-1], records.h_s)
         return self._along[key]
 
     def _at(self, t_s: Array, ahead_s: float = 0.0) -> Array:
         if self._ones:
             return np.ones((len(t_s), len(self._Kd)))
         times = t_s[:1] if self._constant else t_s
-        alpha = np.round(interpolate_dominance(self._energies, times, ahead_s), 12) + 0.0
+        alpha = np.round(_interpolate_dominance(self._energies, times, ahead_s), 12) + 0.0
         matrices, place = np.unique(alpha.reshape(len(alpha), -1), axis=0, return_inverse=True)
-        beta: Array = np.array([self._solve(matrix) for matrix in matrices])[place.ravel()]
+        for matrix in matrices:
+            if (key := matrix.tobytes()) not in self._solved:
+                alpha = matrix.reshape(len(self._Kd), -1)
+                self._solved[key] = compute_lyapunov_weights(alpha, self._Kd).beta
+        beta: Array = np.array([self._solved[matrix.tobytes()] for matrix in matrices])[place.ravel()]
         return np.tile(beta, (len(t_s), 1)) if self._constant else beta
 
-    def _solve(self, matrix: Array) -> Array:
-        key = matrix.tobytes()
-        if key not in self._solved:
-            alpha = matrix.reshape(len(self._Kd), -1)
-            self._solved[key] = compute_lyapunov_weights(alpha, self._Kd).beta
-        return self._solved[key]
 
+def _interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:
+    """Returns the dominance matrix of a group at times, s, shape (T, N, N), without the sites outside of it.
 
-def interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:
-    """Returns the dominance matrix at times, shape (T, N, N).
-
-    Args:
-        energies: of every site of a group, in scenario order; factors for sites outside are left out.
-        t_s: the times, shape (T,), s.
-        ahead_s: how much further a ramp in progress is followed, s.
+    A ramp in progress is followed for `ahead_s` more.
     """
     names = list(energies)
     alpha = np.zeros((len(t_s), len(names), len(names)))
@@ -378,7 +355,7 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
         turns = np.flatnonzero(np.diff(dominance.rate, axis=0, prepend=0.0).any(axis=1))
         steps = np.flatnonzero((dominance.alpha[1:] != dominance.before).any(axis=1)) + 1
         times += [t_s[turns], t_s[steps]]
-    return interpolate_dominance(energies, np.concatenate(times))
+    return _interpolate_dominance(energies, np.concatenate(times))
 
 
 def _sum(columns: Mapping[str, Array]) -> Array:

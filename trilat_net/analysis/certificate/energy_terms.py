@@ -36,12 +36,9 @@ class SiteConstants(NamedTuple):
     Attributes:
         theta: the arm's true parameters.
         g: gravitational acceleration, m/s^2.
-        Lambda: 1/s.
-        Kp: N m s/rad.
-        Kd: N m s/rad.
+        Lambda, Kp, Kd: gains, 1/s and N m s/rad.
         Gamma: adaptation gain.
-        low: lower limits of the estimates.
-        high: upper limits.
+        low, high: limits of the estimates.
         tau_limit: largest torque of a joint, N m.
         outside: True if the arm is outside of the program: theta is then what its author states.
     """
@@ -60,24 +57,19 @@ class SiteConstants(NamedTuple):
     @property
     def adapts(self) -> Bools:
         """True for each parameter that the law adapts, shape (5,)."""
-        adapts: Bools = self.Gamma > 0.0
-        return adapts
+        return self.Gamma > 0.0
 
 
 def derive_site_constants(spec: SiteSpec) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
     gains = spec.control.gains(spec.arm.theta)
+    names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high")
     return SiteConstants(
-        spec.arm.theta,
-        spec.arm.g_m_s2,
-        np.array(gains.Lambda),
-        np.array(gains.Kp),
-        np.array(gains.Kd),
-        np.array(gains.Gamma),
-        np.array(gains.low),
-        np.array(gains.high),
-        spec.limits.tau_limit_nm,
-        spec.plant == "external",
+        theta=spec.arm.theta,
+        g=spec.arm.g_m_s2,
+        tau_limit=spec.limits.tau_limit_nm,
+        outside=spec.plant == "external",
+        **{name: np.array(getattr(gains, name)) for name in names},
     )
 
 
@@ -92,19 +84,16 @@ def explain_missing_functional(spec: SiteSpec) -> str:
 
 
 class PeriodEnds(NamedTuple):
-    """The ends of every period, K - 1 rows; `right` is before the jump, `middle` half-way through it.
+    """The ends of every period, shape (K - 1, 2); `right` is before the jump, `middle` half-way through it.
 
     Attributes:
-        following: True if the site followed its peers at both ends.
+        following: True if the site followed its peers at both ends, shape (K - 1,).
         link: per peer the jump of e by the age of its sample, shape (P, K - 1, 2), rad.
-        dominance: the jump of e by a step of dominance factors, shape (K - 1, 2), rad.
-        rule: the jump of e by the rule for stale peers, shape (K - 1, 2), rad.
-        r_left: r = qd + Lambda e, shape (K - 1, 2), rad/s.
-        r_right: shape (K - 1, 2), rad/s.
-        r_middle: shape (K - 1, 2), rad/s.
-        e_middle: shape (K - 1, 2), rad.
-        qd_des_left: shape (K - 1, 2), rad/s.
-        qd_des_right: shape (K - 1, 2), rad/s.
+        dominance: the jump of e by a step of dominance factors, rad.
+        rule: the jump of e by the rule for stale peers, rad.
+        r_left, r_right, r_middle: r = qd + Lambda e, rad/s.
+        e_middle: rad.
+        qd_des_left, qd_des_right: rad/s.
     """
 
     following: Bools
@@ -142,8 +131,7 @@ class SiteMotion:
     @cached_property
     def r(self) -> Array:
         """The sliding variable qd + Lambda e, Eq. (10), shape (K, 2), rad/s."""
-        r: Array = self.records.qd + self.constants.Lambda * self.records.e
-        return r
+        return self.records.qd + self.constants.Lambda * self.records.e
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
@@ -174,14 +162,11 @@ class SiteMotion:
         here, left = following[:, np.newaxis], at.follows[:-1, np.newaxis]
         before, after, rate = (x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1]))
         kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
-        kept_qd = np.sum(
-            [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)], axis=0
-        )
-        qd_des_left, qd_des_right = at.qd_des[:-1], np.where(left, kept_qd, at.qd_des[1:])
+        rates = [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)]
+        qd_des_left, qd_des_right = at.qd_des[:-1], np.where(left, np.sum(rates, axis=0), at.qd_des[1:])
         ruled_q = at.q_des[:-1] + 0.5 * at.h_s * (qd_des_left + qd_des_right)
-        link = np.array(
-            [np.where(here, before[:, j] * (v.kept.q - v.seen.q[1:]), 0.0) for j, v in enumerate(views)]
-        )
+        jumps = [before[:, j] * (v.kept.q - v.seen.q[1:]) for j, v in enumerate(views)]
+        link = np.where(here, jumps, 0.0)
         steps = [(before[:, j] - after[:, j]) * v.seen.q[1:] for j, v in enumerate(views)]
         dominance = np.where(here, np.sum(steps, axis=0), 0.0)
         rule = np.where(here, 0.0, np.where(left, kept_q, ruled_q) - at.q_des[1:])
@@ -201,14 +186,7 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """V_i of a site by its parts, each of shape (K,), J.
-
-    Attributes:
-        kinetic: 1/2 r' M r.
-        parameter: 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), of the adapted parameters.
-        position: 1/2 e' Lambda Kd e.
-        delay: 1/2 sum_j alpha_ij int qd_j' Kd qd_j ds over the age of the sample in use.
-    """
+    """V_i of a site by its four parts in the order of the module's docstring, each of shape (K,), J."""
 
     kinetic: Array
     parameter: Array
@@ -218,8 +196,7 @@ class FunctionalParts(NamedTuple):
     @property
     def total(self) -> Array:
         """V_i, shape (K,), J."""
-        total: Array = self.kinetic + self.parameter + self.position + self.delay
-        return total
+        return self.kinetic + self.parameter + self.position + self.delay
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
@@ -231,24 +208,17 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
         kinetic=0.5 * (r * inertia_product_rows(c.theta, at.q, r)).sum(axis=1),
         parameter=0.5 * (off**2 / c.Gamma[c.adapts]).sum(axis=1),
         position=0.5 * (c.Lambda * c.Kd * at.e**2).sum(axis=1),
-        delay=np.sum([site.dominance.alpha[:, j] * energy for j, energy in enumerate(in_transit)], axis=0),
+        delay=np.sum([a * x for a, x in zip(site.dominance.alpha.T, in_transit, strict=True)], axis=0),
     )
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
     """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,), J."""
-    stored: Array = 0.5 * ((view.now.squares - view.seen.squares) @ c.Kd)
-    return stored
+    return 0.5 * ((view.now.squares - view.seen.squares) @ c.Kd)
 
 
 class Increment(NamedTuple):
-    """An amount of energy per period, J: the two ends of a trapezoid, and a jump after it.
-
-    Attributes:
-        left: of the trapezoid rule, at the beginning, shape (K - 1,).
-        right: of the trapezoid rule, before the jump, shape (K - 1,).
-        jump: at the end, shape (K - 1,).
-    """
+    """An amount of energy per period, shape (K - 1,), J: the two ends of a trapezoid, and a jump after it."""
 
     left: Array
     right: Array
@@ -257,8 +227,7 @@ class Increment(NamedTuple):
     @property
     def total(self) -> Array:
         """The amount of every period, shape (K - 1,), J."""
-        total: Array = self.left + self.right + self.jump
-        return total
+        return self.left + self.right + self.jump
 
 
 def _trapezoid(site: SiteMotion, left: Array, right: Array, jump: Array | None = None) -> Increment:
@@ -317,13 +286,7 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h of a torque ON the arm.
-
-    Args:
-        site: the site.
-        now: torque that follows the present, shape (K, 2), N m.
-        held: torque that is held over the period, shape (K, 2), N m.
-    """
+    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held, (K, 2), N m."""
     left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
     return _trapezoid(site, left, (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
 
@@ -386,7 +349,7 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     power = np.zeros(len(at.known))
     if len(cut):
         r, ed = site.r[cut], (at.qd - at.qd_des)[cut]
-        law = np.einsum("kij,kj->ki", site.regressor(cut), at.theta_hat[cut]) - c.Kp * r - c.Kd * ed
+        law = _control_torque(c, site.regressor(cut), at.theta_hat[cut], r, ed)
         power[cut] = (r * (at.tau[cut] - law)).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
 
@@ -423,7 +386,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     """
     at, c, ends = site.records, site.constants, site.ends
     u = at.held_torque(c.tau_limit, digital=site.digital)
-    tau_right, Yr_right = _before_jump(site)
+    tau_right, Yr_right = _evaluate_before_jump(site)
     off_law = u - 0.5 * (at.tau[:-1] + tau_right)
     amount = at.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)
     off = (at.theta_hat - c.theta) * c.adapts
@@ -431,7 +394,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     return _jump(amount + 0.5 * at.h_s * ((off[1:] + off[:-1]) * missed).sum(axis=1))
 
 
-def _before_jump(site: SiteMotion) -> tuple[Array, Array]:
+def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     """Returns tau of Eq. (13) and Y'r at the end of every period, before its jump, K - 1 rows each."""
     at, c, ends = site.records, site.constants, site.ends
     tau, Yr = at.tau[1:].copy(), site.Yr[1:].copy()
@@ -441,9 +404,15 @@ def _before_jump(site: SiteMotion) -> tuple[Array, Array]:
     e, ed, r = e[rows], (qd - ends.qd_des_right)[rows], ends.r_right[rows]
     Y = regressor_rows(c.g, q[rows], qd[rows], -c.Lambda * e, -c.Lambda * ed)
     Yr[rows] = np.einsum("kij,ki->kj", Y, r)
-    law = np.einsum("kij,kj->ki", Y, at.theta_hat[1:][rows]) - c.Kp * r - c.Kd * ed
+    law = _control_torque(c, Y, at.theta_hat[1:][rows], r, ed)
     tau[rows] = np.clip(law, -c.tau_limit, c.tau_limit)
     return tau, Yr
+
+
+def _control_torque(c: SiteConstants, Y: Array, theta_hat: Array, r: Array, ed: Array) -> Array:
+    """Returns tau of Eq. (13), without its limit, shape (K, 2), N m."""
+    found: Array = np.einsum("kij,kj->ki", Y, theta_hat) - c.Kp * r - c.Kd * ed
+    return found
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:

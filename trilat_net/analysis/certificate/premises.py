@@ -26,10 +26,9 @@ MAX_LISTED_NAMES = 4
 
 
 class Premise(NamedTuple):
-    """One premise of the theorem.
+    """One premise of the theorem, by its key.
 
     Attributes:
-        name: its key.
         holds: True if it holds, False if it fails, None if the log does not decide it.
         text: the evidence.
     """
@@ -53,13 +52,7 @@ def check_scenario_premises(scenario: Scenario) -> list[Premise]:
 
 
 def check_run_premises(log: Log, energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> list[Premise]:
-    """Returns the premises that the run decides: dominance, delays, stale peers, limits, operators, gaps.
-
-    Args:
-        log: the log.
-        energies: of every site.
-        balance: of all sites.
-    """
+    """Returns the premises that the run decides: dominance, delays, stale peers, limits, operators, gaps."""
     return [
         _check_dominance(log, energies),
         _check_delays(energies),
@@ -92,9 +85,9 @@ def _check_gains(constants: Mapping[str, SiteConstants]) -> Premise:
         return Premise("Kd", False, text)
     if not Kd.all():
         return Premise("Kd", False, "some Kd is zero: the theorem asks for positive ones")
-    if np.ptp(scales) == 0.0:
-        return Premise("Kd", True, "one Kd for all sites")
-    return Premise("Kd", True, f"one Kd but for a scalar: {_per_site(constants, scales)}")
+    alike = np.ptp(scales) == 0.0
+    scalars = f"one Kd but for a scalar: {_per_site(constants, scales)}"
+    return Premise("Kd", True, "one Kd for all sites" if alike else scalars)
 
 
 def _check_dominance(log: Log, energies: Mapping[str, SiteEnergy]) -> Premise:
@@ -138,9 +131,8 @@ def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
                 constant.add(f"{1e3 * age_s[0]:.4g} ms")
     if varying:
         return Premise("delays", False, f"the age of the sample in use varies: {_list(varying)}")
-    if not constant:
-        return Premise("delays", None, "no sample came into use")
-    return Premise("delays", True, f"constant on every link: {', '.join(sorted(constant))}")
+    text = f"constant on every link: {', '.join(sorted(constant))}"
+    return Premise("delays", True, text) if constant else Premise("delays", None, "no sample came into use")
 
 
 def _check_following(log: Log) -> Premise:
@@ -201,8 +193,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
 
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above the least that it was until then, shape (T,)."""
-    rise: Array = values - np.minimum.accumulate(values)
-    return rise
+    return values - np.minimum.accumulate(values)
 
 
 def _list(words: list[str]) -> str:

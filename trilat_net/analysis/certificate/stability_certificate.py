@@ -6,15 +6,15 @@ a log cannot decide is stated: without a functional the end of the run alone dec
 their unit, and unknown values are null.
 """
 
-import math
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ..health import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import RunEnd, classify_log_end
 from .energy_balance import (
@@ -68,8 +68,7 @@ class FunctionalRise(NamedTuple):
     """The largest rise of V that operator and environment did not supply.
 
     Attributes:
-        from_s: when V was lowest before it, s.
-        at_s: when it was highest, s.
+        from_s, at_s: when V was lowest before it, and when it was highest, s.
         amount: its size, J.
         causes: the sources of more than 5 % of it and their work in between, J, largest first.
     """
@@ -81,11 +80,9 @@ class FunctionalRise(NamedTuple):
 
 
 class StabilityVerdict(NamedTuple):
-    """Verdict on V.
+    """Verdict on V: its class and the sentence.
 
     Attributes:
-        finding: the class.
-        text: the sentence.
         rise: the largest rise beyond the tolerance; None if V did not rise.
         tolerance: the size that a rise must exceed, J.
     """
@@ -120,7 +117,7 @@ class Certificate(NamedTuple):
     @property
     def ones_rise(self) -> FunctionalRise | None:
         """The largest rise of V with the paper's weights; None if it did not rise, or if they are right."""
-        return None if self.ones is None else find_largest_rise(self.ones, self.verdict.tolerance)
+        return None if self.ones is None else _find_largest_rise(self.ones, self.verdict.tolerance)
 
     @property
     def bounded_by_v(self) -> bool:
@@ -155,22 +152,24 @@ def certify(log: Log) -> Certificate:
         LogError: a record cannot be read, or names a change that is none.
     """
     premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
+
+    def without_functional(why: str) -> Certificate:
+        return Certificate(premises, _undecided(why), end, {}, None)
+
     if not premises[0].holds:
-        return Certificate(premises, make_undecided_verdict(premises[0].text), end, {}, None)
+        return without_functional(premises[0].text)
     energies = compute_site_energies(log)
     if not energies:
-        return Certificate(premises, make_undecided_verdict(NO_COMMON_TIME), end, {}, None)
+        return without_functional(NO_COMMON_TIME)
     balance = compute_energy_balance(energies)
     if not balance.judged.any():
-        return Certificate(premises, make_undecided_verdict(NO_PERIOD), end, {}, None)
+        return without_functional(NO_PERIOD)
     premises += check_run_premises(log, energies, balance)
     groups = _ambiguous_groups(energies)
     if groups:
-        ambiguous = make_undecided_verdict(describe_closed_groups(groups))
-        return Certificate(
-            premises, judge_balance(energies, balance) or ambiguous, end, energies, None, groups=groups
-        )
-    verdict = judge_stability(premises, energies, balance)
+        verdict = _judge_balance(energies, balance) or _undecided(describe_closed_groups(groups))
+        return Certificate(premises, verdict, end, energies, None, groups=groups)
+    verdict = _judge_stability(premises, energies, balance)
     ones = None if np.allclose(balance.beta, 1.0) else compute_energy_balance(energies, ones=True)
     return Certificate(premises, verdict, end, energies, balance, ones)
 
@@ -185,29 +184,22 @@ def _ambiguous_groups(energies: Mapping[str, SiteEnergy]) -> tuple[tuple[str, ..
     return ()
 
 
-def make_undecided_verdict(why: str) -> StabilityVerdict:
-    """Returns the verdict on a log without V."""
+def _undecided(why: str) -> StabilityVerdict:
     return StabilityVerdict(StabilityFinding.NOT_JUDGED, f"{StabilityFinding.NOT_JUDGED}: {why}")
 
 
-def judge_stability(
+def _judge_stability(
     premises: list[Premise], energies: Mapping[str, SiteEnergy], balance: EnergyBalance
 ) -> StabilityVerdict:
-    """Returns the verdict on sites that have functionals.
-
-    Args:
-        premises: of the theorem.
-        energies: of every site.
-        balance: of all of them.
-    """
+    """Returns the verdict on a group of sites that have functionals."""
     sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
     tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
-    broken = judge_balance(energies, balance)
+    broken = _judge_balance(energies, balance)
     if broken is None and tolerance > COARSE_TOLERANCE_SHARE * balance.scale + 2.0 * ZERO_ENERGY_J:
-        broken = make_undecided_verdict(f"{_TOO_COARSE} {tolerance:.3g} J of {balance.scale:.4g} J")
+        broken = _undecided(f"{_TOO_COARSE} {tolerance:.3g} J of {balance.scale:.4g} J")
     if broken is not None:
         return broken._replace(tolerance=tolerance)
-    rise = find_largest_rise(balance, tolerance)
+    rise = _find_largest_rise(balance, tolerance)
     failed = [premise.name for premise in premises if premise.holds is False]
     where = f"outside the theorem ({', '.join(failed)})"
     if rise is not None:
@@ -222,40 +214,38 @@ def judge_stability(
     return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}", None, tolerance)
 
 
-def judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> StabilityVerdict | None:
+def _judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> StabilityVerdict | None:
     """Returns the verdict if a site's balance does not close; None if all do. Each site counts by itself.
 
     An arm outside of the program need not follow its theta, nor are its angles and velocities measured at
     once; the records of any other are not what they claim, unless the period may be the cause.
     """
+
+    def allow(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
+        return share * balance.scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
+
     worst = {site: _largest(energy.unexplained) for site, energy in energies.items()}
-    wrong = [site for site in energies if worst[site] > _allowed_residual(energies[site], balance)]
+    wrong = [site for site in energies if worst[site] > allow(site)]
     outside = {site for site, energy in energies.items() if energy.motion.constants.outside}
     ours = [site for site in wrong if not outside & {site, *energies[site].followed}]
     site = max(ours or wrong, key=worst.__getitem__, default=None)
     if site is None:
         return None
     energy = energies[site]
-    above = np.abs(energy.unexplained) > _allowed_residual(energy, balance)
+    above = np.abs(energy.unexplained) > allow(site)
     at_s = energy.motion.records.t_s[int(np.argmax(above))]
     amount = f"{worst[site]:.3g} J of {balance.scale:.4g} J"
     text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
     if not ours:
         arms = ", ".join(name for name in energies if name in outside)
-        return make_undecided_verdict(f"{text}: the arm of {arms}, outside of the program, {_OUTSIDE}")
-    clear = worst[site] > _allowed_residual(energy, balance, CLEAR_BREAK_SHARE)
+        return _undecided(f"{text}: the arm of {arms}, outside of the program, {_OUTSIDE}")
+    clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
     certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * balance.scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
     return StabilityVerdict(StabilityFinding.BROKEN, f"{StabilityFinding.BROKEN}: {text}: {why}")
 
 
-def _allowed_residual(
-    energy: SiteEnergy, balance: EnergyBalance, share: float = BROKEN_BALANCE_SHARE
-) -> float:
-    return share * balance.scale + 2.0 * energy.uncertainty + ZERO_ENERGY_J
-
-
-def find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
+def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
     """Returns the largest rise of V that operator and environment did not supply, if above a tolerance, J."""
     V = balance.unsupplied
     rise = rise_above_minimum(V)
@@ -263,13 +253,12 @@ def find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRis
     if rise[last] <= tolerance:
         return None
     first = int(V[: last + 1].argmin())
+    inner = {name: x for name, x in balance.work.items() if name not in EXTERNAL_SOURCES}
     sources = {
-        **{("" if "->" in name else "the ") + name: x for name, x in balance.work.items()},
+        **{("" if "->" in name else "the ") + name: x for name, x in inner.items()},
         "sampling": balance.sampling,
         "what beta does not cancel": -balance.transfer,
     }
-    for name in EXTERNAL_SOURCES:
-        del sources[f"the {name}"]
     causes = {name: float(x[last] - x[first]) for name, x in sources.items()}
     ordered = sorted(causes.items(), key=lambda cause: -cause[1])
     notable = {name: amount for name, amount in ordered if amount > 0.05 * rise[last]}
@@ -291,12 +280,9 @@ def _describe_fall(balance: EnergyBalance) -> str:
     return f"V did not rise: {ends}"
 
 
-CertificateJson = dict[str, Any]
-
-
-def certificate_to_json(certificate: Certificate) -> CertificateJson:
+def certificate_to_json(certificate: Certificate) -> JsonObject:
     """Returns a certificate, ready for JSON."""
-    verdict, end = certificate.verdict, certificate.end
+    verdict, end, balance = certificate.verdict, certificate.end, certificate.balance
     return {
         "passed": certificate.passed,
         "verdict": verdict.finding.name.lower(),
@@ -308,19 +294,21 @@ def certificate_to_json(certificate: Certificate) -> CertificateJson:
         "growth": {
             "motion": end.behaviour.name.lower(),
             "text": end.text,
-            "error_rate_per_s": _known(end.error.rate_per_s),
-            "speed_rate_per_s": _known(end.speed.rate_per_s),
+            "error_rate_per_s": finite_or_none(end.error.rate_per_s),
+            "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
             "end_error_rad": end.end_error_rad,
             "end_speed_rad_s": end.end_speed_rad_s,
         },
-        "functional": None
-        if certificate.balance is None
-        else _functional_to_json(certificate, certificate.balance),
+        "functional": None if balance is None else _functional_to_json(certificate, balance),
     }
 
 
-def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> CertificateJson:
+def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
     V, sites, ones = balance.V, certificate.energies, certificate.ones
+    with_ones: JsonObject | None = None
+    if ones is not None:
+        with_ones = {"v_first_j": float(ones.V[0]), "v_max_j": float(ones.V.max())}
+        with_ones["rise"] = _rise_to_json(certificate.ones_rise)
     return {
         "beta_first": dict(zip(sites, balance.beta[0].tolist(), strict=True)),
         "beta_last": dict(zip(sites, balance.beta[-1].tolist(), strict=True)),
@@ -337,17 +325,11 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Cer
         "unexplained_max_j": _largest(balance.unexplained),
         "sites_unexplained_max_j": {site: _largest(energy.unexplained) for site, energy in sites.items()},
         "not_judged_s": find_unjudged_spans(balance),
-        "ones": None
-        if ones is None
-        else {
-            "v_first_j": float(ones.V[0]),
-            "v_max_j": float(ones.V.max()),
-            "rise": _rise_to_json(certificate.ones_rise),
-        },
+        "ones": with_ones,
     }
 
 
-def _rise_to_json(rise: FunctionalRise | None) -> CertificateJson | None:
+def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
     if rise is None:
         return None
     return {"from_s": rise.from_s, "at_s": rise.at_s, "amount_j": rise.amount, "causes_j": rise.causes}
@@ -359,7 +341,3 @@ def _last(columns: dict[str, Array]) -> dict[str, float]:
 
 def _largest(values: Array) -> float:
     return float(np.abs(values).max())
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value

@@ -1,14 +1,8 @@
 """Force sharing: the part of a torque at one site that an operator at another site feels, at rest.
 
-Invariant: at rest sum_i pi_i e_i = 0, whatever the delays, pi being the left Perron vector of the
-dominance matrix. With known gravity and a stiffness K_i that holds e_i (Kp Lambda of the paper's law, K
-of P+d and PD+d), the torques tau_i ON the arms obey, per joint,
-
-    sum_i (pi_i / K_i) tau_i = 0,
-
-and with two loaded sites the operator at i feels tau_s (pi_s / K_s) / (pi_i / K_i) of a torque at s: for
-equal gains tau_s beta_s / beta_i. If gravity is adapted the estimates take up the load and no ratio is
-expected.
+Invariant: the torques tau_i ON the arms obey sum_i (pi_i / K_i) tau_i = 0 per joint, pi being the left
+Perron vector of the dominance matrix and K_i what holds e_i; nothing is expected if gravity is adapted: the
+estimates take up the load. docs/metrics.md derives it.
 """
 
 from typing import NamedTuple
@@ -32,18 +26,13 @@ MIN_LOAD_SHARE = 0.02
 
 
 class SharingRatio(NamedTuple):
-    """Two loaded sites in a static window.
+    """Two loaded sites in a static window, from its first tick to its last; joints count from 1.
 
     Attributes:
-        from_s: the window's first tick, s.
-        to_s: its last, s.
-        joint: from 1.
-        pushed: the site of the torque.
-        pushed_nm: that torque, ON its arm, N m.
+        pushed, pushed_nm: the site of the torque, and that torque, ON its arm.
         by_wall: True if the environment makes most of it.
-        holds: the site of the operator that feels it.
-        felt_nm: the torque that this operator feels: the negative of its own ON its arm, N m.
-        expected_nm: the torque by the dominance factors, N m.
+        holds, felt_nm: the site of the operator that feels it, and what: the negative of its own ON its arm.
+        expected_nm: the torque by the dominance factors.
     """
 
     from_s: float
@@ -64,13 +53,10 @@ class SharingRatio(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """The torques of a joint in a static window, of all loaded sites.
+    """The torques of a joint, from 1, in a static window, of all loaded sites.
 
     Attributes:
-        from_s: the window's first tick, s.
-        to_s: its last, s.
-        joint: from 1.
-        torque_nm: per loaded site, ON its arm, N m.
+        torque_nm: per loaded site, ON its arm.
         weight: per loaded site pi_i / K_i, the largest of all sites 1.
         imbalance: |sum of weight times torque| / largest |weight times torque|.
     """
@@ -101,7 +87,7 @@ def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metr
     """Returns the number of static windows."""
     if absent:
         return Metric(None, f"no records of {', '.join(absent)}")
-    return metric(len(windows) or None, NO_STATIC_WINDOW_TEXT)
+    return metric(len(windows) or None, "no second in which all sites rest under torques that stand")
 
 
 def measure_force_sharing(
@@ -111,13 +97,9 @@ def measure_force_sharing(
     offs = [pair.off for pair in pairs if pair.off is not None]
     if offs:
         return {"sharing_off": metric(max(offs))}
-    whys = dict.fromkeys(pair.expected_nm.why for pair in pairs)
-    none = count_static_windows(absent, windows)
-    unloaded = "no two sites are loaded in a window at rest"
-    return {"sharing_off": Metric(None, none.why or "; ".join(whys) or unloaded, applies=bool(absent))}
-
-
-NO_STATIC_WINDOW_TEXT = "no second in which all sites rest under torques that stand"
+    whys = "; ".join(dict.fromkeys(pair.expected_nm.why for pair in pairs))
+    why = count_static_windows(absent, windows).why or whys or "no two sites are loaded in a window at rest"
+    return {"sharing_off": Metric(None, why, applies=bool(absent))}
 
 
 def _weigh_load(
@@ -130,9 +112,8 @@ def _weigh_load(
     weight = dict(zip(window.torque, column.tolist(), strict=True))
     moments = [weight[site] * value for site, value in torque.items()]
     largest = max(map(abs, moments))
-    imbalance = metric(
-        abs(sum(moments)) / largest if largest > 0.0 else None, "nobody who is followed is loaded"
-    )
+    share = abs(sum(moments)) / largest if largest > 0.0 else None
+    imbalance = metric(share, "nobody who is followed is loaded")
     shown = {site: metric(weight[site]) for site in torque}
     return JointLoad(window.from_s, window.to_s, joint + 1, torque, shown, imbalance)
 
@@ -151,30 +132,24 @@ def find_sharing_ratios(
             pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
             torque = load.torque_nm[pushed]
             by_wall = abs(float(at[load.from_s].environment[pushed][load.joint - 1])) > 0.5 * abs(torque)
-            expected = _expected_torque(load, pushed, holds)
+            one, other = load.weight[pushed], load.weight[holds]
+            if one.value is None or other.value is None:
+                expected = Metric(None, one.why)
+            elif other.value == 0.0:
+                expected = Metric(None, f"nobody ends up following {holds}")
+            else:
+                expected = metric(torque * one.value / other.value)
             felt = -load.torque_nm[holds]
             pairs.append(SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected))
     return pairs
 
 
-def _expected_torque(load: JointLoad, pushed: str, holds: str) -> Metric:
-    one, other = load.weight[pushed], load.weight[holds]
-    if one.value is None or other.value is None:
-        return Metric(None, one.why)
-    if other.value == 0.0:
-        return Metric(None, f"nobody ends up following {holds}")
-    return metric(load.torque_nm[pushed] * one.value / other.value)
-
-
 def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
     """Returns a sort key of the site that feels: a spring is active there and no wall; it is a master."""
     spec = scenario.sites[site]
-    springs = any(
-        hand.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND)
-        and hand.actor.start_s <= at_s < hand.actor.end_s
-        for hand in spec.hands
-    )
-    return springs and not spec.environment, spec.role == "master"
+    springs = (one.actor for one in spec.hands if one.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND))
+    held = any(spring.start_s <= at_s < spring.end_s for spring in springs)
+    return held and not spec.environment, spec.role == "master"
 
 
 def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:

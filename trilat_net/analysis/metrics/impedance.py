@@ -5,13 +5,8 @@ spectral line with the strongest drive, if at least `MIN_SEGMENTS` independent s
 signals have a coherence of at least `MIN_COHERENCE` with the drive: then its random error is below 17 %.
 
 In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its own that
-depends on nothing else: H = S_dy / S_dx, which is H1 if the input is the drive. An impedance is driven by
-the operator's script (torque over velocity alone would be the operator's own impedance if anything else
-moves the arm); a reflection is driven by the wall while every operator holds still.
-
-Spectra: Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans. Audio
-and Electroacoustics 15 (1967). Coherence and random error: Bendat and Piersol, "Random Data" (2010),
-chapters 6 and 9. Estimate: Soderstrom and Stoica, "System Identification" (1989), chapter 10.
+depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources (Welch; Bendat and Piersol;
+Soderstrom and Stoica).
 """
 
 import math
@@ -49,9 +44,8 @@ class FrequencyResponse(NamedTuple):
     """Output over input at one frequency; undecided values are None.
 
     Attributes:
-        frequency_hz: the line with the strongest drive, Hz.
-        gain: amplitude of the ratio, in the unit of output over input.
-        phase_rad: its phase.
+        frequency_hz: the line with the strongest drive.
+        gain, phase_rad: of the ratio, in the unit of output over input.
         coherence: the smaller of both signals' coherences with the drive.
         segments: number of segments of equal power that would drive the line as much as all of them do.
         error: random error of the gain, one standard deviation as a share of it.
@@ -84,14 +78,9 @@ class ResponseSignals(NamedTuple):
 
 
 def estimate_response(signals: ResponseSignals, rate_hz: int, least: float) -> FrequencyResponse:
-    """Returns the ratio of two signals at the line with the strongest drive.
+    """Returns the ratio of two signals at the line with the strongest drive, if that is `least` or larger.
 
     Own code in place of `scipy.signal.csd`, which cannot leave out segments with unusable rows.
-
-    Args:
-        signals: the signals.
-        rate_hz: rows per second.
-        least: amplitude below which nothing drives.
     """
     length = round(SEGMENT_S * rate_hz)
     starts = _segment_starts(signals.usable, length)
@@ -116,8 +105,9 @@ def _estimate_at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -
         return FrequencyResponse(frequency_hz, segments=segments, why=f"{why}{MIN_SEGMENTS:g} are needed")
     coherence = min(_coherence(D, X), _coherence(D, Y))
     if coherence < MIN_COHERENCE:
-        measured = f"the coherence at {frequency_hz:g} Hz is {coherence:.2f}"
-        why = f"undecided: {measured}, {MIN_COHERENCE:g} is needed"
+        why = (
+            f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, {MIN_COHERENCE:g} is needed"
+        )
         return FrequencyResponse(frequency_hz, coherence=coherence, segments=segments, why=why)
     H = np.vdot(D, Y) / np.vdot(D, X)
     noise = sum(1.0 / _coherence(D, one) - 1.0 for one in (X, Y))
@@ -155,16 +145,13 @@ def _spectra(signal: Array, starts: list[int], length: int) -> Complex:
 
 
 class ImpedanceEstimate(NamedTuple):
-    """An impedance or a reflection over frequency.
+    """An impedance or a reflection over frequency, of a joint, from 1.
 
     Attributes:
         kind: "impedance": torque of an operator ON its arm over the velocity of the joint: of its site and of
             all behind it, N m s/rad. "reflection": torque that an operator feels over the one of the
             environment ON another arm.
-        at: the site of the operator.
-        of: of a reflection the site of the environment, else "".
-        joint: from 1.
-        ratio: the response.
+        at, of: the site of the operator, and of a reflection that of the environment, else "".
     """
 
     kind: str
@@ -182,12 +169,7 @@ class ImpedanceEstimate(NamedTuple):
 def estimate_impedances(
     aligned: Mapping[str, AlignedRecords], torques: Mapping[str, TorqueSplit]
 ) -> list[ImpedanceEstimate]:
-    """Returns the impedance at every operator, and its reflection of every environment elsewhere.
-
-    Args:
-        aligned: the sites' records.
-        torques: ON their arms.
-    """
+    """Returns the impedance at every operator, and its reflection of every environment elsewhere."""
     operators = [site for site in aligned if torques[site].operator.any()]
     walls = [site for site in aligned if torques[site].environment.any()]
     pairs = [(site, "") for site in operators]

@@ -74,10 +74,7 @@ class LogMetrics(NamedTuple):
     """All metrics of a log.
 
     Attributes:
-        run: of the whole, by key.
-        sites: per site.
-        links: per link "j->i".
-        walls: per wall "s/1": a site, and the number of its wall.
+        run, sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first of s).
         estimates: per site with records, its parameter estimates.
         static_windows: their number.
         joint_loads: the loaded joints in them, with the torques of all loaded sites.
@@ -257,12 +254,7 @@ def _values(metrics: MetricValues) -> dict[str, float | None]:
 
 
 class ComparisonRow(NamedTuple):
-    """A quantity of every run.
-
-    Attributes:
-        quantity: its entry in the catalogue.
-        entries: the metric of each column.
-    """
+    """A quantity of every run, by its entry in the catalogue and the metric of each column."""
 
     quantity: Quantity
     entries: tuple[Metric, ...]
@@ -286,33 +278,19 @@ class MetricComparison(NamedTuple):
 
     def row(self, key: str) -> ComparisonRow:
         """Returns a quantity's row by its key; KeyError without one."""
-        for row in self.rows:
-            if row.quantity.key == key:
-                return row
-        raise KeyError(key)
+        return {row.quantity.key: row for row in self.rows}[key]
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Returns logs side by side.
-
-    Args:
-        logs: the logs; torn, short and empty ones too.
-        names: of the columns; by default those of the logs' files.
+    """Returns logs side by side, torn, short and empty ones too; columns bear their files' names by default.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    columns = tuple(names) or tuple(Path(log.source).stem for log in logs)
-    return tabulate_metrics([compute_log_metrics(log) for log in logs], columns)
-
-
-def tabulate_metrics(measured: Sequence[LogMetrics], names: Sequence[str]) -> MetricComparison:
-    """Returns the metrics of runs side by side, by the names of the columns."""
-    rows = [
-        ComparisonRow(quantity, tuple(one.whole(quantity) for one in measured)) for quantity in QUANTITIES
-    ]
+    measured = [compute_log_metrics(log) for log in logs]
+    rows = [ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured)) for one in QUANTITIES]
     kept = tuple(row for row in rows if any(entry.applies for entry in row.entries))
-    return MetricComparison(tuple(names), kept)
+    return MetricComparison(tuple(names) or tuple(Path(log.source).stem for log in logs), kept)
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:

@@ -18,14 +18,13 @@ ESTIMATE_END_S = 5.0
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of a site.
+    """Estimates of a site, shape (5,) each.
 
     Attributes:
         learnt: True for each that the law adapts.
         theta: the true parameters; None if unknown.
-        first: the estimates of the first record, shape (5,).
-        last: of the last one, shape (5,).
-        slope_per_s: of straight lines through the last 5 s, shape (5,), 1/s; None with less than two records.
+        first, last: the estimates of the first and the last record.
+        slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two records.
     """
 
     learnt: list[bool]

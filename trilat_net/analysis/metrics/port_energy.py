@@ -1,22 +1,12 @@
-"""Energies of a site's ports.
-
-The energy stored in its arm, and the energy that the delay of each link injects.
+"""Energies of a site's ports, of its arm, and the energy that the delay of each link injects.
 
 Invariant: the work of a torque is int tau' dq: tau_k' (q_k+1 - q_k), exactly, for one held over a period;
 the trapezoid rule over dq for one that follows the state, which is exact for springs. The running energy
-of a port is that of a passivity observer: Hannaford and Ryu, "Time-domain passivity control of haptic
-interfaces", IEEE Trans. Robotics and Automation 18 (2002).
+of a port is that of a passivity observer (Hannaford and Ryu 2002).
 
-The control torque is affine in a peer's motion: the torque of the same law without delay, at this state
-and estimate, plus one term per link,
-
-    E_ij = int qd_i' dtau_ij dt,   dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ),
-
-p_j being what the link carries (q_j, qd_j, for direct force reflection the torque) and S_i the law's
-gain. The sum over links is exactly what delays add to the energy of the controller's port. For P+d it is
-the term that damping must dominate, K int qd_i' (q_j(t - T) - q_j(t)) dt: Nuno, Basanez, Ortega and
-Spong, "Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics
-Research 28 (2009). It assumes nothing about the peers and does not predict the run without delay.
+The control torque is affine in a peer's motion: that of the same law without delay, at this state and
+estimate, plus one term per link, E_ij = int qd_i' dtau_ij dt, dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ), p_j
+being what the link carries and S_i the law's gain; docs/metrics.md has it for each law, and the sources.
 """
 
 from collections.abc import Mapping
@@ -36,12 +26,7 @@ from .parameter_error import has_known_theta
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is held over every period, shape (K - 1,), J.
-
-    Args:
-        torque: of every period, shape (K - 1, 2) or more rows, N m.
-        q: joint angles, shape (K, 2), rad.
-    """
+    """Returns the work of a torque held over every period, shape (K - 1, 2) or more, N m, per period, J."""
     work: Array = np.einsum("kj,kj->k", torque[: len(q) - 1], np.diff(q, axis=0))
     return work
 
@@ -58,8 +43,7 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     """
     spec = scenario.sites[records.site]
     if spec.plant == "external":
-        mean: Array = 0.5 * (records.tau[:-1] + records.tau[1:])
-        return mean
+        return 0.5 * (records.tau[:-1] + records.tau[1:])
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
     return records.held_torque(spec.limits.tau_limit_nm, digital=digital)
 
@@ -77,13 +61,7 @@ def mechanical_energy(spec: SiteSpec, records: AlignedRecords) -> Array:
 
 
 def measure_port_energy(scenario: Scenario, records: AlignedRecords, torque: TorqueSplit) -> MetricValues:
-    """Returns the energies of a site's ports, over the periods with both ends recorded.
-
-    Args:
-        scenario: the experiment.
-        records: of the site.
-        torque: ON its arm.
-    """
+    """Returns the energies of a site's ports, over the periods with both ends recorded."""
     spec, known, q = scenario.sites[records.site], records.known_periods, records.q
     if not known.any():
         return unavailable(ENERGY, "no two records in a row", of="site")
@@ -134,7 +112,7 @@ def measure_delay_energy(
     records, other = aligned[site], aligned[peer]
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
-    view = view_delayed_peer(records, other, PeerTrajectory(other))
+    view = view_delayed_peer(records, PeerTrajectory(other))
     known = view.seen.known & view.now.known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():

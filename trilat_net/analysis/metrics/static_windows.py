@@ -1,14 +1,7 @@
 """Static windows of a run, with all arms at rest under constant torques, and the stiffness between two.
 
-Invariant: a window is the last second of an interval in which no joint of any site moves faster than
-`STATIC_SPEED_RAD_S`, no operator's script moves, every site follows its peers with constant dominance
-factors, and every tick is recorded; within it no torque varies by more than `MAX_TORQUE_VARIATION` of the
-largest one.
-
-A rendered stiffness is the change of a joint's torque over the change of its angle from one window to the
-next, if only that operator moved and no dominance factor changed: otherwise the ratio is the operator's
-own. Walls and operators at rest contribute to it. It is a secant along the path taken: the other joint
-moves as well.
+Invariant: docs/metrics.md defines both. A stiffness is the operator's own, and is not given, if anything but
+that operator changed. It is a secant along the path taken: the other joint moves as well.
 """
 
 from collections.abc import Mapping
@@ -42,15 +35,12 @@ STILL_SCRIPT_NM = 1e-6
 
 
 class StaticWindow(NamedTuple):
-    """A static window; means over it.
+    """A static window, from its first tick to its last; per site means over it, shape (2,).
 
     Attributes:
-        from_s: its first tick, s.
-        to_s: its last tick, s.
-        torque: per site of operator and environment ON the arm, shape (2,), N m.
-        environment: per site of the environment alone, shape (2,), N m.
-        script: per site the operator's script, shape (2,), N m; None if unknown.
-        q: per site the joint angles, shape (2,), rad.
+        torque, environment: of operator and environment ON the arm, and of the environment alone, N m.
+        script: the operator's script, N m; None if unknown.
+        q: the joint angles, rad.
         alpha: the dominance matrix, shape (N, N).
     """
 
@@ -68,13 +58,7 @@ def find_static_windows(
     torques: Mapping[str, TorqueSplit],
     dominance: Mapping[str, DominanceHistory],
 ) -> list[StaticWindow]:
-    """Returns the static windows, in order.
-
-    Args:
-        aligned: the records of every site, in scenario order.
-        torques: ON their arms.
-        dominance: their factors for their peers.
-    """
+    """Returns the static windows of all sites, in order."""
     first = next(iter(aligned.values()))
     rows, still = {}, first.known.copy()
     for site, records in aligned.items():
@@ -130,16 +114,11 @@ def _static_window(
 
 
 class StiffnessEstimate(NamedTuple):
-    """Stiffness that an operator met from one static window to the next.
+    """Stiffness that an operator met at a joint, from 1, between the ends of two static windows in a row.
 
     Attributes:
-        from_s: the end of the first window, s.
-        to_s: the end of the second one, s.
-        site: of the operator.
-        joint: from 1.
-        torque_nm: change of the operator's torque ON its arm, N m.
-        angle_rad: change of the joint's angle, rad.
-        stiffness_nm_rad: their ratio, N m/rad; None if the joint did not move: too stiff to measure.
+        torque_nm, angle_rad: change of the operator's torque ON its arm, and of the joint's angle.
+        stiffness_nm_rad: their ratio; None if the joint did not move: too stiff to measure.
     """
 
     from_s: float
@@ -165,9 +144,8 @@ def estimate_stiffness(windows: list[StaticWindow]) -> list[StiffnessEstimate]:
             torque, angle = float(torques[joint]), float(angles[joint])
             if abs(torque) >= MIN_TORQUE_CHANGE_NM:
                 K = torque / angle if abs(angle) >= MIN_ANGLE_CHANGE_RAD else None
-                estimates.append(
-                    StiffnessEstimate(before.to_s, after.to_s, site, joint + 1, torque, angle, K)
-                )
+                found = StiffnessEstimate(before.to_s, after.to_s, site, joint + 1, torque, angle, K)
+                estimates.append(found)
     return estimates
 
 

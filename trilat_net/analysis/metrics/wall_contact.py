@@ -20,13 +20,11 @@ CONTACT_END_S = 5.0
 
 
 class WallContact(NamedTuple):
-    """Contact of an end effector with a wall, over the recorded ticks.
+    """Contact of an end effector with a wall, over the K recorded ticks.
 
     Attributes:
-        t_s: shape (K,), s.
-        force: along its normal, shape (K,), N.
-        depth: of the end effector in it, shape (K,), m.
-        began: True if the force began at that tick, shape (K,).
+        force, depth: along its normal, N, and m.
+        began: True if the force began at that tick.
     """
 
     t_s: Array
