@@ -21,10 +21,10 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import EventPublisher, new_boot
+from trilat_net.net.membership import Epoch, EventPublisher, new_boot
 from trilat_net.net.messages import Info
 from trilat_net.net.pinging import describe_clocks
-from trilat_net.net.session import Epoch, SessionJoin
+from trilat_net.net.session import SessionJoin
 from trilat_net.process import Interrupt
 from trilat_net.scenario import parse_embedded
 
@@ -64,7 +64,7 @@ class Recorder:
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._queue.take)
-        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._presence = bus.presence(topics.presence_key(session, "*"))
         info = Info(
             member=topics.RECORDER,
             boot=boot,

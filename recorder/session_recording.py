@@ -14,9 +14,8 @@ from trilat_net.log.accounting import Account
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import EventPublisher
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
-from trilat_net.net.session import Epoch
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario
 

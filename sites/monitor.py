@@ -11,12 +11,10 @@ from rich.live import Live
 from rich.table import Table
 
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.membership import read_events
+from trilat_net.net.membership import read_events, read_messages
 from trilat_net.net.messages import LinkStats
-from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 
 
@@ -37,11 +35,7 @@ class SessionMonitor:
 
     def poll(self) -> None:
         """Takes the messages that have arrived."""
-        while (message := self._links.poll()) is not None:
-            try:
-                stats = decode(message[1], LinkStats)
-            except WireError:
-                continue  # the sites and the recorder count strangers
+        for stats in read_messages(self._links, LinkStats):
             if stats.site in self._sites:
                 self.latest[stats.site] = stats
         for event in read_events(self._events):

@@ -26,7 +26,7 @@ class PeerMonitor:
         self._site = site
         self._events = {peer: bus.inbox(topics.key(session, peer, topics.EVENT), 256) for peer in peers}
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
-        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._presence = bus.presence(topics.presence_key(session, "*"))
         self._boots: Mapping[str, int] = {}
         self._ended: set[str] = set()
 
@@ -35,12 +35,7 @@ class PeerMonitor:
         self._boots = boots
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Takes events and presence; publishes who is back, and who is lost without an end event.
-
-        Args:
-            publisher: the site's own events.
-            t_ns: nominal time, ns since the epoch.
-        """
+        """Takes events and presence; publishes who is back, and who is lost without an end event."""
         for peer, inbox in self._events.items():
             for event in read_events(inbox):
                 if event.boot != self._boots.get(peer):
@@ -49,10 +44,7 @@ class PeerMonitor:
                     self.ended_by = event.text
                 elif event.kind == "end":
                     self._ended.add(peer)
-        while (change := self._presence.poll()) is not None:
-            parts, alive = topics.parse_key(change[0]), change[1]
-            if parts is None:
-                continue
+        for parts, alive in topics.read_presence(self._presence):
             known = str(self._boots.get(parts.member)) == parts.boot
             if parts.member == topics.RECORDER:
                 (self.recorders.add if alive else self.recorders.discard)(parts.boot)
@@ -64,11 +56,7 @@ class PeerMonitor:
                 publisher.publish("lost", f"{parts.member} is gone", about=parts.member, t_ns=t_ns)
 
     def read_stored(self, ticks: int) -> bool:
-        """Takes the recorders' events; True if one has just stored all messages of this site.
-
-        Args:
-            ticks: number of the site's ticks.
-        """
+        """Takes the recorders' events; True if one has just stored all `ticks` of this site."""
         before = len(self.stored)
         for event in read_events(self._recorder_events):
             if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:

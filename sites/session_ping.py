@@ -7,17 +7,16 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from trilat_net.errors import RunFailed, ScenarioError, SessionError, WireError
+from trilat_net.errors import RunFailed, ScenarioError, SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection, default_endpoint
 from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import MemberQuery
+from trilat_net.net.membership import MemberQuery, read_messages
 from trilat_net.net.messages import Info, LinkStats
 from trilat_net.net.offset import OffsetEstimate, exact_offset
 from trilat_net.net.pinging import PING_PACE_NS, Pinger
-from trilat_net.net.wire import decode
 from trilat_net.scenario import parse_embedded
 
 POLL_NS = 1_000_000
@@ -45,13 +44,7 @@ class PingResult:
 
 
 class SessionPing:
-    """One measurement of a session; call `poll` until `over`.
-
-    Args:
-        bus: a connection to its members.
-        clock: the time.
-        session: the session's name.
-        count: number of round trips to each member.
+    """One measurement of a session, of `count` round trips to each member; call `poll` until `over`.
 
     Attributes:
         infos: identities of the members that answered, by name.
@@ -72,14 +65,11 @@ class SessionPing:
         for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
-        while (message := self._stats.poll()) is not None:
-            try:
-                stats = decode(message[1], LinkStats)
-            except WireError:
-                continue
+        for stats in read_messages(self._stats, LinkStats):
             self.links[stats.site] = stats
-        self.pinger.poll(self._boots())
+        self.pinger.poll(self._boots)
 
+    @property
     def _boots(self) -> set[int]:
         return {info.boot for info in self.infos.values()}
 
@@ -90,7 +80,7 @@ class SessionPing:
             return now_ns - begun_ns > timeout_ns
         passed_ns = now_ns - self._first_ns
         enough_ns = GATHER_NS + self._count * PING_PACE_NS + PATIENCE_NS
-        return passed_ns > GATHER_NS and (self.pinger.know(self._boots()) or passed_ns > enough_ns)
+        return passed_ns > GATHER_NS and (self.pinger.know(self._boots) or passed_ns > enough_ns)
 
     def reached(self) -> list[PingResult]:
         """Returns the measurements in the order of the members' names."""
@@ -113,15 +103,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> SessionPing | None:
-    """Measures a session once; None if `stopped`.
-
-    Args:
-        connection: how to reach it, see `connect_to_session`.
-        clock: the time.
-        session: its name.
-        count: number of round trips to each member.
-        timeout_s: how long to wait for the first answer, s.
-        stopped: True once the client should end.
+    """Measures a session once; None if `stopped`. It waits for the first answer for `timeout_s`.
 
     Raises:
         RunFailed: no member answered.

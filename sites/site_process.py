@@ -15,10 +15,10 @@ from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
-from trilat_net.net.membership import EventPublisher
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Info
 from trilat_net.net.pinging import Pinger, describe_clocks
-from trilat_net.net.session import Epoch, SessionJoin
+from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
@@ -191,7 +191,7 @@ class RunningSite:
 
     def _publish_clocks(self, notices: Iterable[ClockNotice], t_ns: int) -> None:
         for notice in notices:
-            self._publisher.publish(notice.kind, notice.text, t_ns=t_ns, **notice.facts)
+            self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
         """See `LoopIO`."""

@@ -150,7 +150,7 @@ class SiteStandIns:
         self._clock, self._header, self._history = clock, header, history
         self._stored: dict[str, set[str]] = {}
         self._met: set[str] = set()
-        self._presence = bus.presence(topics.key(session, topics.RECORDER, topics.ALIVE) + "/*")
+        self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         self._recorder_query = RepeatedQuery(bus, clock, topics.key(session, topics.RECORDER, topics.INFO))
         self._sites = {

@@ -9,9 +9,9 @@ from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import Clock, ManualClock
-from trilat_net.net.membership import EventPublisher
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.session import Epoch, SessionJoin
+from trilat_net.net.session import SessionJoin
 from trilat_net.net.wire import decode
 
 SESSION = "t"

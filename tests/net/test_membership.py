@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import ManualClock
-from trilat_net.net.membership import LATE_GATHER_NS
-from trilat_net.net.session import Epoch
+from trilat_net.net.membership import LATE_GATHER_NS, Epoch
 
 from .parties import STEP_NS, Party
 

@@ -164,7 +164,7 @@ def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
 
 
 def test_a_clock_that_steps_meanwhile_is_not_known_until_enough_agree_again() -> None:
-    trips = RoundTrips(pong(), PINGS)
+    trips = RoundTrips(PINGS)
     for n in range(PINGS):
         trips.take(n * STEP_NS, pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50), n * STEP_NS + 100)
     assert trips.known

@@ -17,10 +17,9 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Inbox, LocalNetwork
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.loop_stats import LoopStats
-from trilat_net.net.membership import EventPublisher, read_events
+from trilat_net.net.membership import Epoch, EventPublisher, read_events
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.requests import Backfill, BackfillRequest
-from trilat_net.net.session import Epoch
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
 

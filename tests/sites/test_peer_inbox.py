@@ -14,8 +14,8 @@ from trilat_net.core.ticks import MAX_ARRIVALS
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import VERSION
-from trilat_net.net.offset import SlewedOffset, exact_offset
-from trilat_net.net.timing import LinkTimingMonitor, SentStamps
+from trilat_net.net.offset import exact_offset
+from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SentStamps
 from trilat_net.net.wire import MAX_BYTES
 
 PEERS = ("m2", "s")
@@ -51,7 +51,8 @@ class Desk:
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
         self.meters = [
-            LinkTimingMonitor(EPOCH_NS, 0, SentStamps(), SlewedOffset(exact_offset(0)), None) for _ in PEERS
+            LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
+            for name in PEERS
         ]
         self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped)
 
@@ -86,7 +87,7 @@ def test_what_comes_before_it_was_sent_is_counted_and_used() -> None:
     desk.send[0](payload(0, 0, sent_ns=5_000_001))
     desk.send[0](payload(1, 0, sent_ns=4_000_000))
     assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [(0, -1), (1, 1000)]
-    assert [meter.figures().faults for meter in desk.meters] == [1, 0]
+    assert [meter.faults for meter in desk.meters] == [1, 0]
     assert desk.meters[0].worst_ns == 1
     assert not desk.dropped
 

@@ -32,12 +32,6 @@ FRESH_NS = 100_000_000
 class ArmPort:
     """The connection of an arm to its site; a context, which closes it.
 
-    Args:
-        bus: a connection that reaches the site.
-        clock: the time.
-        session: the session's name.
-        site: the site of the arm.
-
     Attributes:
         record: the newest record of the site, None before the first.
     """
@@ -52,7 +46,7 @@ class ArmPort:
         self._publish = bus.publisher(topics.key(session, site, topics.MEASURED))
         self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, 64)
         self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
-        self._presence = bus.presence(topics.key(session, site, topics.ALIVE) + "/*")
+        self._presence = bus.presence(topics.presence_key(session, site))
 
     @classmethod
     def connected(cls, session: str, site: str, connect: Sequence[str]) -> "ArmPort":
@@ -77,12 +71,7 @@ class ArmPort:
         self._bus.close()
 
     def send(self, q: Sequence[float], qd: Sequence[float]) -> None:
-        """Sends the position of the arm.
-
-        Args:
-            q: joint angles, rad.
-            qd: joint velocities, rad/s.
-        """
+        """Sends the position of the arm: joint angles, rad, and joint velocities, rad/s."""
         message = ArmMeasurement(
             site=self._site,
             boot=self._boot,
@@ -124,6 +113,6 @@ class ArmPort:
         for event in read_events(self._events):
             if event.kind == "end" and self.record is not None and event.boot == self.record.boot:
                 self._gone = True
-        while (change := self._presence.poll()) is not None:
-            self._present = self._present or change[1]
-            self._gone = self._gone or (self._present and not change[1])
+        for _, alive in topics.read_presence(self._presence):
+            self._present = self._present or alive
+            self._gone = self._gone or (self._present and not alive)

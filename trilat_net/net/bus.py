@@ -13,38 +13,34 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
 """Capacity of a ring in messages: sixteen seconds of one peer at 1 kHz."""
 
-
 T = TypeVar("T")
+Polled = TypeVar("Polled", covariant=True)
 
 
-class Inbox(Protocol):
-    """A bounded ring of messages."""
+class PolledRing(Protocol[Polled]):
+    """A bounded ring of what has arrived."""
 
-    def poll(self) -> tuple[str, bytes] | None:
-        """Returns the oldest message (key, payload), or None; never waits."""
+    def poll(self) -> Polled | None:
+        """Returns the oldest entry, or None; never waits."""
 
 
-class StampedInbox(Protocol):
-    """A bounded ring of messages with the instants of their arrival."""
+Inbox = PolledRing[tuple[str, bytes]]
+"""Messages: (key, payload)."""
+PresenceInbox = PolledRing[tuple[str, bool]]
+"""Liveliness changes: (key, whether it is alive now)."""
+
+
+class StampedInbox(PolledRing[tuple[bytes, int]], Protocol):
+    """Messages with the instants of their arrival: (payload, ns)."""
 
     @property
     def overflowed(self) -> int:
         """Number of messages that the full ring has dropped, oldest first."""
-
-    def poll(self) -> tuple[bytes, int] | None:
-        """Returns the oldest message (payload, instant of its arrival in ns), or None; never waits."""
-
-
-class PresenceInbox(Protocol):
-    """A bounded ring of liveliness changes."""
-
-    def poll(self) -> tuple[str, bool] | None:
-        """Returns the oldest change (key, whether it is alive now), or None; never waits."""
 
 
 class Query(Protocol):
@@ -58,11 +54,7 @@ class Query(Protocol):
         """Answers it."""
 
 
-class QueryInbox(Protocol):
-    """A bounded ring of queries."""
-
-    def poll(self) -> Query | None:
-        """Returns the oldest query, or None; never waits."""
+QueryInbox = PolledRing[Query]
 
 
 class Bus(Protocol):
@@ -168,17 +160,15 @@ class StampingRing:
             return None
 
 
-class _LocalQuery:
+class _LocalQuery(NamedTuple):
     """A query inside one process."""
 
-    def __init__(self, key: str, payload: bytes, replies: _Ring[tuple[str, bytes]]) -> None:
-        self.payload = payload
-        self._key = key
-        self._replies = replies
+    key: str
+    payload: bytes
+    replies: _Ring[tuple[str, bytes]]
 
     def answer(self, payload: bytes) -> None:
-        """See `Query`."""
-        self._replies.put((self._key, payload))
+        self.replies.put((self.key, payload))
 
 
 class LocalNetwork:

@@ -11,6 +11,7 @@ import re
 import socket
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,29 +39,25 @@ def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
 def choose_session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
     """Returns endpoints for the sites of a session: the defaults, or free ones if a port is taken."""
     default = list(default_endpoints(session, sites).values())
-    return default if all(map(_is_free, default)) else find_free_endpoints(len(sites))
-
-
-def _is_free(endpoint: str) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
-        except OSError:
-            return False
-    return True
+    try:
+        return _bind_for_a_moment([int(endpoint.rpartition(":")[2]) for endpoint in default])
+    except OSError:
+        return find_free_endpoints(len(sites))
 
 
 def find_free_endpoints(count: int) -> list[str]:
     """Returns loopback endpoints whose ports are free now."""
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for probe in sockets:
-            probe.bind(("127.0.0.1", 0))
+    return _bind_for_a_moment([0] * count)
+
+
+def _bind_for_a_moment(ports: Sequence[int]) -> list[str]:
+    """Returns loopback endpoints that were bound just now; port 0 stands for any. Raises OSError."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in ports]
+        for probe, port in zip(sockets, ports, strict=True):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(port > 0))
+            probe.bind(("127.0.0.1", port))
         return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
-    finally:
-        for probe in sockets:
-            probe.close()
 
 
 RETRY_NS = 200_000_000
@@ -100,15 +97,7 @@ def resolve_member_connection(
     """Returns the connection of a site, a recorder or a tool.
 
     With a router, named by `--router` or by a file of mode "client", a member listens nowhere and connects to
-    nothing else.
-
-    Args:
-        listen: `--listen`.
-        connect: `--connect`.
-        routers: `--router`; the first that answers counts.
-        file: `--zenoh-config`.
-        listen_else: default of `listen`.
-        connect_else: default of `connect`.
+    nothing else. `listen_else` and `connect_else` hold where neither an option nor the file names endpoints.
 
     Raises:
         UsageError: options and file contradict each other.
@@ -117,12 +106,7 @@ def resolve_member_connection(
     if file.mode == "router":
         raise UsageError(f"{file.source}: mode: router is for `trilat router`; here it is peer or client")
     if not routers and file.mode != "client":
-        return Connection(
-            _choose_listen(listen, file, "peer", listen_else),
-            _merge_endpoints(connect, file, "peer", connect_else),
-            "peer",
-            file.settings,
-        )
+        return _join_options(listen, connect, file, "peer", listen_else, connect_else)
     where = "--router" if routers else f"{file.source}: mode: client"
     if routers and file.mode == "peer":
         raise UsageError(f"{file.source}: mode: peer contradicts --router, which makes a client")
@@ -155,23 +139,23 @@ def resolve_router_connection(
     file = file or ZenohFile("")
     if file.mode not in ("", "router"):
         raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
-    return Connection(
-        _choose_listen(listen, file, "router", listen_else),
-        _merge_endpoints(connect, file, "router", ()),
-        "router",
-        file.settings,
-    )
+    return _join_options(listen, connect, file, "router", listen_else, ())
 
 
-def _choose_listen(
-    named: Sequence[str] | None, file: ZenohFile, mode: ZenohMode, otherwise: Sequence[str]
-) -> Sequence[Endpoint]:
+def _join_options(
+    listen: Sequence[str] | None,
+    connect: Sequence[str] | None,
+    file: ZenohFile,
+    mode: ZenohMode,
+    listen_else: Sequence[str],
+    connect_else: Sequence[str] | None,
+) -> Connection:
     stated = file.endpoints("listen", mode)
-    if named is not None and stated is not None:
+    if listen is not None and stated is not None:
         raise UsageError(f"{file.source}: listen/endpoints: given by --listen too; give them in one place")
-    if named is not None:
-        return named
-    return otherwise if stated is None else stated
+    named = stated if listen is None else listen
+    connected = _merge_endpoints(connect, file, mode, connect_else)
+    return Connection(listen_else if named is None else named, connected, mode, file.settings)
 
 
 def _merge_endpoints(
@@ -191,14 +175,9 @@ def open_bus(
     timeout_s: float | None,
     say: Callable[[str], None],
 ) -> ZenohBus | None:
-    """Opens a connection; returns None if `stopped` before the router answers.
+    """Opens a connection whose `connect` is known; returns None if `stopped` before the router answers.
 
-    Args:
-        connection: the connection; its `connect` is known.
-        clock: the time.
-        stopped: True once the caller should end.
-        timeout_s: how long to wait for a router, s; None for ever.
-        say: prints a line for the user.
+    It waits for a router for `timeout_s`, or for ever, and says so.
 
     Raises:
         UsageError: an endpoint cannot be used.
@@ -228,26 +207,16 @@ def run_router(
     say: Callable[[str], None],
     until_idle_s: float | None = None,
 ) -> None:
-    """Runs a router until `stopped`, or until all members have left.
-
-    Args:
-        bus: the router's connection.
-        clock: the time.
-        stopped: True once it should end.
-        say: prints a line for the user.
-        until_idle_s: end so long after the last member has left, s; None: stay.
-    """
-    presence = bus.presence(topics.key("*", "*", topics.ALIVE) + "/*")
-    present: set[str] = set()
+    """Runs a router until `stopped`, or until the last member has left `until_idle_s` ago."""
+    presence = bus.presence(topics.presence_key("*", "*"))
+    present: set[topics.KeyParts] = set()
     idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
     empty_since_ns: int | None = None  # None before the first member
     while not stopped():
-        while (change := presence.poll()) is not None:
-            key, alive = change
-            parts = topics.parse_key(key)
-            if parts is None or alive == (key in present):
+        for parts, alive in topics.read_presence(presence):
+            if alive == (parts in present):
                 continue
-            (present.add if alive else present.remove)(key)
+            (present.add if alive else present.remove)(parts)
             say(f"session {parts.session}: {parts.member} {'is here' if alive else 'has left'}")
             empty_since_ns = None if present else clock.monotonic_ns()
         now_ns = clock.monotonic_ns()

@@ -31,14 +31,7 @@ SiteNamesOf = Callable[[str], tuple[str, ...]]
 def find_members(
     bus: Bus, clock: Clock, session: str, *, stopped: Callable[[], bool], timeout_s: float | None
 ) -> Iterator[Info]:
-    """Yields identities of members as they arrive, each again and again, until the time is over.
-
-    Args:
-        bus: a connection to the session.
-        clock: the time.
-        session: its name.
-        stopped: True once the caller should end.
-        timeout_s: how long to ask, s; None for as long as it takes.
+    """Yields identities of members as they arrive, each again and again, until the time, if any, is over.
 
     Raises:
         SessionError: the time is over, and all answers that arrived are unreadable.
@@ -69,17 +62,10 @@ def connect_to_session(
 ) -> Iterator[Bus | None]:
     """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
 
-    Without endpoints to connect to, it asks the session's first site, on this machine, for the others.
-
-    Args:
-        connection: how to reach the session; its `connect` is None without endpoints.
-        clock: the time.
-        session: the session's name.
-        names: reads the sites from a scenario's text; if it returns none, the first site's endpoint remains.
-        stopped: True once the caller should end.
-        timeout_s: how long to wait for the first site, or for a router, s; None for as long as it takes.
-        say: prints a line for the user.
-        recorder_boot: boot of a recorder to announce meanwhile, so that the session waits for it.
+    Without endpoints to connect to (`connect` is None) it asks the session's first site, on this machine, for
+    the others; if `names` returns none, that site's endpoint remains. It waits for the first site, or for a
+    router, for `timeout_s`, or for as long as it takes. A recorder is announced by its boot meanwhile: then
+    the session waits for it.
 
     Raises:
         SessionError: no site or no router answers in time.
@@ -94,11 +80,9 @@ def connect_to_session(
         if connection.connect is None:
             first = default_endpoint(session, 0)
             visitor = connect(replace(connection, listen=(), connect=[first]))
-            sites = None
-            if visitor is not None:
-                if recorder_boot is not None:
-                    visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
-                sites = _ask_for_sites(visitor, clock, session, names, stopped, timeout_s)
+            if visitor is not None and recorder_boot is not None:
+                visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
+            sites = _ask_for_sites(visitor, clock, session, names, stopped, timeout_s) if visitor else None
             if sites is None:
                 yield None
                 return
@@ -133,15 +117,7 @@ def _ask_for_sites(
 def request_change(
     connection: Connection, clock: Clock, session: str, site: str, request: ChangeRequest, names: SiteNamesOf
 ) -> ChangeReply:
-    """Requests a change from a site and returns its reply.
-
-    Args:
-        connection: how to reach the session, see `connect_to_session`.
-        clock: the time.
-        session: the session's name.
-        site: the site that carries the change out.
-        request: the change.
-        names: reads the sites from a scenario's text.
+    """Requests a change from the site that carries it out and returns its reply; see `connect_to_session`.
 
     Raises:
         SessionError: the session has no such site, has not begun, or the site does not reply.

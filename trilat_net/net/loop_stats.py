@@ -18,12 +18,7 @@ def ticks_per_stats(rate_hz: int) -> int:
 
 
 class LoopStats:
-    """Counters of a loop, since the last statistics and since the start.
-
-    Args:
-        site: the site that the loop steps.
-        boot: its process start.
-        rates: tick rate of every peer, Hz, in scenario order.
+    """Counters of a loop, since the last statistics and since the start; `rates` are those of the peers, Hz.
 
     Attributes:
         dropped: messages dropped, by reason.
@@ -31,13 +26,10 @@ class LoopStats:
     """
 
     def __init__(self, site: Site, boot: int, rates: list[int]) -> None:
-        self._site = site
-        self._boot = boot
-        self._rates = rates
+        self._site, self._boot, self._rates = site, boot, rates
         self._every = ticks_per_stats(site.rate_hz)
         self._period_us = 1_000_000 / site.rate_hz
-        self._late_max_us = 0
-        self._busy_max_us = 0
+        self._late_max_us = self._busy_max_us = 0
         self.dropped: Counter[str] = Counter()
         self.overruns = 0
 
@@ -52,11 +44,9 @@ class LoopStats:
         return k % self._every == 0
 
     def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
-        """Returns the statistics as of a tick and resets the largest values.
+        """Returns the statistics as of a record's tick, with the timing fields that were measured if any.
 
-        Args:
-            output: the record of that tick.
-            measured: the timing fields of `LinkStats`; None in virtual time.
+        The largest values begin anew.
         """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))

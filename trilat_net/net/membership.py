@@ -19,7 +19,7 @@ from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info
 from .pinging import Pinger, RepeatedQuery
-from .wire import decode, encode
+from .wire import M, decode, encode
 
 
 def new_boot() -> int:
@@ -32,27 +32,26 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
 
-def read_events(inbox: Inbox) -> Iterator[Event]:
-    """Yields the events that wait in a ring; skips other payloads."""
+def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
+    """Yields the messages of a kind that wait in a ring; skips other payloads."""
     while (message := inbox.poll()) is not None:
         try:
-            yield decode(message[1], Event)
+            yield decode(message[1], kind)
         except WireError:
-            continue
+            continue  # a stranger's; the sites and the recorder count them
+
+
+def read_events(inbox: Inbox) -> Iterator[Event]:
+    """Yields the events that wait in a ring; skips other payloads."""
+    return read_messages(inbox, Event)
 
 
 class EventPublisher:
     """Publishes a member's events and answers queries for its identity.
 
-    Args:
-        bus: the member's connection.
-        session: the session's name.
-        info: the member's identity.
-        keep: takes the payload of every event.
-
     Attributes:
         info: the identity that it answers with.
-        published: number of events so far.
+        published: number of events so far; `keep` takes the payload of each.
     """
 
     def __init__(
@@ -115,9 +114,6 @@ class Membership:
     """The other members of a session, as one member knows them.
 
     Args:
-        bus: the member's connection.
-        clock: the time.
-        session: the session's name.
         publisher: the member's own events and identity.
         sites: the sites of the scenario, in order; empty for a recorder, which learns them.
 
@@ -132,7 +128,7 @@ class Membership:
         self.met: dict[str, Info] = {}
         self.gone: set[str] = set()
         self._session, self._publisher, self._sites = session, publisher, tuple(sites)
-        self._presence = bus.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+        self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
         self._refused: set[int] = set()
         self._recorders: set[str] = set()
@@ -180,10 +176,7 @@ class Membership:
         """
         for info in self._query.poll():
             self.take(info, invited=invited)
-        while (change := self._presence.poll()) is not None:
-            parts, alive = topics.parse_key(change[0]), change[1]
-            if parts is None:
-                continue
+        for parts, alive in topics.read_presence(self._presence):
             if parts.member == topics.RECORDER:
                 (self._recorders.add if alive else self._recorders.discard)(parts.boot)
             (self.gone.discard if alive else self.gone.add)(parts.boot)
@@ -232,12 +225,20 @@ LATE_GATHER_NS = 1_500_000_000
 """Time to wait for the other members of a running session after the first one is met."""
 
 
-class RunningSession(NamedTuple):
-    """Tick 0 of a running session, on the own clock and in Unix time, and its boots."""
+class Epoch(NamedTuple):
+    """Tick 0 of a session.
+
+    Attributes:
+        mono_ns: on this process's monotonic clock.
+        unix_ns: in Unix time, as the leader read it.
+        boots: the members and their boots.
+        epochs: the same instant on every member's own clock; empty for a recorder that joins late.
+    """
 
     mono_ns: int
     unix_ns: int
     boots: Mapping[str, int]
+    epochs: Mapping[str, int] = {}
 
 
 class LateJoin:
@@ -247,12 +248,8 @@ class LateJoin:
         self._membership, self._pinger = membership, pinger
         self._first_ns: int | None = None
 
-    def poll(self, now_ns: int) -> RunningSession | None:
-        """Returns the session once all its members that are present have been met.
-
-        Args:
-            now_ns: the own clock.
-        """
+    def poll(self, now_ns: int) -> Epoch | None:
+        """Returns the epoch once all members of the session that are present have been met."""
         infos = [
             info
             for _, info in sorted(self._membership.met.items())
@@ -272,5 +269,5 @@ class LateJoin:
             if info.clock == own or self._pinger.know([info.boot]):
                 # as the clocks stand now: their drift apart since the epoch is unknown
                 offset_ns = 0 if info.clock == own else self._pinger.estimate(info.boot).offset_at(now_ns)
-                return RunningSession(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
+                return Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
         return None

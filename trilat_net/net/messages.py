@@ -262,17 +262,12 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """A member's identity, in answer to a query.
 
     Attributes:
-        v: version of this schema.
-        member: a site, or "recorder".
-        boot: its process start.
         scenario_sha256: hash of the resolved scenario; "" for a recorder, which learns it.
         scenario: the resolved text; "" for a recorder.
-        host: name of its machine.
         clock: identity of its monotonic clock.
         fingerprint: of its platform's arithmetic.
         needs_recorder: whether it waits for a recorder.
         running: whether its session's epoch is fixed.
-        ticks: number of its ticks.
         epoch_mono_ns: the epoch on its clock, once it is fixed.
         epoch_unix_ns: the epoch in Unix time.
         boots: the members of the session and their boots.

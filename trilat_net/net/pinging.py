@@ -88,24 +88,17 @@ def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
 
 
 class RoundTrips:
-    """The round trips to one start of a member.
-
-    Args:
-        pong: its first answer.
-        enough: round trips until its clock counts as known.
+    """The round trips to one start of a member; its clock counts as known after `enough` that agree.
 
     Attributes:
-        member: its name.
-        clock: identity of its clock.
         rtts_ns: the latest round trips, without the time that the member held them.
         shortest_ns: the shortest of all.
         estimator: the limits of its clock's offset.
         latest: the latest estimate, None before the first.
     """
 
-    def __init__(self, pong: Pong, enough: int) -> None:
+    def __init__(self, enough: int) -> None:
         self._enough = enough
-        self.member, self.clock = pong.member, pong.clock
         self.rtts_ns: deque[int] = deque(maxlen=_ROUND_TRIPS_KEPT)
         self.shortest_ns = 0
         self.estimator = OffsetEstimator()
@@ -146,12 +139,6 @@ class RoundTrips:
 class Pinger:
     """Pings every member of a session; call `poll` again and again.
 
-    Args:
-        bus: the connection.
-        clock: the time.
-        session: the session's name.
-        enough: round trips until a member's clock counts as known.
-
     Attributes:
         trips: round trips by the boot of the member.
     """
@@ -163,11 +150,7 @@ class Pinger:
         self._glance_until_ns = 0
 
     def poll(self, wanted: Collection[int]) -> None:
-        """Sends a ping if it is due, and takes the answers that have arrived.
-
-        Args:
-            wanted: boots of the members whose clocks to learn; without any, it sends no pings.
-        """
+        """Sends a ping if it is due, and takes the answers that have arrived from the boots wanted."""
         pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
         if wanted and self._query.repeat(pace_ns):
             self._glance_until_ns = self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
@@ -179,7 +162,7 @@ class Pinger:
             except WireError:
                 continue  # a stranger's
             if parts is not None and parts.member == pong.member and pong.boot in wanted:
-                trips = self.trips.setdefault(pong.boot, RoundTrips(pong, self._enough))
+                trips = self.trips.setdefault(pong.boot, RoundTrips(self._enough))
                 trips.take(reply.asked_ns, pong, now_ns)
 
     def know(self, boots: Collection[int]) -> bool:

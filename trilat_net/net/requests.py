@@ -17,19 +17,21 @@ BACKFILL_BYTES = 40_000
 """Most messages in one `Backfill`, and most bytes of them, unless a single message has more."""
 
 
-class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A message between two parties, of this version of the schema."""
+
+    v: int = VERSION
+
+
+class Pong(Request, frozen=True, kw_only=True):
     """A member's answer to a ping.
 
     Attributes:
-        v: version of this schema.
-        member: a site, or "recorder".
-        boot: its process start.
-        clock: identity of its monotonic clock.
+        clock: identity of the member's monotonic clock.
         came_ns: reading of that clock on arrival of the ping.
         left_ns: its reading when the answer was sent.
     """
 
-    v: int = VERSION
     member: str
     boot: U64
     clock: str
@@ -37,74 +39,56 @@ class Pong(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     left_ns: Instant
 
 
-class ChangeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ChangeRequest(Request, frozen=True, kw_only=True):
     """A change requested from a site, as in a scenario's timeline, from the earliest possible tick on.
 
     Attributes:
-        v: version of this schema.
         link: the link to change, as in "m1->s", or "".
         dominance: the site whose dominance row to change, or "".
         to: new values of the link or the row.
         ramp_s: duration of a change of the row, s.
     """
 
-    v: int = VERSION
     link: str = ""
     dominance: str = ""
     to: dict[str, Any]
     ramp_s: float = 0.0
 
 
-class ChangeReply(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ChangeReply(Request, frozen=True, kw_only=True):
     """A site's reply to a `ChangeRequest`.
 
     Attributes:
-        v: version of this schema.
-        member: the site.
-        accepted: whether it makes the change.
         text: the tick from which the change holds, or the reason for refusing it.
         tick: first tick, at the site's rate, for which the change holds; -1 if refused.
     """
 
-    v: int = VERSION
     member: str
     accepted: bool
     text: str
     tick: int = -1
 
 
-class BackfillRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BackfillRequest(Request, frozen=True, kw_only=True):
     """A recorder's request for missing messages of a site.
 
     A message's number is its tick for a record, its place from 0 for statistics and events.
-
-    Attributes:
-        v: version of this schema.
-        channel: the channel.
-        first: number of the first message.
-        last: number of the last message, the same or more.
     """
 
-    v: int = VERSION
     channel: Literal["state", "link", "event"]
     first: TickNumber
     last: TickNumber
 
 
-class Backfill(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Backfill(Request, frozen=True, kw_only=True):
     """The requested messages that a site still has: consecutive, as they were published.
 
     Attributes:
-        v: version of this schema.
-        member: the site.
-        boot: its process start.
-        channel: the channel.
         first: number of the first message here: the one requested, or the oldest one kept.
         payloads: the messages, a bounded number; empty if there are none (yet, or any more).
         made: number of messages of this channel that the site has published.
     """
 
-    v: int = VERSION
     member: str
     boot: U64
     channel: Literal["state", "link", "event"]
@@ -116,20 +100,15 @@ class Backfill(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 MEASUREMENT_VECTORS = {"q": JOINTS, "qd": JOINTS}
 
 
-class ArmMeasurement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ArmMeasurement(Request, frozen=True, kw_only=True):
     """One measurement of an external arm.
 
     Attributes:
-        v: version of this schema.
-        site: the site of the arm.
         boot: the start of the arm's program, random: a site listens to one of them.
         n: number of the measurement of that start, from 0.
-        q: joint angles.
-        qd: joint velocities.
         sent_ns: time of sending, ns of the program's own monotonic clock.
     """
 
-    v: int = VERSION
     site: str
     boot: U64
     n: TickNumber

@@ -11,13 +11,12 @@ Everything is polled, on a given `Bus` and `Clock`; nothing waits.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import EventPublisher, LateJoin, Membership, liveliness_token, read_events
+from .membership import Epoch, EventPublisher, LateJoin, Membership, liveliness_token, read_events
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
@@ -27,35 +26,13 @@ DECIDE_NS = 150_000_000
 """Time before the epoch by which every reply must have arrived, without a round trip."""
 
 
-class Epoch(NamedTuple):
-    """Tick 0 of a session.
-
-    Attributes:
-        mono_ns: on this process's monotonic clock.
-        unix_ns: in Unix time, as the leader read it.
-        boots: the members and their boots.
-        epochs: the same instant on every member's own clock.
-    """
-
-    mono_ns: int
-    unix_ns: int
-    boots: Mapping[str, int]
-    epochs: Mapping[str, int] = {}
-
-
 class SessionJoin:
     """One member's way into a session; call `poll` until it returns the epoch.
 
     Args:
         bus: the member's connection, with its subscriptions declared.
-        clock: the time.
-        session: the session's name.
         publisher: the member's own events and identity.
         sites: the sites of the scenario, in order; empty for a recorder, which learns them.
-
-    Attributes:
-        membership: the members present.
-        pinger: round trips to them and their clocks.
     """
 
     def __init__(
@@ -95,8 +72,7 @@ class SessionJoin:
             if membership.leads:
                 epoch = self._lead()
             elif not self._sites and (self._announced is None or now_ns >= self._epoch_ns):
-                running = self._late_join.poll(now_ns)  # not while `start` may still be under way
-                epoch = Epoch(*running) if running else None
+                epoch = self._late_join.poll(now_ns)  # not while `start` may still be under way
         return epoch
 
     def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:

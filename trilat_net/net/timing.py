@@ -8,7 +8,7 @@ Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of t
 echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the echo.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..core.ticks import NS_PER_S
@@ -21,11 +21,7 @@ _SETTLE_S = 2.0  # time constant of an error: slow against the noise of an estim
 
 
 class TickSchedule:
-    """Deadlines of one site's ticks.
-
-    Args:
-        epoch_ns: tick 0, on the site's clock.
-        rate_hz: its tick rate.
+    """Deadlines of one site's ticks, on its clock.
 
     Attributes:
         slew: lag of the schedule against the clock, ns/s.
@@ -44,20 +40,16 @@ class TickSchedule:
         passed_ns = k * NS_PER_S // self._rate_hz - self._from_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
-    def nominal(self, k: int) -> int:
-        """Returns the nominal time of tick k, ns since the epoch."""
-        return k * NS_PER_S // self._rate_hz
-
     def steer(self, k: int, error_ns: int, drift: float) -> None:
-        """Slews towards the leader's schedule from a tick on.
+        """Slews towards the leader's schedule from a tick on, at or after the last one it was steered from.
 
         Args:
-            k: that tick, at or after the last one it was steered from.
+            k: that tick.
             error_ns: its lateness against the leader's schedule.
             drift: drift of the leader's clock against the own one, ns/s.
         """
         self._base_ns = self.deadline(k)
-        self._from_ns = self.nominal(k)
+        self._from_ns = k * NS_PER_S // self._rate_hz
         self.error_ns = error_ns
         self.slew = min(max(-drift - error_ns / _SETTLE_S, -SLEW_LIMIT), SLEW_LIMIT)
         self._slew_per_ns = self.slew / NS_PER_S
@@ -89,33 +81,28 @@ class SentStamps:
         return self._instants[slot] if self._ticks[slot] == tick else None
 
 
-class LinkTiming(NamedTuple):
-    """Timing of one link since the last statistics; -1 without samples.
+class PeerClock(NamedTuple):
+    """A peer's clock at the start of the session.
 
     Attributes:
-        delay_us: one-way delay, median.
-        delay_max_us: one-way delay, largest.
-        rtt_us: smallest round trip, without the time that the peer held the echo.
-        faults: samples since the start that arrived before they were sent, by more than the bound.
+        epoch_ns: tick 0 on its clock.
+        place: index of this site among its peers.
+        estimate: offset of its clock.
+        estimator: the limits found by pings; None if both clocks are one.
     """
 
-    delay_us: int
-    delay_max_us: int
-    rtt_us: int
-    faults: int
+    name: str
+    epoch_ns: int
+    place: int
+    estimate: OffsetEstimate
+    estimator: OffsetEstimator | None
 
 
 class LinkTimingMonitor:
     """Timing of one link, at its receiving end.
 
-    Args:
-        epoch_ns: tick 0 on the peer's clock.
-        place: index of this site among the peer's peers.
-        sent: stamps of the own records.
-        offset: the initial offset of the peer's clock.
-        estimator: refines it; None if both clocks are one.
-
     Attributes:
+        peer: the sender's clock.
         offset: the offset in use.
         newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
         faults: impossible stamps since the start.
@@ -123,30 +110,19 @@ class LinkTimingMonitor:
         contradicted: whether windows contradicted each other since then.
     """
 
-    def __init__(
-        self,
-        epoch_ns: int,
-        place: int,
-        sent: SentStamps,
-        offset: SlewedOffset,
-        estimator: OffsetEstimator | None,
-    ) -> None:
-        self.offset = offset
+    def __init__(self, peer: PeerClock, sent: SentStamps) -> None:
+        self.peer = peer
+        self.offset = SlewedOffset(peer.estimate)
         self.newest: tuple[int, int] | None = None
         self.faults = 0
         self.worst_ns = 0
         self.contradicted = False
-        self._epoch_ns, self._place, self._sent, self._estimator = epoch_ns, place, sent, estimator
+        self._epoch_ns, self._place, self._sent = peer.epoch_ns, peer.place, sent
         self._delays: list[int] = []
         self._rtt_ns = _FAR_NS
         self._windows = 0
         self._opened_ns: int | None = None
         self._open_window()
-
-    @property
-    def estimated(self) -> bool:
-        """True if the peer has another clock."""
-        return self._estimator is not None
 
     def _open_window(self) -> None:
         self._there_ns = self._back_ns = _FAR_NS  # smallest delays of the window, with their limits
@@ -179,13 +155,9 @@ class LinkTimingMonitor:
         return delay_ns
 
     def close(self, now_ns: int, from_ns: int) -> OffsetEstimate | None:
-        """Closes the window if it is due, and slews to the new estimate; None if nothing changed.
-
-        Args:
-            now_ns: the own clock.
-            from_ns: start of the slew.
-        """
-        if self._estimator is None:
+        """Closes the window if it is due, and slews to the new estimate from an instant on; else None."""
+        estimator = self.peer.estimator
+        if estimator is None:
             return None
         if self._opened_ns is None:
             self._opened_ns = now_ns
@@ -194,10 +166,10 @@ class LinkTimingMonitor:
             return None
         self._opened_ns = now_ns
         self._windows += 1
-        broken = self._estimator.broken
-        self._estimator.add(self._ceiling, self._floor)
-        estimate = self._estimator.estimate(now_ns)
-        if self._estimator.broken > broken:
+        broken = estimator.broken
+        estimator.add(self._ceiling, self._floor)
+        estimate = estimator.estimate(now_ns)
+        if estimator.broken > broken:
             self.faults += 1
             self.contradicted = True
         if estimate is None:  # no stamps, or contradictory ones: a clock has stepped
@@ -212,54 +184,29 @@ class LinkTimingMonitor:
         self.worst_ns = 0
         self.contradicted = False
 
-    def figures(self) -> LinkTiming:
-        """Returns the timing since the last call."""
-        delays = sorted(self._delays)
-        self._delays = []
-        rtt_us = -1 if self._rtt_ns == _FAR_NS else self._rtt_ns // 1000
-        self._rtt_ns = _FAR_NS
-        if not delays:
-            return LinkTiming(-1, -1, rtt_us, self.faults)
-        return LinkTiming(delays[len(delays) // 2] // 1000, delays[-1] // 1000, rtt_us, self.faults)
+    def measured(self, now_ns: int) -> dict[str, int]:
+        """Returns the link's timing fields of `LinkStats` since the last call."""
+        delays, rtt_ns = sorted(self._delays), self._rtt_ns
+        self._delays, self._rtt_ns = [], _FAR_NS
+        return {
+            "offset_us": self.offset.at(now_ns) // 1000,
+            "bound_us": -(-self.offset.bound_at(now_ns) // 1000),
+            "delay_us": delays[len(delays) // 2] // 1000 if delays else -1,
+            "delay_max_us": delays[-1] // 1000 if delays else -1,
+            "rtt_us": -1 if rtt_ns == _FAR_NS else rtt_ns // 1000,
+            "clock_faults": self.faults,
+        }
 
 
 FAULT_EVERY_NS = 1_000_000_000
 
 
-class PeerClock(NamedTuple):
-    """A peer's clock at the start of the session.
-
-    Attributes:
-        name: the peer.
-        epoch_ns: tick 0 on its clock.
-        place: index of this site among its peers.
-        estimate: offset of its clock.
-        estimator: the limits found by pings; None if both clocks are one.
-    """
-
-    name: str
-    epoch_ns: int
-    place: int
-    estimate: OffsetEstimate
-    estimator: OffsetEstimator | None
-
-
-class ClockNotice(NamedTuple):
-    """An event about a clock: its kind, its text and its further fields."""
-
-    kind: str
-    text: str
-    facts: Mapping[str, object]
+ClockNotice = dict[str, Any]
+"""The fields of an event about a clock."""
 
 
 class SiteTiming:
-    """Deadlines of a site, and timing of its links.
-
-    Args:
-        epoch_ns: tick 0 on the own clock.
-        rate_hz: the own tick rate.
-        peers: the peers' clocks, in scenario order.
-        leader: the site whose schedule is the session's.
+    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's.
 
     Attributes:
         schedule: deadlines of the own ticks.
@@ -268,29 +215,19 @@ class SiteTiming:
 
     def __init__(self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str) -> None:
         self.schedule = TickSchedule(epoch_ns, rate_hz)
-        self._epoch_ns = epoch_ns
-        self._names = [peer.name for peer in peers]
+        self._epoch_ns, self._rate_hz = epoch_ns, rate_hz
         self._sent = SentStamps()
-        self.meters: list[LinkTimingMonitor] = []
+        self.meters = [LinkTimingMonitor(peer, self._sent) for peer in peers]
+        for meter in self.meters:
+            meter.offset.slew_to(epoch_ns, meter.peer.estimate)
+        self._estimated = [meter for meter in self.meters if meter.peer.estimator is not None]
+        self._leader = next((meter for meter in self._estimated if meter.peer.name == leader), None)
         self._turn = 0
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
-        self._leader: LinkTimingMonitor | None = None
-        self._leader_epoch_ns = 0
-        for peer in peers:
-            offset = SlewedOffset(peer.estimate)
-            offset.slew_to(epoch_ns, peer.estimate)
-            meter = LinkTimingMonitor(peer.epoch_ns, peer.place, self._sent, offset, peer.estimator)
-            self.meters.append(meter)
-            if peer.name == leader and meter.estimated:
-                self._leader, self._leader_epoch_ns = meter, peer.epoch_ns
 
     def opening(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
-        return [
-            _estimate_notice(name, 0, self._epoch_ns, meter.offset)
-            for name, meter in zip(self._names, self.meters, strict=True)
-            if meter.estimated
-        ]
+        return [_estimate_notice(meter, 0, self._epoch_ns) for meter in self._estimated]
 
     def sent(self, tick: int, now_ns: int) -> int:
         """Notes the time of sending of a record; returns it since the epoch, ns."""
@@ -308,74 +245,62 @@ class SiteTiming:
         return echo
 
     def settle(self, k: int, now_ns: int) -> list[ClockNotice]:
-        """Estimates one clock, steers the schedule and returns the events; ten times a second.
-
-        Args:
-            k: the next tick.
-            now_ns: the own clock.
-        """
+        """Estimates one clock, steers the schedule from tick k on, returns the events; ten times a second."""
         notices: list[ClockNotice] = []
         due_ns = self.schedule.deadline(k)
         for _ in self.meters:  # one estimate at a time, in turn: it takes a part of a tick
             self._turn = (self._turn + 1) % len(self.meters)
             meter = self.meters[self._turn]
             if meter.close(now_ns, due_ns) is not None:
-                notices.append(_estimate_notice(self._names[self._turn], k, due_ns, meter.offset))
+                notices.append(_estimate_notice(meter, k, due_ns))
                 break
-        for n, (name, meter) in enumerate(zip(self._names, self.meters, strict=True)):
+        for n, meter in enumerate(self.meters):
             faulty = bool(meter.worst_ns) or meter.contradicted
             if faulty and now_ns - self._faults_ns[n] >= FAULT_EVERY_NS:
                 self._faults_ns[n] = now_ns
-                notices.append(_fault_notice(name, meter.worst_ns, meter.offset.bound_ns))
+                notices.append(_fault_notice(meter))
                 meter.reset_faults()
         if self._leader is not None:
             offset = self._leader.offset
-            leader_ns = due_ns + offset.at(due_ns) - self._leader_epoch_ns
-            self.schedule.steer(k, leader_ns - self.schedule.nominal(k), offset.estimate.drift)
+            leader_ns = due_ns + offset.at(due_ns) - self._leader.peer.epoch_ns
+            error_ns = leader_ns - k * NS_PER_S // self._rate_hz
+            self.schedule.steer(k, error_ns, offset.estimate.drift)
         return notices
 
     def measured(self, now_ns: int) -> dict[str, Any]:
         """Returns the timing fields of `LinkStats` since the last call."""
-        timings = {name: meter.figures() for name, meter in zip(self._names, self.meters, strict=True)}
-        offsets = {name: meter.offset for name, meter in zip(self._names, self.meters, strict=True)}
-        return {
-            "offset_us": {name: offset.at(now_ns) // 1000 for name, offset in offsets.items()},
-            "bound_us": {name: -(-offset.bound_at(now_ns) // 1000) for name, offset in offsets.items()},
-            "delay_us": {name: timing.delay_us for name, timing in timings.items()},
-            "delay_max_us": {name: timing.delay_max_us for name, timing in timings.items()},
-            "rtt_us": {name: timing.rtt_us for name, timing in timings.items()},
-            "clock_faults": {name: timing.faults for name, timing in timings.items()},
+        stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
             "slew_ppb": round(self.schedule.slew),
         }
+        for meter in self.meters:
+            for field, value in meter.measured(now_ns).items():
+                stats.setdefault(field, {})[meter.peer.name] = value
+        return stats
 
 
-def _estimate_notice(name: str, k: int, at_ns: int, offset: SlewedOffset) -> ClockNotice:
-    estimate = offset.estimate
+def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotice:
+    offset, estimate, name = meter.offset, meter.offset.estimate, meter.peer.name
     offset_ns = offset.at(at_ns)
     drift_bound = max(estimate.drift_high - estimate.drift, estimate.drift - estimate.drift_low)
-    return ClockNotice(
-        "clock",
-        f"clock of {name}: {format_offset(offset_ns, offset.bound_ns)}, "
-        f"drift {estimate.drift / 1000:+.2f} ppm",
-        {
-            "about": name,
-            "ticks": k,
-            "offset_ns": offset_ns,
-            "bound_ns": offset.bound_ns,
-            "drift_ppb": round(estimate.drift),
-            "drift_bound_ppb": round(drift_bound) + 1,
-        },
-    )
+    told = f"{format_offset(offset_ns, offset.bound_ns)}, drift {estimate.drift / 1000:+.2f} ppm"
+    return {
+        "kind": "clock",
+        "text": f"clock of {name}: {told}",
+        "about": name,
+        "ticks": k,
+        "offset_ns": offset_ns,
+        "bound_ns": offset.bound_ns,
+        "drift_ppb": round(estimate.drift),
+        "drift_bound_ppb": round(drift_bound) + 1,
+    }
 
 
-def _fault_notice(name: str, before_ns: int, bound_ns: int) -> ClockNotice:
+def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
     """Reports a sample that arrived before it was sent, or windows that contradict each other."""
+    name, before_ns, bound_ns = meter.peer.name, meter.worst_ns, meter.offset.bound_ns
     what = f"its stamps contradict those before, beyond the bound of {bound_ns / 1000:.0f} us"
     if before_ns:
         what = f"a sample came {before_ns / 1e6:.3f} ms before it was sent"
-    return ClockNotice(
-        "clock fault",
-        f"clock of {name}: {what}; one of the two clocks has stepped",
-        {"about": name, "offset_ns": before_ns, "bound_ns": bound_ns},
-    )
+    text = f"clock of {name}: {what}; one of the two clocks has stepped"
+    return {"kind": "clock fault", "text": text, "about": name, "offset_ns": before_ns, "bound_ns": bound_ns}

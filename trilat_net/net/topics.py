@@ -1,6 +1,9 @@
 """Bus keys: `trilat/<session>/<member>/<channel>`, and a boot number after `alive`."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
+
+from .bus import PresenceInbox
 
 ROOT = "trilat"
 RECORDER = "recorder"
@@ -16,6 +19,18 @@ class KeyParts(NamedTuple):
     member: str
     channel: str
     boot: str = ""
+
+
+def presence_key(session: str, member: str) -> str:
+    """Returns the expression of the liveliness tokens of a member's starts; `*` stands for every one."""
+    return f"{key(session, member, ALIVE)}/*"
+
+
+def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
+    """Yields the changes of presence that wait in a ring: whose token, and whether it is alive now."""
+    while (change := inbox.poll()) is not None:
+        if (parts := parse_key(change[0])) is not None:
+            yield parts, change[1]
 
 
 def key(session: str, member: str, channel: str) -> str:

@@ -8,9 +8,9 @@ Payloads are MessagePack maps with string keys and plain lists, encoded by `msgp
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from operator import attrgetter
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 import msgpack
 import msgspec
@@ -28,51 +28,25 @@ from .messages import (
     RecorderStats,
     State,
 )
-from .requests import (
-    MEASUREMENT_VECTORS,
-    ArmMeasurement,
-    Backfill,
-    BackfillRequest,
-    ChangeReply,
-    ChangeRequest,
-    Pong,
-)
+from .requests import MEASUREMENT_VECTORS, ArmMeasurement, Backfill, Request
 
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
 MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
 
-_Sent = (
-    LinkStats
-    | Event
-    | Info
-    | RecorderStats
-    | Pong
-    | ChangeRequest
-    | ChangeReply
-    | BackfillRequest
-    | Backfill
-    | ArmMeasurement
-)
+_Sent = LinkStats | Event | Info | RecorderStats | Request
 _pack = msgpack.Packer().pack
-_DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in (State, PeerSample, *get_args(_Sent))
-}
+_KINDS: list[type[msgspec.Struct]] = [State, PeerSample, LinkStats, Event, Info, RecorderStats]
+_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.__subclasses__()]}
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 
 
-def _vector_check(
-    lengths: Mapping[str, int],
-) -> tuple[tuple[str, ...], Callable[[Any], Any], tuple[int, ...]]:
-    return tuple(lengths), attrgetter(*lengths), tuple(lengths.values())
-
-
+_VECTORS = {PeerSample: SAMPLE_VECTORS, State: STATE_VECTORS, ArmMeasurement: MEASUREMENT_VECTORS}
 _CHECKS = {
-    PeerSample: _vector_check(SAMPLE_VECTORS),
-    State: _vector_check(STATE_VECTORS),
-    ArmMeasurement: _vector_check(MEASUREMENT_VECTORS),
+    kind: (attrgetter(*lengths), tuple(lengths.values()), tuple(lengths))
+    for kind, lengths in _VECTORS.items()
 }
 
 
@@ -89,16 +63,7 @@ def encode_state(
 ) -> bytes:
     """Returns the payload of one record.
 
-    Args:
-        site: the site's name.
-        boot: its process start.
-        peers: its peers in scenario order.
-        output: the record.
-        arrivals: the samples that the tick took in.
-        late_us: wake-up minus deadline, us.
-        busy_us: computing time of the tick before, us.
-        sent_ns: time of sending, ns since the epoch on the own clock; None in virtual time: nominal.
-        echo: newest sample of each peer: (index of the peer, its tick, arrival as `sent_ns`).
+    The arguments are the fields of `State`. Without `sent_ns`, in virtual time, it is the nominal time.
 
     Raises:
         WireError: a number is not finite.
@@ -147,12 +112,7 @@ M = TypeVar("M", bound=msgspec.Struct)
 
 
 def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:
-    """Returns the message of a payload.
-
-    Args:
-        payload: the bytes received.
-        kind: the type that the key promises.
-        versions: accepted schema versions: one from the network, `messages.READABLE` from a file.
+    """Returns the message of a payload, of the present schema version or of those that a file may have.
 
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
@@ -168,21 +128,14 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
     check = _CHECKS.get(kind)
     if check is not None:
-        names, vectors_of, lengths = check
+        vectors_of, lengths, names = check
         vectors = vectors_of(message)
         # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
         if tuple(map(len, vectors)) != lengths or not _isfinite(sum(map(sum, vectors))):
-            _check_vectors(message, names, vectors, lengths)
+            for name, vector, length in zip(names, vectors, lengths, strict=True):
+                if len(vector) != length:
+                    raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
+                if not all(map(_isfinite, vector)):
+                    number = message.n if kind is ArmMeasurement else message.tick
+                    raise WireError("not finite", f"{name} of {message.site} at {number}")
     return message  # type: ignore[no-any-return]
-
-
-def _check_vectors(
-    message: Any, names: Sequence[str], vectors: Sequence[list[float]], lengths: Sequence[int]
-) -> None:
-    """Refuses vectors of the wrong length and numbers that are not finite."""
-    for name, vector, length in zip(names, vectors, lengths, strict=True):
-        if len(vector) != length:
-            raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
-        if not all(map(_isfinite, vector)):
-            number = message.n if isinstance(message, ArmMeasurement) else message.tick
-            raise WireError("not finite", f"{name} of {message.site} at {number}")

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
@@ -23,67 +23,44 @@ MAX_DEPTH = 100
 """Nesting of a configuration; Zenoh's recursive parser overflows its stack on deep nesting."""
 
 
+T = TypeVar("T")
+
+
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
     """A router that does not answer, or not yet."""
 
 
-class _ZenohRing:
-    def __init__(self, subscriber: Any) -> None:
-        self._try_recv = subscriber.try_recv
-        self._subscriber = subscriber
+class _ZenohRing(Generic[T]):
+    """A ring of Zenoh's; `read` turns what it holds into an entry, or into None, which is passed over."""
 
-    def poll(self) -> tuple[str, bytes] | None:
-        sample = self._try_recv()
-        return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
+    def __init__(self, source: Any, read: Callable[[Any], T | None]) -> None:
+        self._source, self._try_recv, self._read = source, source.try_recv, read
 
-
-class _ZenohReplies:
-    def __init__(self, replies: Any) -> None:
-        self._replies = replies
-
-    def poll(self) -> tuple[str, bytes] | None:
+    def poll(self) -> T | None:
         try:
-            reply = self._replies.try_recv()
-        except zenoh.ZError:  # every answer has arrived: the channel is closed
-            return None
-        if reply is None or reply.ok is None:
-            return None
-        return str(reply.ok.key_expr), reply.ok.payload.to_bytes()
-
-
-class _ZenohPresenceRing:
-    def __init__(self, subscriber: Any, own: set[str]) -> None:
-        self._subscriber = subscriber
-        self._own = own
-
-    def poll(self) -> tuple[str, bool] | None:
-        while (sample := self._subscriber.try_recv()) is not None:
-            key = str(sample.key_expr)
-            if key not in self._own:  # liveliness has no locality: own tokens arrive too
-                return key, sample.kind == zenoh.SampleKind.PUT
+            while (received := self._try_recv()) is not None:
+                if (entry := self._read(received)) is not None:
+                    return entry
+        except zenoh.ZError:  # every answer to a query has arrived: the channel is closed
+            pass
         return None
 
 
-class _ZenohQuery:
-    def __init__(self, query: zenoh.Query, key: str) -> None:
-        self._query, self._key = query, key
+def _read_sample(sample: Any) -> tuple[str, bytes]:
+    return str(sample.key_expr), sample.payload.to_bytes()
+
+
+class _ZenohQuery(NamedTuple):
+    query: zenoh.Query
+    key: str
 
     @property
     def payload(self) -> bytes:
-        return b"" if self._query.payload is None else self._query.payload.to_bytes()
+        return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def answer(self, payload: bytes) -> None:
-        with self._query as query:  # a query ends for its sender only when it is dropped
-            query.reply(self._key, payload)
-
-
-class _ZenohQueryRing:
-    def __init__(self, queryable: Any, key: str) -> None:
-        self._queryable, self._key = queryable, key
-
-    def poll(self) -> _ZenohQuery | None:
-        query = self._queryable.try_recv()
-        return None if query is None else _ZenohQuery(query, self._key)
+        with self.query as query:  # a query ends for its sender only when it is dropped
+            query.reply(self.key, payload)
 
 
 class ZenohBus:
@@ -141,7 +118,7 @@ class ZenohBus:
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """See `Bus`."""
-        return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)))
+        return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
     def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """See `Bus`."""
@@ -151,22 +128,19 @@ class ZenohBus:
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
-
-        def call(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr), sample.payload.to_bytes())
-
-        self._kept.append(self._subscribe(key, handlers.Callback(call, indirect=False)))
+        handler: Any = handlers.Callback(lambda sample: callback(*_read_sample(sample)), indirect=False)
+        self._kept.append(self._subscribe(key, handler))
 
     def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
-        return _ZenohQueryRing(self._serve(key, handlers.RingChannel(64)), key)
+        return _ZenohRing(self._serve(key, handlers.RingChannel(64)), lambda query: _ZenohQuery(query, key))
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
 
         def answer_at_once(query: zenoh.Query) -> None:
             with query:  # a query ends for its sender only when it is dropped
-                payload = answer(b"" if query.payload is None else query.payload.to_bytes())
+                payload = answer(_ZenohQuery(query, key).payload)
                 if payload is not None:
                     query.reply(key, payload)
 
@@ -174,20 +148,19 @@ class ZenohBus:
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
-        return _ZenohReplies(
-            self._session.get(
-                key,
-                handlers.FifoChannel(256),  # a ring forgets its answers when the last one has arrived
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
-                timeout=ASK_TIMEOUT_S,
-                allowed_destination=Locality.REMOTE,
-                payload=payload,
-                # answers inherit these: no member that answers waits for a receiver that hangs
-                congestion_control=CongestionControl.DROP,
-                priority=Priority.REAL_TIME,
-            )
+        replies = self._session.get(
+            key,
+            handlers.FifoChannel(256),  # a ring forgets its answers when the last one has arrived
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
+            timeout=ASK_TIMEOUT_S,
+            allowed_destination=Locality.REMOTE,
+            payload=payload,
+            # answers inherit these: no member that answers waits for a receiver that hangs
+            congestion_control=CongestionControl.DROP,
+            priority=Priority.REAL_TIME,
         )
+        return _ZenohRing(replies, lambda reply: None if reply.ok is None else _read_sample(reply.ok))
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
@@ -196,10 +169,13 @@ class ZenohBus:
 
     def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
-        return _ZenohPresenceRing(
-            self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True),
-            self._tokens,
-        )
+
+        def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
+            token = str(sample.key_expr)  # liveliness has no locality: own tokens arrive too
+            return None if token in self._tokens else (token, sample.kind == zenoh.SampleKind.PUT)
+
+        tokens = self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True)
+        return _ZenohRing(tokens, read)
 
     def close(self) -> None:
         """See `Bus`."""

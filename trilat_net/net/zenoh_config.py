@@ -30,7 +30,7 @@ ZenohMode = Literal["peer", "client", "router"]
 Endpoint = str | Mapping[str, Any]
 """As in "tcp/127.0.0.1:7447", or one of Zenoh's groups of locators."""
 
-QUEUES = (
+QUEUES = [
     "control",
     "real_time",
     "interactive_high",
@@ -39,7 +39,7 @@ QUEUES = (
     "data",
     "data_low",
     "background",
-)
+]
 """Zenoh's queues of a link, by priority."""
 
 
@@ -49,14 +49,7 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     own: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a session member.
-
-    Args:
-        listen: endpoints to listen at.
-        connect: where it connects to; a client takes the first that answers.
-        mode: what it is to Zenoh.
-        own: the `settings` of a `ZenohFile`.
-    """
+    """Returns the Zenoh configuration of a session member, with the `settings` of a `ZenohFile`."""
     tries = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     needed: dict[str, Any] = {
         "mode": mode,
@@ -175,12 +168,7 @@ class ZenohFile:
 
 
 def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]) -> ZenohFile:
-    """Checks the content of a user's file.
-
-    Args:
-        source: the file.
-        stated: its content.
-        refusal: returns Zenoh's reason for refusing a configuration, or "".
+    """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing settings, or "".
 
     Raises:
         UsageError: it is no Zenoh configuration, or contradicts a requirement of a session.

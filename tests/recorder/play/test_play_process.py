@@ -19,10 +19,10 @@ from trilat_net.execution.virtual import virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
 from trilat_net.net.discovery import refuse_running_session
-from trilat_net.net.membership import EventPublisher, liveliness_token
+from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
 from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import Backfill, BackfillRequest, Pong
-from trilat_net.net.session import Epoch, SessionJoin
+from trilat_net.net.session import SessionJoin
 from trilat_net.net.wire import decode, encode
 
 from .clocks import LookedAt
