@@ -7,7 +7,7 @@ import pytest
 
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import refuse_existing, stage_output, write_whole
-from trilat_net.reporting.export_tables import EXPORT_MANIFEST
+from trilat_net.reporting.export import EXPORT_MANIFEST
 
 
 def everything(folder: Path) -> dict[str, str]:

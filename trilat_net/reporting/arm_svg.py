@@ -11,12 +11,7 @@ from .figures.arm_poses import ArmPose, choose_instants_s, pose_at
 
 
 def render_arms_svg(log: Log, bounds_m: tuple[float, float, float, float]) -> str:
-    """Returns HTML with a row per site and a column per instant.
-
-    Args:
-        log: the log.
-        bounds_m: left, right, bottom and top of every picture, m.
-    """
+    """Returns HTML with a row per site and a column per instant; bounds: left, right, bottom, top, m."""
     times = choose_instants_s(log)
     cells = ["<span></span>", *(f'<span class="head">t = {t:.4g} s</span>' for t in times)]
     for index, site in enumerate(log.sites):
@@ -33,19 +28,17 @@ def _picture(
     box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
     ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
     base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
-    inside = (
-        ""
-        if drawn is None
-        else (
-            f'<polyline class="path site-{index}" points="{_points(drawn.path)}"/>'
-            f'<polyline class="desired" points="{_points(drawn.desired)}"/>'
-            f'<polyline class="arm site-{index}" points="{_points(drawn.actual)}"/>'
-            + "".join(
-                f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
-                for x, y in drawn.actual[1:]
-            )
+    inside = ""
+    if drawn is not None:
+        paths = (
+            (f"path site-{index}", drawn.path),
+            ("desired", drawn.desired),
+            (f"arm site-{index}", drawn.actual),
         )
-    )
+        inside = "".join(f'<polyline class="{kind}" points="{_points(path)}"/>' for kind, path in paths)
+        inside += "".join(
+            f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>' for x, y in drawn.actual[1:]
+        )
     return f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">{ground}{inside}{base}</svg>'
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
-from ..core.vectors import Array
 
 MIN_ENERGY_SHARE = 1e-6
 """Smaller shares of the largest energy are not listed."""
@@ -33,12 +32,7 @@ class CertificateMark(StrEnum):
 
 
 class CertificateLine(NamedTuple):
-    """One sentence.
-
-    Attributes:
-        mark: ok: it supports the run; FAIL: it alone fails the run; open: it decides nothing; note: a remark.
-        text: the sentence.
-    """
+    """One sentence, and what it does: ok supports the run, FAIL alone fails it, open decides nothing."""
 
     mark: CertificateMark
     text: str
@@ -51,25 +45,16 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     verdict = (
         CertificateMark.FAIL if broken else CertificateMark.OK if found.bounded_by_v else CertificateMark.OPEN
     )
-    lines = [
-        CertificateLine(verdict, found.verdict.text),
-        CertificateLine(_GROWTH[found.end.behaviour.grows], f"e and qd: {found.end.text}"),
-    ]
+    lines = [(verdict, found.verdict.text)]
+    lines.append((_GROWTH[found.end.behaviour.grows], f"e and qd: {found.end.text}"))
     if found.balance is not None:
-        lines.append(
-            CertificateLine(
-                _BALANCE.get(finding, CertificateMark.OK),
-                f"energy balance: {describe_balance(found.balance)}",
-            )
-        )
+        mark = _BALANCE.get(finding, CertificateMark.OK)
+        lines.append((mark, f"energy balance: {describe_balance(found.balance)}"))
     if found.ones is not None and found.ones_rise is not None:
         risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
-        lines.append(
-            CertificateLine(
-                CertificateMark.NOTE, f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"
-            )
-        )
-    return lines
+        text = f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"
+        lines.append((CertificateMark.NOTE, text))
+    return [CertificateLine(*line) for line in lines]
 
 
 _GROWTH = {True: CertificateMark.FAIL, False: CertificateMark.OK, None: CertificateMark.OPEN}
@@ -94,12 +79,14 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
         links = {f"{len(links)} links": np.sum(list(links.values()), axis=0)}
+    gained, lost = sum(balance.work.values()), sum(balance.dissipation.values())
+    rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
     entries = {
         **{f"taken: {name}": -values for name, values in balance.dissipation.items()},
         **{f"given: {_SOURCE_NAMES.get(name, name)}": values for name, values in (given | links).items()},
         "given: sampling of the controller": balance.sampling,
         "left by beta": -balance.transfer,
-        "unexplained" if balance.judged.all() else "in gaps, or unexplained": _rest(balance),
+        "unexplained" if balance.judged.all() else "in gaps, or unexplained": rest,
     }
     least = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
     shown = [(name, float(x[-1])) for name, x in entries.items() if np.abs(x).max() > least]
@@ -108,11 +95,3 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
         (f"V at {t_s:.4g} s", x) for t_s, x in zip((balance.t_s[0], balance.t_s[-1]), ends, strict=True)
     )
     return [first, *shown, last]
-
-
-def _rest(balance: EnergyBalance) -> Array:
-    """Returns the unexplained part of V, in gaps too, shape (T,), J."""
-    gained, lost = sum(balance.work.values()), sum(balance.dissipation.values())
-    known = gained - lost + balance.sampling - balance.transfer
-    rest: Array = balance.V - balance.V[0] - known
-    return rest

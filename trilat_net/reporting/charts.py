@@ -32,12 +32,7 @@ ChartJson = dict[str, Any]
 
 
 class Charts:
-    """The charts of a log.
-
-    Args:
-        log: the log.
-        twin: the same experiment without operators, or None.
-    """
+    """The charts of a log; `twin` is the same experiment without operators, or None."""
 
     def __init__(self, log: Log, twin: Log | None) -> None:
         self._log = log
@@ -119,11 +114,8 @@ class Charts:
             both = np.stack([site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2)
             for joint in range(JOINTS):
                 table = self._site_table(site, both[:, joint])
-                desired = {"colour": LIMIT_COLOUR, "dash": True}
-                series = [
-                    self._series(site, table, 0),
-                    {**self._series(site, table, 1, "desired"), **desired},
-                ]
+                desired = {**self._series(site, table, 1, "desired"), "colour": LIMIT_COLOUR, "dash": True}
+                series = [self._series(site, table, 0), desired]
                 yield _chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
 
     def _estimates(self) -> Iterator[ChartJson]:
@@ -166,9 +158,8 @@ class Charts:
         log = self._log
         lines: list[ChartJson] = []
         for peer in log[site].peers:
-            t_s, mean_ms = sample_age.stated_delay_line(
-                log, list_stated_models(log, f"{peer}->{site}", self._changes)
-            )
+            states = list_stated_models(log, f"{peer}->{site}", self._changes)
+            t_s, mean_ms = sample_age.stated_delay_line(log, states)
             for start, end, value in zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True):
                 if np.isfinite(value):
                     line = {"value": value, "colour": log.sites.index(peer), "from": start, "to": end}
@@ -195,14 +186,10 @@ class Charts:
         periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
         titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
         for field, title in titles.items():
-            series = [
-                {
-                    "label": site,
-                    "colour": n,
-                    "counts": loop_timing.bin_loop_times(getattr(log[site], field), edges).tolist(),
-                }
-                for n, site in enumerate(log.sites)
-            ]
+            series: list[ChartJson] = []
+            for n, site in enumerate(log.sites):
+                counts = loop_timing.bin_loop_times(getattr(log[site], field), edges).tolist()
+                series.append({"label": site, "colour": n, "counts": counts})
             axis = {"edges": edges.tolist(), "periods": periods}
             yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
 
@@ -220,12 +207,8 @@ def _chart(section: str, title: str, unit: str, series: list[ChartJson], **optio
 
 def workspace_box_m(log: Log) -> tuple[float, float, float, float]:
     """Returns left, right, bottom and top of a box around the motion of all arms, m."""
-    drawn = [
-        arm_poses.pose_at(log, site, t)
-        for site in log.sites
-        for t in np.linspace(0.0, recorded_end_s(log), 60)
-    ]
-    return arm_poses.pose_box_m(drawn)
+    times = np.linspace(0.0, recorded_end_s(log), 60)
+    return arm_poses.pose_box_m([arm_poses.pose_at(log, site, t) for site in log.sites for t in times])
 
 
 def _packed(column: NDArray[Any]) -> str:

@@ -23,13 +23,9 @@ from .text_table import TextTable
 
 
 class Conclusion(NamedTuple):
-    """A finished run with its checks.
+    """A finished run with its checks: a row per site, lines on links, changes, modes, clocks and certificate.
 
-    Attributes:
-        table: a row per site.
-        notes: links, changes, modes, clocks and certificate, a line each.
-        lines: the checks and their results.
-        paths: the log's files, and those that were written.
+    `paths` are the log's files, and those that were written.
     """
 
     table: TextTable
@@ -49,12 +45,7 @@ class Conclusion(NamedTuple):
 
 
 def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:
-    """Verifies a log, compares it with virtual time, and writes figures, page and summary.
-
-    Args:
-        log: the log, from a file.
-        folder: of the results; exists.
-        progress: called with the number of figures that are drawn, and of all.
+    """Verifies a log from a file, and writes figures, page and summary into a folder that exists.
 
     Raises:
         LogError: a record cannot be read.

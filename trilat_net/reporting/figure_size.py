@@ -7,11 +7,8 @@ from typing import NamedTuple
 
 from ..errors import UsageError
 
-PRINT_TYPE_PT = 8.0
-"""Size of type in print, pt."""
 COLUMN_IN, PAGE_IN = 3.5, 7.0
 """Widths of one column and of two, in."""
-_REPORT_DPI, _PRINT_DPI = 200, 600
 
 
 class FigureSize(NamedTuple):
@@ -35,7 +32,7 @@ class FigureSize(NamedTuple):
         return self.width_in < 5.0
 
 
-REPORT_SIZE = FigureSize(PAGE_IN, 7.0, 6.0, _REPORT_DPI)
+REPORT_SIZE = FigureSize(PAGE_IN, 7.0, 6.0, 200)
 """The figures beside the report."""
 
 
@@ -47,4 +44,4 @@ def make_print_size(width_in: float) -> FigureSize:
     """
     if width_in not in (COLUMN_IN, PAGE_IN):
         raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in:g}")
-    return FigureSize(width_in, PRINT_TYPE_PT, PRINT_TYPE_PT, _PRINT_DPI)
+    return FigureSize(width_in, 8.0, 8.0, 600)

@@ -11,9 +11,6 @@ import numpy as np
 from ..theory.linear_analysis import LinearAnalysis
 from .text_table import TextTable
 
-ROOT_HEADS = ("re 1/s", "im rad/s", "Hz", "damping", "modes", "what moves")
-SAMPLED_ROOT_HEADS = ("re as computed", "im as computed")
-
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields the equilibrium and the way it was found."""
@@ -54,7 +51,8 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
         )
         other_s = ("same", "same") if other is None else (f"{other.s.real:.4g}", f"{other.s.imag:.4g}")
         rows.append((*numbers, *(other_s if differ else ()), root.words))
-    heads = (*ROOT_HEADS[:5], *(SAMPLED_ROOT_HEADS if differ else ()), ROOT_HEADS[5])
+    computed = ("re as computed", "im as computed") if differ else ()
+    heads = ("re 1/s", "im rad/s", "Hz", "damping", "modes", *computed, "what moves")
     return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
 
 

@@ -33,10 +33,7 @@ def print_overview(facts: JsonObject) -> None:
     own = {topic: channel for topic, channel in channels.items() if topic not in views}
     _print_channels(own, session)
     if views:
-        rows = [
-            (topic, v["messages"], _number(v["rate_hz"]), _size(v["bytes"]), v["schema"].rpartition("/")[2])
-            for topic, v in views.items()
-        ]
+        rows = [(topic, *_counts(v), v["schema"].rpartition("/")[2]) for topic, v in views.items()]
         _print_table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
     if session is not None:
         _print_accounts(session)
@@ -82,13 +79,12 @@ def _print_sites(sites: dict[str, JsonObject]) -> None:
     rows = []
     for name, site in sites.items():
         ticks = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
-        counts = (site["records"], ticks, site["missing"], site["overruns"])
-        rows.append((name, site["role"], site["rate_hz"], *counts))
+        of = (site["records"], ticks, site["missing"], site["overruns"])
+        rows.append((name, site["role"], site["rate_hz"], *of))
     _print_table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
     if any(site["late_us"] for site in sites.values()):
-        headers = ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max")
         loops = [(name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()]
-        _print_table(headers, loops)
+        _print_table(("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops)
 
 
 def _print_links(links: dict[str, JsonObject]) -> None:
@@ -112,9 +108,8 @@ def _print_channels(channels: dict[str, JsonObject], session: JsonObject | None)
     prefix = f"/trilat/{session['session']}/" if session else ""
     rows = []
     for topic, channel in channels.items():
-        count, rate_hz, size = channel["messages"], _number(channel["rate_hz"]), _size(channel["bytes"])
         name = topic.removeprefix(prefix) or "(none)"
-        rows.append((name, count, rate_hz, size, channel["missing"], *_three(channel["between_ms"])))
+        rows.append((name, *_counts(channel), channel["missing"], *_three(channel["between_ms"])))
     _print_table(("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
     for topic, channel in channels.items():
         if gaps := channel["gaps"]:
@@ -161,6 +156,10 @@ def _print_file(file: JsonObject) -> None:
     _print_rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
     for damage in file["damaged"][:_MOST_GAPS]:
         _print_rows(("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}"))
+
+
+def _counts(channel: JsonObject) -> tuple[int, str | None, str]:
+    return channel["messages"], _number(channel["rate_hz"]), _size(channel["bytes"])
 
 
 def _three(spread: JsonObject | None) -> list[str | None]:

@@ -69,15 +69,9 @@ def write_report(
 ) -> list[Path]:
     """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
 
-    Figures are drawn before the verdicts are read, which may still be in the making.
-
-    Args:
-        log: the log.
-        folder: made if it does not exist.
-        twin: the same experiment without operators, or None.
-        certificate: the log's, for a section of its own; None leaves it out.
-        verdicts: the checks of the log and their results.
-        progress: called with the number of figures that are drawn, and of all.
+    Figures are drawn before the verdicts are read, which may still be in the making. Without a certificate
+    the page has no section of it, and without `twin`, the same experiment without operators, no motion due to
+    them. `progress` is called with the number of figures that are drawn, and of all.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
@@ -106,15 +100,7 @@ def write_report(
 def render_report(
     log: Log, twin: Log | None, verdicts: Sequence[CheckLine], facts: JsonObject, certificate: str = ""
 ) -> str:
-    """Returns the page of a log.
-
-    Args:
-        log: the log.
-        twin: the same experiment without operators, or None.
-        verdicts: the checks of the log and their results.
-        facts: as from `summarise_run`.
-        certificate: the section of the certificate, as HTML.
-    """
+    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML."""
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
     data = {**charts.Charts(log, twin).data(), "bounds_m": bounds}

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.health import JsonObject
@@ -44,39 +43,35 @@ def render_description(scenario: Scenario) -> str:
 def render_run_facts(log: Log, facts: JsonObject) -> str:
     """Returns the table of the run."""
     scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
-    settled = f"every |e| below {facts['settle_below_rad']:g} rad"
+    settled = "not within the run"
+    if facts["settle_s"] is not None:
+        settled = f"every |e| below {facts['settle_below_rad']:g} rad from {facts['settle_s']:.3f} s on"
     dominance = "; ".join(
         f"{site} follows " + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
         for site, shares in scenario.dominance.items()
     )
-    rows = [
+    return _render_facts(
         ("scenario", f"{scenario.name}, sha256 {scenario.sha256[:16]}"),
         ("driven by", _describe_driver(log)),
         ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}"),
         ("records", f"{facts['records']}, {facts['missing']} missing{torn}"),
         ("largest error at the end", f"{format_cell(facts['max_error_end_rad'])} rad in the last second"),
-        (
-            "settled",
-            "not within the run"
-            if facts["settle_s"] is None
-            else f"{settled} from {facts['settle_s']:.3f} s on",
-        ),
+        ("settled", settled),
         ("dominance", dominance),
         ("diverged", "yes" if facts["diverged"] else "no"),
-    ]
-    return _render_facts(rows)
+    )
 
 
 def render_sites(log: Log, facts: JsonObject) -> str:
     """Returns the table of the sites: their records and their motion."""
     headers = ["site", "records", "missing", "q at the end (rad)", "max |e| (rad)", "max |e|, last 1 s (rad)"]
     headers += ["settled (s)", "max |τ| (N\u00a0m)", "ticks at the limit", "moved by operators, max (rad)"]
+    motion = ("max_error_rad", "max_error_end_rad", "settle_s", "peak_tau_nm", "saturated_ticks")
     rows = []
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
-        motion = (site[key] for key in ("max_error_rad", "max_error_end_rad", "settle_s", "peak_tau_nm"))
-        cells = [str(site["records"]), str(site["missing"]), _format_numbers(site["q_end_rad"])]
-        cells += [*map(format_cell, motion), str(site["saturated_ticks"])]
+        counts = [str(site["records"]), str(site["missing"]), _format_numbers(site["q_end_rad"])]
+        cells = [*counts, *(format_cell(site[key]) for key in motion)]
         rows.append([_label_site(log, name), *cells, _format_numbers(site["hands_moved_max_rad"])])
     return render_html_table(headers, rows)
 
@@ -178,9 +173,9 @@ def render_modes(log: Log, facts: JsonObject) -> str:
 
 def render_certificate(certificate: Certificate) -> str:
     """Returns verdict, premises and energies of a stability certificate."""
+    cells = ((escape(p.name), _PREMISE_MARKS[p.holds], escape(p.text)) for p in certificate.premises)
     premises = "".join(
-        f"<tr><th>{escape(p.name)}</th><th>{_PREMISE_MARKS[p.holds]}</th><td>{escape(p.text)}</td></tr>"
-        for p in certificate.premises
+        f"<tr><th>{name}</th><th>{mark}</th><td>{text}</td></tr>" for name, mark, text in cells
     )
     first, *others = (escape(line.text) for line in describe_certificate(certificate))
     html = f"<p><strong>{first}</strong></p>" + "".join(f"<p>{text}</p>" for text in others)
@@ -194,9 +189,8 @@ def render_certificate(certificate: Certificate) -> str:
 
 def render_assumptions(scenario: Scenario) -> str:
     """Returns the scenario's assumptions beyond its source."""
-    if not scenario.assumed:
-        return "<p>Nothing is declared as assumed.</p>"
-    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in scenario.assumed)}</ul>"
+    items = "".join(f"<li>{escape(text)}</li>" for text in scenario.assumed)
+    return f"<ul>{items}</ul>" if items else "<p>Nothing is declared as assumed.</p>"
 
 
 def render_commands(log: Log) -> str:
@@ -219,13 +213,12 @@ def render_versions(log: Log) -> str:
     """Returns the table of commit, platform and versions that made the log."""
     session = log.session
     changed = " with changes" if session.get("commit_dirty") == "true" else ""
-    rows = [
+    return _render_facts(
         ("commit", session.get("commit", "unknown") + changed),
         ("fingerprint of arithmetic", session.get("fingerprint", "unknown")),
         ("platform", f"{session.get('platform', 'unknown')}, {session.get('python', 'unknown')}"),
-    ]
-    versions = [(k.removeprefix("version_"), v) for k, v in session.items() if k.startswith("version_")]
-    return _render_facts([*rows, *versions])
+        *((k.removeprefix("version_"), v) for k, v in session.items() if k.startswith("version_")),
+    )
 
 
 def _describe_driver(log: Log) -> str:
@@ -266,21 +259,15 @@ def _swatch(log: Log, name: str) -> str:
     return f'<span class="swatch fill-{log.sites.index(name)}"></span>'
 
 
-def _render_facts(rows: Iterable[tuple[str, Any]]) -> str:
-    lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape(str(value))}</td></tr>" for key, value in rows)
+def _render_facts(*rows: tuple[str, str]) -> str:
+    lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape(value)}</td></tr>" for key, value in rows)
     return f'<table class="facts">{lines}</table>'
 
 
 def render_html_table(
     headers: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()
 ) -> str:
-    """Returns a table.
-
-    Args:
-        headers: of its columns, plain text of this program.
-        rows: their cells, HTML already.
-        words: the columns besides the first that hold words instead of numbers.
-    """
+    """Returns a table of rows in HTML; `words` are the columns besides the first that hold no numbers."""
     kinds = [' class="words"' if n in words else "" for n in range(len(headers))]
     head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, headers, strict=True))
     body = "".join(

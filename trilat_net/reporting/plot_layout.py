@@ -17,13 +17,7 @@ Ros2Channels = Mapping[str, Ros2Channel]
 
 
 class PlotCurves(NamedTuple):
-    """Curves of one channel.
-
-    Attributes:
-        entity: where Rerun puts their numbers.
-        names: their names, in the order of the numbers.
-        shown: which of them are shown.
-    """
+    """Curves of one channel: where Rerun puts its numbers, their names in order, and which of them show."""
 
     entity: str
     names: tuple[str, ...]
@@ -40,15 +34,14 @@ class CurvePlot(NamedTuple):
 PlotPage = list[list[CurvePlot]]
 """Rows of plots."""
 
-_POSITION, _VELOCITY, _EFFORT = "position", "velocity", "effort"
 _PAGES = {
     "Motion": (
-        ("joint angles and reference", "rad", (("joint_states", _POSITION), ("reference", _POSITION))),
+        ("joint angles and reference", "rad", (("joint_states", "position"), ("reference", "position"))),
         ("error", "rad", (("error", ""),)),
-        ("torque, and exogenous torque", "N m", (("joint_states", _EFFORT), ("tau_x", ""))),
+        ("torque, and exogenous torque", "N m", (("joint_states", "effort"), ("tau_x", ""))),
     ),
     "Speeds, estimates": (
-        ("joint velocities", "rad/s", (("joint_states", _VELOCITY), ("reference", _VELOCITY))),
+        ("joint velocities", "rad/s", (("joint_states", "velocity"), ("reference", "velocity"))),
         ("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
         ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""),)),
     ),
@@ -90,14 +83,10 @@ def _row(
 ) -> Iterator[CurvePlot]:
     """Yields the plots of a quantity, one per site that has it."""
     for root in roots:
-        curves = [
-            curves
-            for name, field in parts
-            if (curves := _curves(f"{root}/{name}", field, channels.get(f"{root}/{name}"))) is not None
-        ]
-        if curves:
+        found = [_curves(f"{root}/{name}", field, channels.get(f"{root}/{name}")) for name, field in parts]
+        if curves := tuple(one for one in found if one is not None):
             site = root.rpartition("/")[2]
-            yield CurvePlot(f"{site}: {what}" + (f" ({unit})" if unit else ""), tuple(curves))
+            yield CurvePlot(f"{site}: {what}" + (f" ({unit})" if unit else ""), curves)
 
 
 def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
@@ -109,11 +98,11 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
         prefix = f"{topic.rpartition('/')[2]} " if topic.endswith("/tau_x") else ""
         return PlotCurves(topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names))
     reference = all(name.endswith("_ref") for name in names) or topic.endswith("/reference")
-    if field == _EFFORT and reference:
+    if field == "effort" and reference:
         return None
     if reference:
         names = tuple(name.removesuffix("_ref") + "_ref" for name in names)
-    shown = tuple(reference or field == _POSITION or not name.endswith("_ref") for name in names)
+    shown = tuple(reference or field == "position" or not name.endswith("_ref") for name in names)
     return PlotCurves(f"{topic}/{field}", names, shown)
 
 
@@ -132,23 +121,19 @@ _TIMELINE = "message_publish_time"
 
 
 def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint file.
-
-    Args:
-        board: the layout.
-        application: Rerun's name of the recordings that it is for.
-        path: the file.
+    """Writes a layout as a blueprint file; `application` is Rerun's name of the recordings that it is for.
 
     Raises:
         UsageError: Rerun is not installed.
     """
     rrb = import_extra("rerun.blueprint", "view", "viewers")
-    pages = rrb.Tabs(*(_page(rrb, name, page) for name, page in board.pages.items()))
-    views = [pages]
-    if board.lines:
-        views.append(rrb.TextLogView(origin=board.lines, name="events"))
+    pages = [
+        rrb.Vertical(*(rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page), name=name)
+        for name, page in board.pages.items()
+    ]
+    events = [rrb.TextLogView(origin=board.lines, name="events")] if board.lines else []
     blueprint = rrb.Blueprint(
-        rrb.Vertical(*views, row_shares=[6, 1][: len(views)]),
+        rrb.Vertical(rrb.Tabs(*pages), *events, row_shares=[6, 1][: 1 + len(events)]),
         rrb.TimePanel(state="collapsed", timeline=_TIMELINE),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -158,16 +143,9 @@ def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
     blueprint.save(application, path)
 
 
-def _page(rrb: Any, name: str, page: PlotPage) -> Any:
-    rows = [rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page]
-    return rrb.Vertical(*rows, name=name)
-
-
 def _view(rrb: Any, plot: CurvePlot) -> Any:
     """Returns a plot; each of its channels has colors of its own."""
-    overrides: dict[str, Any] = {}
-    for curves in plot.curves:
-        overrides[curves.entity] = _lines(curves, 2 * len(overrides))
+    overrides = {curves.entity: _lines(curves, 2 * n) for n, curves in enumerate(plot.curves)}
     return rrb.TimeSeriesView(
         name=plot.title,
         origin="/",

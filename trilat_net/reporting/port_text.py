@@ -7,7 +7,7 @@ proof.
 import math
 
 from ..theory.frequency_search import FrequencyBand
-from ..theory.port_analysis import PortAnalysis, TwoPort
+from ..theory.port_analysis import PortAnalysis
 from ..theory.port_passivity import Passivity
 from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
 
@@ -22,9 +22,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         "(a grid refined at minima: evidence, no proof)"
     ]
     if ports.resolved_hz < high:
-        lines.append(
-            f"  above {ports.resolved_hz:.3g} Hz the grid does not follow the phase of the longest delay"
-        )
+        beyond = f"above {ports.resolved_hz:.3g} Hz"
+        lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
     if ports.verdict == "unstable":
         return [*lines, "  the loop without operators is unstable: not passive, and without an impedance"]
     if ports.pole.order:
@@ -33,10 +32,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     lines.append(f"  operators passive in qd: {_describe_passivity(ports.velocity)}")
     lines += [f"    joint {joint} alone: {_describe_passivity(one)}" for joint, one in ports.joints.items()]
     if ports.proof is not None:
-        lines.append(
-            "  operators passive in r = qd + Lambda e, the proof's premise: "
-            f"{_describe_proof(ports, ports.proof)}"
-        )
+        proof = _describe_proof(ports, ports.proof)
+        lines.append(f"  operators passive in r = qd + Lambda e, the proof's premise: {proof}")
     lines.append(f"  any passive operators in qd, best weights: {_describe_absolute_stability(ports)}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
     if ports.clamped_verdict == "unstable":
@@ -87,19 +84,14 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     holding = len(ports.two_ports) - len(failing)
     third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""
     every = f"every pair and joint{third}" if not failing else "the others"
-    return [
-        *map(_describe_failing_two_port, failing),
-        *([f"{every}: holds ({holding} two-ports)"] if holding else []),
-    ]
-
-
-def _describe_failing_two_port(one: TwoPort) -> str:
-    third = f", {one.clamped} clamped" if one.clamped else ""
-    minima = one.minima
-    return (
-        f"{one.sites[0]} and {one.sites[1]}{third}, joint {one.joint}: fails {_list_bands(minima.below)}; "
-        f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-    )
+    lines = []
+    for one in failing:
+        which = (
+            f"{' and '.join(one.sites)}{f', {one.clamped} clamped' if one.clamped else ''}, joint {one.joint}"
+        )
+        least = f"least {one.minima.least:.3g} at {one.minima.least_hz:.3g} Hz"
+        lines.append(f"{which}: fails {_list_bands(one.minima.below)}; {least}")
+    return [*lines, *([f"{every}: holds ({holding} two-ports)"] if holding else [])]
 
 
 def _describe_transparency(one: Transparency) -> str:

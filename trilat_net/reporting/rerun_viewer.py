@@ -32,13 +32,7 @@ _QUIET = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """How to show a log.
-
-    Attributes:
-        full: every record instead of the decimated channels.
-        web: in a browser.
-        save: write the recording into this file, `.rrd`, instead of showing it.
-    """
+    """How to show a log: every record instead of decimated channels, in a browser, or into a file, `.rrd`."""
 
     full: bool = False
     web: bool = False
@@ -50,9 +44,9 @@ def open_rerun(
     opened: Callable[[], Log],
     show: ViewerOptions,
     say: Callable[[str], None],
-    run: RunCommand | None = None,
+    run: RunCommand = lambda command, environment: subprocess.run(command, env=environment).returncode,
 ) -> None:
-    """Shows a log, until its viewer is closed.
+    """Shows a log in its file or parts, until its viewer is closed.
 
     Args:
         paths: its file, or its parts.
@@ -82,12 +76,7 @@ def open_rerun(
         layout = Path(folder) / "layout.rbl"
         save_blueprint(build_plot_layout(read_ros2_channels(path)), path.stem, layout)
         for command in _commands(show, path, layout, say):
-            arguments, environment = [*_PROGRAM, *command], {**_QUIET, **os.environ}
-            if run is None:
-                code = subprocess.run(arguments, env=environment, check=False).returncode
-            else:
-                code = run(arguments, environment)
-            if code:
+            if code := run([*_PROGRAM, *command], {**_QUIET, **os.environ}):
                 raise RunFailed(f"Rerun ended with exit code {code}")
 
 
@@ -100,7 +89,13 @@ def make_application_id(path: Path) -> str:
 def _commands(show: ViewerOptions, log: Path, layout: Path, say: Callable[[str], None]) -> list[list[str]]:
     """Returns the arguments of one call of Rerun after the other; it listens on this machine alone."""
     if show.save is not None:
-        return _saving(log, layout, show.save)
+        # Rerun's own `--save` of several files ends with the first that was read; the rest of the others is
+        # missing (measured with 0.41: up to all of a log)
+        recording = layout.with_name("log.rrd")
+        return [
+            ["mcap", "convert", str(log), "--application-id", log.stem, "--output", str(recording)],
+            ["rrd", "merge", str(recording), str(layout), "--output", str(show.save)],
+        ]
     port = _free_port()
     command = [str(log), str(layout), "--bind", _OWN, "--port", str(port)]
     if show.web:
@@ -110,21 +105,7 @@ def _commands(show: ViewerOptions, log: Path, layout: Path, say: Callable[[str],
     return [command]
 
 
-def _saving(log: Path, layout: Path, save: Path) -> list[list[str]]:
-    """Returns the calls of Rerun that write the recording.
-
-    Its own `--save` of several files ends with the first that was read; the rest of the others is missing
-    (measured with 0.41: up to all of a log).
-    """
-    recording = layout.with_name("log.rrd")
-    return [
-        ["mcap", "convert", str(log), "--application-id", log.stem, "--output", str(recording)],
-        ["rrd", "merge", str(recording), str(layout), "--output", str(save)],
-    ]
-
-
 def _free_port() -> int:
-    """Returns a free port."""
     with socket.socket() as probe:
         probe.bind((_OWN, 0))
         port: int = probe.getsockname()[1]

@@ -61,10 +61,7 @@ def export_ros2(log: Log, path: Path, progress: Callable[[int], None] = lambda _
     statistics `link_age`, `link_delay`, `link_offset`, `timing`; of the session `/events` and `/log`. Units
     and names stand in the channels' metadata and in the labels of dimensions.
 
-    Args:
-        log: the log.
-        path: the file; an earlier one is replaced.
-        progress: called with the number of records that were written since the last call.
+    An earlier file is replaced; `progress` is called with the number of records written since its last call.
 
     Raises:
         LogError: a message of the log cannot be read.
@@ -87,12 +84,7 @@ def export_ros2(log: Log, path: Path, progress: Callable[[int], None] = lambda _
 
 
 class _BagChannels:
-    """The channels of a bag, each registered with its first message.
-
-    Args:
-        file: the file.
-        known: every possible channel, by topic.
-    """
+    """The channels of a bag, of all that are known by topic; each is registered with its first message."""
 
     def __init__(self, file: McapWriter, known: dict[str, Ros2Channel]) -> None:
         self._file, self._known = file, known

@@ -29,6 +29,8 @@ from ..log.record_columns import Ints
 from .figure_size import REPORT_SIZE, FigureSize
 
 AxesGrid = NDArray[np.object_]
+LegendEntries = Sequence[tuple[str, dict[str, Any]]]
+"""Texts, each with the options of its line."""
 
 SITE_COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
 DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
@@ -86,6 +88,13 @@ def figure_style(form: FigureSize = REPORT_SIZE) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
+    """Yields an empty figure of a size, to be drawn in the style of all figures."""
+    with figure_style(form):
+        yield new_figure(height_in, form.width_in)
+
+
 def new_figure(height_in: float, width_in: float = REPORT_WIDTH_IN) -> Figure:
     """Returns an empty figure of a size in inches."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
@@ -102,19 +111,15 @@ def site_colour(log: Log, site: str) -> str:
     return SITE_COLOURS[log.sites.index(site) % len(SITE_COLOURS)]
 
 
-def site_dashes(log: Log, site: str) -> Any:
-    """Returns the line style of a site: solid until the colours are used up."""
-    return DASHES[log.sites.index(site) // len(SITE_COLOURS) % len(DASHES)]
-
-
 def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
-    """Returns the options of a site's line, `width` pt wide.
+    """Returns the options of a site's line, `width` pt wide, solid until the colours are used up.
 
     Without a width sites share a panel: later ones are thinner, so that lines on top of each other all show.
     """
-    shared = 2.0 - 1.2 * log.sites.index(site) / (len(log.sites) - 1)
-    width = shared if width is None else width
-    return {"color": site_colour(log, site), "linestyle": site_dashes(log, site), "linewidth": width}
+    index = log.sites.index(site)
+    width = 2.0 - 1.2 * index / (len(log.sites) - 1) if width is None else width
+    dashes = DASHES[index // len(SITE_COLOURS) % len(DASHES)]
+    return {"color": site_colour(log, site), "linestyle": dashes, "linewidth": width}
 
 
 def site_title(log: Log, site: str) -> str:
@@ -146,11 +151,8 @@ def typeset(text: str) -> str:
     return text.replace("+-", "±").replace("->", " → ")
 
 
-def add_legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
-    """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for.
-
-    An entry is a text with the options of its line.
-    """
+def add_legend(figure: Figure, entries: LegendEntries) -> None:
+    """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for."""
     handles = [Line2D([], [], label=text, **options) for text, options in entries]
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for columns in range(min(len(handles), 6), 0, -1):
@@ -167,8 +169,7 @@ def site_legend_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns a figure that consists of a text: why there is nothing to draw."""
-    with figure_style(form):
-        figure = new_figure(1.0, form.width_in)
+    with styled_figure(form, 1.0) as figure:
         lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
         figure.text(0.5, 0.5, lines, ha="center", va="center", color=REFERENCE)
     return figure

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from ..analysis.health import ClockSummary, summarise_clock
 from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
-from ..analysis.timeline import ModeInterval, StatedModel, find_mode_intervals, list_changes
+from ..analysis.timeline import StatedModel, find_mode_intervals, list_changes
 from ..log.log_reader import Log
 
 MOST_LINES = 12
@@ -58,9 +58,10 @@ def format_change_lines(log: Log) -> list[str]:
 def format_mode_lines(log: Log) -> list[str]:
     """Returns a line per site that held, braked or returned."""
     lines = []
+    doing = {"hold": "held", "brake": "braked", "return": "returned"}
     for site in log.sites:
         if found := find_mode_intervals(log[site]):
-            words = [_span(span) for span in found[:MOST_LINES]]
+            words = [f"{doing.get(s.mode, s.mode)} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]]
             more = [f"and {len(found) - MOST_LINES} more"] if len(found) > MOST_LINES else []
             lines.append(f"{site}: {', '.join([*words, *more])}")
     return lines
@@ -129,19 +130,11 @@ def _losses(use: LinkSummary, counts: SampleCounts) -> str:
         "superseded": counts.superseded,
         "duplicates": counts.duplicate + counts.copies,
     }
-    words = [f"{name} {_share(count, counts.judged)}" for name, count in losses.items() if count]
+    judged = max(counts.judged, 1)
+    words = [f"{name} {count} ({100 * count / judged:.2g} %)" for name, count in losses.items() if count]
     if use.burst is not None and use.burst > 1.005:
         words.append(f"{_number(use.burst)} in a row")
     return ", ".join(words) or "nothing lost"
-
-
-def _share(count: int, of: int) -> str:
-    return f"{count} ({100 * count / max(of, 1):.2g} %)"
-
-
-def _span(span: ModeInterval) -> str:
-    doing = {"hold": "held", "brake": "braked", "return": "returned"}
-    return f"{doing.get(span.mode, span.mode)} {span.from_s:.3f}-{span.to_s:.3f} s"
 
 
 def _first(lines: list[str]) -> list[str]:

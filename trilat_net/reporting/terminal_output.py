@@ -108,23 +108,15 @@ def conclude_files(paths: Sequence[Path], folder: Path) -> "tuple[Log, Conclusio
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a second.
-
-    Args:
-        label: the activity, as in "reading run.mcap".
-    """
+    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a second."""
     if not err.is_interactive:
         yield lambda _done, _total: None
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-    )
-    display = Progress(*columns, console=err, transient=True, auto_refresh=False)
+    columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    name = TextColumn("{task.description}", markup=False)
+    display = Progress(name, *columns, console=err, transient=True, auto_refresh=False)
     task = display.add_task(label, total=None)
     began_s = display.get_time()
     drawn_s = began_s
@@ -168,12 +160,8 @@ def open_with_progress(first: Path, *more: Path) -> "Log":
 def warn_user_laws(log: "Log", *, needed: bool = True) -> None:
     """Warns of code outside the log, which an execution of the log runs.
 
-    Args:
-        log: the log.
-        needed: whether nothing can be done without that code.
-
     Raises:
-        ScenarioError: the file of a needed law does not exist.
+        ScenarioError: the file of a law does not exist, and nothing can be done without it (`needed`).
     """
     from ..errors import ScenarioError
     from ..execution.verify import find_user_laws

@@ -22,6 +22,8 @@ from ..figure_size import REPORT_SIZE, FigureSize
 INSTANTS = 6
 _NARROW_INSTANTS = 3
 _PATH_POINTS = 400
+_DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
+_BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
 
 
 class ArmPose(NamedTuple):
@@ -92,19 +94,15 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> tuple[float, float, float, fl
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[float] | None = None) -> Figure:
     """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
 
-    Args:
-        log: the log.
-        form: width and type size.
-        instants: the instants, s; None for `choose_instants_s`.
+    The instants, s, are those of `choose_instants_s` unless given.
     """
     count = _NARROW_INSTANTS if form.narrow else INSTANTS
     times = choose_instants_s(log, count) if instants is None else list(instants)
     drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
     left, right, bottom, top = pose_box_m([p for row in drawn.values() for p in row])
     side_in = (form.width_in - 0.6) / len(times)
-    with style.figure_style(form):
-        height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
-        figure = style.new_figure(height_in, form.width_in)
+    height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
+    with style.styled_figure(form, height_in) as figure:
         grid = style.add_panels(figure, len(log.sites), len(times), sharex=True, sharey=True)
         for site, row in zip(log.sites, grid, strict=True):
             for axes, one in zip(row, drawn[site], strict=True):
@@ -115,7 +113,11 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[fl
         for axes in grid[-1]:
             axes.set_xlabel("x (m)")
         grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
-        style.add_legend(figure, _entries(log))
+        sites = [
+            (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0})
+            for s in log.sites
+        ]
+        style.add_legend(figure, [*sites, ("desired", _DESIRED), ("base", _BASE)])
     return figure
 
 
@@ -128,15 +130,4 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
     axes.plot(*drawn.desired.T, **_DESIRED)
     axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")
     axes.plot(*drawn.actual[1:].T, linestyle="none", marker="o", markersize=2.6, color=colour)
-    axes.plot(0.0, 0.0, linestyle="none", marker="s", markersize=4.5, color=style.REFERENCE)
-
-
-def _entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    sites = [
-        (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0}) for s in log.sites
-    ]
-    base = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
-    return [*sites, ("desired", _DESIRED), ("base", base)]
-
-
-_DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
+    axes.plot(0.0, 0.0, **_BASE)

@@ -39,10 +39,7 @@ _HEIGHTS = (1.5, 1.2, 1.3, 1.0)
 def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns V with its sites, its parts, dissipation and work, and the residual of the balance, J.
 
-    Args:
-        log: the log.
-        certificate: its certificate; one without a balance gives a figure with the reason.
-        form: width and type size.
+    A certificate without a balance gives a figure with the reason.
     """
     balance = certificate.balance
     if balance is None:

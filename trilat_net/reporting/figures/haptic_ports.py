@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from ...core.vectors import Array
-from ...theory.characteristic_roots import Complex
 from ...theory.frequency_search import Minima
 from ...theory.port_analysis import PortAnalysis
 from ...theory.port_transparency import Transparency
@@ -33,8 +32,8 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
     joints = sorted({one.joint for one in ports.transparency})
-    with style.figure_style(size):
-        figure = style.new_figure(3.8, size.width_in)
+    sites = dict.fromkeys(one.at for one in ports.transparency)
+    with style.styled_figure(size, 3.8) as figure:
         grid = style.add_panels(figure, 2, len(joints), sharex=True, sharey="row")
         for column, joint in enumerate(joints):
             of_joint = [one for one in ports.transparency if one.joint == joint]
@@ -46,7 +45,14 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         grid[0, 0].set_ylabel("|Z| (N m s/rad)")
         grid[1, 0].set_ylabel("phase (degrees)")
         grid[1, 0].yaxis.set_major_locator(MultipleLocator(45.0))
-        style.add_legend(figure, _impedance_entries(ports))
+        of = ports.transparency[0].of
+        entries: list[tuple[str, dict[str, Any]]] = [
+            *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
+            (f"{of} free", {"color": style.REFERENCE}),
+            (f"{of} clamped", {"color": style.REFERENCE, "linestyle": _CLAMPED}),
+            ("band of the Z-width", {**_BAND, "alpha": 0.4, "linewidth": 6.0}),
+        ]
+        style.add_legend(figure, entries)
     return figure
 
 
@@ -59,7 +65,7 @@ def _plot_impedance(
             line: dict[str, Any] = {"color": _colour(ports, one.at), "linestyle": dashes}
             line["linewidth"] = 2.0 - 1.2 * n / (len(transparency) - 1) if len(transparency) > 1 else 1.1
             magnitude.loglog(hz, np.abs(Z), **line)
-            phase.semilogx(hz, _phase_degrees(Z), **line)
+            phase.semilogx(hz, np.rad2deg(np.unwrap(np.angle(Z))), **line)  # from -180 to 180 degrees on
     for axes in (magnitude, phase):
         axes.axvspan(*transparency[0].band_hz, **_BAND)
         axes.set_xlim(hz[0], hz[-1])
@@ -70,25 +76,8 @@ def _describe_widths(transparency: Sequence[Transparency]) -> str:
     return f"\nZ-width {widths}".replace("-", "\N{MINUS SIGN}").replace("Z\N{MINUS SIGN}", "Z-")
 
 
-def _phase_degrees(Z: Complex) -> Array:
-    """Returns the unwrapped phase, its start between -180 and 180 degrees."""
-    degrees: Array = np.rad2deg(np.unwrap(np.angle(Z)))
-    return degrees
-
-
 def _colour(ports: PortAnalysis, site: str) -> str:
     return style.SITE_COLOURS[ports.sites.index(site) % len(style.SITE_COLOURS)]
-
-
-def _impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    sites = dict.fromkeys(one.at for one in ports.transparency)
-    of = ports.transparency[0].of
-    return [
-        *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
-        (f"{of} free", {"color": style.REFERENCE}),
-        (f"{of} clamped", {"color": style.REFERENCE, "linestyle": _CLAMPED}),
-        ("band of the Z-width", {**_BAND, "alpha": 0.4, "linewidth": 6.0}),
-    ]
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
@@ -99,25 +88,17 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     """
     if ports.verdict == "unstable":
         return style.empty_figure("The loop without operators is unstable: it cannot be passive.", size)
-    with style.figure_style(size):
-        figure = style.new_figure(3.9, size.width_in)
+    with style.styled_figure(size, 3.9) as figure:
         above, below = style.add_panels(figure, 2, 1, sharex=True)[:, 0]
         _plot_eigenvalues(ports, above)
-        if len(ports.sites) == 2:
-            _plot_parameters(ports, below)
-        else:
-            _plot_margin(ports, below)
-        below.set_xlim(*ports.band_hz)
-        below.set_xlabel("frequency (Hz)")
+        (_plot_parameters if len(ports.sites) == 2 else _plot_margin)(ports, below)
+        below.set(xlim=ports.band_hz, xlabel="frequency (Hz)")
         figure.align_ylabels()
-        style.add_legend(figure, _passivity_entries(ports))
+        proof = [] if ports.proof is None else [("all joints, in r (weighted)", _PROOF)]
+        joints = [(f"joint {joint} alone", _joint_line(joint)) for joint in ports.joints]
+        fails = ("fails", {**_FAILS, "linewidth": 6.0})
+        style.add_legend(figure, [("all joints", _ALL), *joints, *proof, fails])
     return figure
-
-
-def _passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    proof = [] if ports.proof is None else [("all joints, in r (weighted)", _PROOF)]
-    joints = [(f"joint {joint} alone", _joint_line(joint)) for joint in ports.joints]
-    return [("all joints", _ALL), *joints, *proof, ("fails", {**_FAILS, "linewidth": 6.0})]
 
 
 def _joint_line(joint: int) -> dict[str, Any]:
@@ -135,16 +116,13 @@ def _shade(axes: Axes, minima: Minima) -> None:
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    for joint, one in ports.joints.items():
-        _plot(axes, one.minima, one.minima.values / (2.0 * one.size), **_joint_line(joint))
-    if ports.proof is not None:
-        _plot(axes, ports.proof.minima, ports.proof.minima.values / (2.0 * ports.proof.size), **_PROOF)
-    own = ports.velocity
-    _plot(axes, own.minima, own.minima.values / (2.0 * own.size), **_ALL)
-    _shade(axes, own.minima)
+    curves = [(one, _joint_line(joint)) for joint, one in ports.joints.items()]
+    curves += [] if ports.proof is None else [(ports.proof, _PROOF)]
+    for one, line in [*curves, (ports.velocity, _ALL)]:
+        _plot(axes, one.minima, one.minima.values / (2.0 * one.size), **line)
+    _shade(axes, ports.velocity.minima)
     axes.axhline(0.0, **style.LIMIT_LINE)
-    axes.set_ylim(-1.08, 1.08)
-    axes.set_ylabel(r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
+    axes.set(ylim=(-1.08, 1.08), ylabel=r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
 
 
 def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
@@ -152,8 +130,7 @@ def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
         _plot(axes, one.minima, one.minima.values, **_joint_line(one.joint))
         _shade(axes, one.minima)
     axes.axhline(1.0, **style.LIMIT_LINE)
-    axes.set_ylim(-1.2, _MAX_SHOWN_PARAMETER)
-    axes.set_ylabel("Llewellyn's parameter")
+    axes.set(ylim=(-1.2, _MAX_SHOWN_PARAMETER), ylabel="Llewellyn's parameter")
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:

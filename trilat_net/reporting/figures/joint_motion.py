@@ -5,6 +5,8 @@ those of `analysis.site_signals`.
 """
 
 from collections.abc import Sequence
+from functools import partial
+from itertools import product
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,7 +33,7 @@ from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
-from .time_figure import SiteSignal, TimeFigure, time_figure
+from .time_figure import SiteSignal, TimeFigure, site_records, time_figure
 
 THETA_UNITS = ("kg m²", "kg m²", "kg m²", "kg m", "kg m")
 """Of the five parameters of Eq. (24)."""
@@ -46,11 +48,8 @@ _STEP = 0.01
 
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques of the operators ON the arms over time, N m; Fig. 3 of the paper."""
-    with time_figure(log, form, 2.2) as plot:
-        sites = sites_with_operator(log)
-        row = _joint_panels(plot, sites, plot.records(external_torques), "torque on the arm (N m)")
-        plot.finish(row, style.site_legend_entries(log, sites))
-    return plot.figure
+    signal = site_records(log, external_torques)
+    return _draw_joints(log, form, sites_with_operator(log), signal, "torque on the arm (N m)")
 
 
 def draw_operator_displacement(
@@ -58,18 +57,11 @@ def draw_operator_displacement(
 ) -> Figure:
     """Returns how far the operators moved every site over time, rad: the log minus a run without operators.
 
-    Args:
-        log: the log.
-        form: width and type size.
-        twin: the same experiment without operators; None: it is simulated.
+    That run, `twin`, is simulated if it is not given.
     """
     other = simulate_without_operators(log) if twin is None else twin
-    with time_figure(log, form, 2.2) as plot:
-        row = _joint_panels(
-            plot, log.sites, lambda site: operator_displacement(log, other, site), "moved by operators (rad)"
-        )
-        plot.finish(row, style.site_legend_entries(log, log.sites))
-    return plot.figure
+    signal = partial(operator_displacement, log, other)
+    return _draw_joints(log, form, log.sites, signal, "moved by operators (rad)")
 
 
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
@@ -77,14 +69,27 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     largest = {site: np.abs(controller_torques(log[site])).max(initial=0.0) for site in log.sites}
     limits = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
     reached = sorted({limit for site, limit in limits.items() if largest[site] >= limit})
+    signal = site_records(log, controller_torques)
+    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", reached)
+
+
+def _draw_joints(
+    log: Log,
+    form: FigureSize,
+    sites: Sequence[str],
+    signal: SiteSignal,
+    label: str,
+    limits: Sequence[float] = (),
+) -> Figure:
+    """Returns a signal over time: a panel per joint, a line per site, dashed ones at its limits."""
     with time_figure(log, form, 2.2) as plot:
-        row = _joint_panels(plot, log.sites, plot.records(controller_torques), "control torque (N m)")
-        for axes in row:
-            for limit in reached:
-                axes.axhline(limit, **style.LIMIT_LINE)
-                axes.axhline(-limit, **style.LIMIT_LINE)
-        entries = [("limit", style.LIMIT_LINE)] if reached else []
-        plot.finish(row, [*style.site_legend_entries(log, log.sites), *entries])
+        row = style.add_panels(plot.figure, 1, JOINTS, sharex=True, sharey=True)[0]
+        style.title_joints(row)
+        plot.joint_row(row, sites, signal, label)
+        for axes, limit in product(row, (sign * limit for limit in limits for sign in (1, -1))):
+            axes.axhline(limit, **style.LIMIT_LINE)
+        entries = [("limit", style.LIMIT_LINE)] if limits else []
+        plot.finish(row, [*style.site_legend_entries(log, sites), *entries])
     return plot.figure
 
 
@@ -98,8 +103,8 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         torque, angle = "torque (N m)", "angle (rad)"
         if not form.narrow:
             torque, angle = "torque on the arm (N m)", "joint angle (rad)"
-        plot.joint_row(grid[0], sites_with_operator(log), plot.records(external_torques), torque)
-        plot.joint_row(grid[1], log.sites, plot.records(joint_angles), angle)
+        plot.joint_row(grid[0], sites_with_operator(log), site_records(log, external_torques), torque)
+        plot.joint_row(grid[1], log.sites, site_records(log, joint_angles), angle)
         plot.finish(grid[1], style.site_legend_entries(log, log.sites))
     return plot.figure
 
@@ -136,7 +141,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         row[1].sharey(row[0])
         row[1].tick_params(labelleft=False)
         style.title_joints(row)
-        plot.joint_row(row, log.sites, plot.records(joint_errors), "tracking error (rad)")
+        plot.joint_row(row, log.sites, site_records(log, joint_errors), "tracking error (rad)")
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             remaining = largest_remaining_error(log[site])
@@ -186,10 +191,7 @@ def draw_parameter_estimates(
 ) -> Figure:
     """Returns the estimates of the five parameters over time with the true values; Fig. 6 of the paper.
 
-    Args:
-        log: the log.
-        form: width and type size.
-        sites: whose estimates; None for all. The paper shows master 1.
+    They are those of all sites unless `sites` are given; the paper shows master 1.
     """
     chosen = log.sites if sites is None else tuple(sites)
     rows = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
@@ -218,20 +220,12 @@ def _draw_estimate(plot: TimeFigure, sites: Sequence[str], index: int, axes: Axe
         axes.axhline(truth, **{**style.LIMIT_LINE, "color": style.site_colour(plot.log, site)})
 
 
-def _joint_panels(plot: TimeFigure, sites: Sequence[str], signal: SiteSignal, label: str) -> Sequence[Axes]:
-    row: Sequence[Axes] = style.add_panels(plot.figure, 1, JOINTS, sharex=True, sharey=True)[0]
-    style.title_joints(row)
-    plot.joint_row(row, sites, signal, label)
-    return row
-
-
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the phase portrait of the errors: e over the run against qd - qd_des, a panel per joint.
 
     A ring marks the start of a site, a disc its end.
     """
-    with style.figure_style(form):
-        figure = style.new_figure(1.0 + 0.36 * form.width_in, form.width_in)
+    with style.styled_figure(form, 1.0 + 0.36 * form.width_in) as figure:
         row = style.add_panels(figure, 1, JOINTS)[0]
         for site in log.sites:
             part, line = log[site], style.site_line(log, site, _LOOP_PT)

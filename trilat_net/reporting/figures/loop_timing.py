@@ -48,28 +48,26 @@ def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
     edges = loop_time_bin_edges(log)
-    lateness = "lateness" if form.narrow else "wake-up after the deadline"
-    computing = "computing time" if form.narrow else "computing time of a tick"
-    with style.figure_style(form):
-        figure = style.new_figure(0.6 + (1.3 if form.narrow else 1.05) * len(log.sites), form.width_in)
+    labels = ("lateness", "computing time")
+    if not form.narrow:
+        labels = ("wake-up after the deadline", "computing time of a tick")
+    with style.styled_figure(form, 0.6 + (1.3 if form.narrow else 1.05) * len(log.sites)) as figure:
         grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
         for site, (late, busy) in zip(log.sites, grid, strict=True):
             _bars(log, site, late, log[site].late_us, edges, form)
             _bars(log, site, busy, log[site].busy_us, edges, form)
             late.set_ylabel("ticks (count)")
         grid[0, 0].set_ylim(bottom=0.7)
-        for axes, text in zip(grid[-1], (lateness, computing), strict=True):
+        for axes, text in zip(grid[-1], labels, strict=True):
             axes.set_xlabel(f"{text} (µs)")
         style.add_legend(figure, [("one period", style.LIMIT_LINE)])
     return figure
 
 
 def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.stairs(
-        bin_loop_times(times_us, edges), edges, baseline=0.5, fill=True, color=style.site_colour(log, site)
-    )
+    axes.set(xscale="log", yscale="log")
+    counts, colour = bin_loop_times(times_us, edges), style.site_colour(log, site)
+    axes.stairs(counts, edges, baseline=0.5, fill=True, color=colour)
     axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")

@@ -34,6 +34,7 @@ from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_d
 NO_OPERATOR = "no site has an operator in this run"
 
 Draw = Callable[[Log, FigureSize], Figure]
+Absent = Callable[[Log], str]
 
 
 class FigureEntry(NamedTuple):
@@ -48,17 +49,20 @@ class FigureEntry(NamedTuple):
 
     about: str
     draw: Draw
-    absent: Callable[[Log], str] = lambda _: ""
+    absent: Absent = lambda _: ""
     in_report: bool = False
 
 
-def explain_absent_operator(log: Log) -> str:
-    """Returns why there is no torque of an operator to draw; "" if there is one."""
-    return "" if sites_with_operator(log) else NO_OPERATOR
+def _unless(shows: Callable[[Log], object], reason: str) -> Absent:
+    return lambda log: "" if shows(log) else reason
 
 
-def _no_script(log: Log) -> str:
-    return "" if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
+explain_absent_operator = _unless(sites_with_operator, NO_OPERATOR)
+"""Returns why there is no torque of an operator to draw; "" if there is one."""
+
+
+def _has_script(log: Log) -> bool:
+    return any(site.hands for site in log.scenario.sites.values())
 
 
 def _no_functional(log: Log) -> str:
@@ -66,84 +70,67 @@ def _no_functional(log: Log) -> str:
     return "" if law.holds else law.text
 
 
-def _no_learning(log: Log) -> str:
-    learnt = any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
-    return "" if learnt else "no estimate changed in this run"
+def _learns(log: Log) -> bool:
+    return any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
 
+
+_ReportEntry = partial(FigureEntry, in_report=True)
 
 FIGURES = {
     "operation": FigureEntry(
         "torque on the arms above their angles", joint_motion.draw_operation, explain_absent_operator
     ),
-    "operator_torques": FigureEntry(
-        "torque on the arms (Fig. 3)",
-        joint_motion.draw_operator_torques,
-        explain_absent_operator,
-        in_report=True,
+    "operator_torques": _ReportEntry(
+        "torque on the arms (Fig. 3)", joint_motion.draw_operator_torques, explain_absent_operator
     ),
-    "positions": FigureEntry(
-        "actual and desired angles (Fig. 4)", joint_motion.draw_positions, in_report=True
-    ),
-    "tracking_errors": FigureEntry(
-        "errors, and the largest one still to come (Fig. 5)",
-        joint_motion.draw_tracking_errors,
-        in_report=True,
+    "positions": _ReportEntry("actual and desired angles (Fig. 4)", joint_motion.draw_positions),
+    "tracking_errors": _ReportEntry(
+        "errors, and the largest one still to come (Fig. 5)", joint_motion.draw_tracking_errors
     ),
     "settling": FigureEntry("size of the errors on a log axis, settling times", joint_motion.draw_settling),
     "phase": FigureEntry("errors against their rates", joint_motion.draw_phase_portrait),
-    "parameter_estimates": FigureEntry(
+    "parameter_estimates": _ReportEntry(
         "estimates and true values (Fig. 6)",
         joint_motion.draw_parameter_estimates,
-        _no_learning,
-        in_report=True,
+        _unless(_learns, "no estimate changed in this run"),
     ),
     "control_torques": FigureEntry("torque of the controllers", joint_motion.draw_control_torques),
-    "hands_moved": FigureEntry(
+    "hands_moved": _ReportEntry(
         "the log minus the same run without operators",
         joint_motion.draw_operator_displacement,
-        _no_script,
-        in_report=True,
+        _unless(_has_script, NO_OPERATOR),
     ),
     "contact": FigureEntry(
         "force of the walls, and depth in them",
         draw_contact,
-        lambda log: "" if sites_with_walls(log) else "no site has a wall in this run",
+        _unless(sites_with_walls, "no site has a wall in this run"),
     ),
     "authority": FigureEntry(
         "shares that change, and the motion of the arms",
         draw_authority,
-        lambda log: "" if sites_with_changing_dominance(log) else "the shares of all sites are constant",
+        _unless(sites_with_changing_dominance, "the shares of all sites are constant"),
     ),
     "certificate": FigureEntry(
         "V, its parts, who changed it, the energy balance",
         lambda log, form: draw_functional(log, certify(log), form),
         _no_functional,
     ),
-    "arms": FigureEntry("the arms at a few instants", draw_arms, in_report=True),
-    "sample_age": FigureEntry("age of the samples in use, per link", draw_sample_age, in_report=True),
-    "delay_distributions": FigureEntry(
+    "arms": _ReportEntry("the arms at a few instants", draw_arms),
+    "sample_age": _ReportEntry("age of the samples in use, per link", draw_sample_age),
+    "delay_distributions": _ReportEntry(
         "distributions of delays and ages",
         draw_delay_distributions,
-        lambda log: "" if has_varying_delay(log) else "every link is stated as one constant delay",
-        in_report=True,
+        _unless(has_varying_delay, "every link is stated as one constant delay"),
     ),
-    "loop_timing": FigureEntry(
-        "lateness and computing time of the loops",
-        draw_loop_timing,
-        explain_missing_loop_times,
-        in_report=True,
+    "loop_timing": _ReportEntry(
+        "lateness and computing time of the loops", draw_loop_timing, explain_missing_loop_times
     ),
 }
 """By name, in the order in which a paper has them."""
 
 
 def figure(log: Log, name: str, width_in: float = COLUMN_IN) -> Figure:
-    """Returns a figure of a log for a paper, type 8 pt.
-
-    Args:
-        log: the log.
-        name: one of `FIGURES`.
-        width_in: 3.5 for one column, 7 for two, in.
+    """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
 
     Raises:
         UsageError: there is no such figure or width, or the log has nothing to show in it.
@@ -198,11 +185,8 @@ def write_report_figures(
 ) -> list[Path]:
     """Writes the figures of the report for which a log has something to show, and returns the paths.
 
-    Args:
-        log: the log.
-        folder: exists; earlier figures in it are replaced.
-        twin: the same experiment without operators; None: `hands_moved` is left out.
-        progress: called with the number of figures that are drawn, and of all.
+    Earlier figures in the folder are replaced. Without `twin`, the same experiment without operators,
+    `hands_moved` is left out.
     """
     chosen = {name: FIGURES[name].draw for name in list_drawable_figures(log) if FIGURES[name].in_report}
     if twin is None:

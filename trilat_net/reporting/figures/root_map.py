@@ -13,16 +13,16 @@ from matplotlib.figure import Figure
 from ...theory.characteristic_roots import Spectrum
 from ...theory.linear_analysis import LinearAnalysis
 from .. import style
+from ..figure_size import COLUMN_IN, REPORT_SIZE
 
-WIDTH_IN = 3.5
+_SIZE = REPORT_SIZE._replace(width_in=COLUMN_IN)
 _HEIGHT_IN = 3.0
 _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
 
 
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
     """Returns the map of continuous and sampled roots."""
-    with style.figure_style():
-        figure = style.new_figure(_HEIGHT_IN, WIDTH_IN)
+    with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         _plot_roots(axes, analysis.continuous, "o", style.SITE_COLOURS[0], "continuous")
         if analysis.sampled is not None:
@@ -34,9 +34,7 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
         high = max(high, 0.06 * (high - low), 0.0)
         axes.axvline(0.0, **style.LIMIT_LINE)
         axes.axvspan(0.0, high, **_UNSTABLE)
-        axes.set_xlim(low, high)
-        axes.set_xlabel("real part (1/s)")
-        axes.set_ylabel("imaginary part (rad/s)")
+        axes.set(xlim=(low, high), xlabel="real part (1/s)", ylabel="imaginary part (rad/s)")
         figure.legend(loc="outside upper center", ncols=3, handlelength=1.0, columnspacing=1.0)
     return figure
 

@@ -42,10 +42,7 @@ class DelayDistribution(NamedTuple):
 
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    changed = list_changes(log)
-    lines = {
-        link: stated_delay_line(log, list_stated_models(log, link, changed)) for link in log.scenario.links
-    }
+    lines = {link: stated_delay_line(log, states) for link, states in _stated_models(log).items()}
     with time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
         grid = style.add_panels(plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         drawn: list[Array] = []
@@ -55,7 +52,7 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 plot.mark(axes, [site], f"{peer}->{site}")
                 plot.trace(axes, site, age_ms, **style.site_line(log, peer, 1.4))
                 axes.plot(*line, **style.LIMIT_LINE)
-                axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+                _title_link(axes, peer, site)
                 if not np.any(np.isfinite(age_ms)):
                     style.annotate_empty_panel(axes, "no sample in use")
                 drawn += [age_ms, line[1]]
@@ -74,8 +71,7 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
     A curve is the percentage of samples, or of ticks, with at most that delay or age.
     """
     found = {(d.peer, d.site): d for d in measure_delay_distributions(log)}
-    with style.figure_style(form):
-        figure = style.new_figure(0.6 + 1.05 * len(log.sites), form.width_in)
+    with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
         grid = style.add_panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         x_ms = delay_axis_ms(list(found.values()))
         for site, row in zip(log.sites, grid, strict=True):
@@ -83,7 +79,7 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
                 link = found[peer, site]
                 axes.plot(x_ms, cumulative_percent(link.age_ms, x_ms), **style.site_line(log, peer, 1.8))
                 axes.plot(x_ms, cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE)
-                axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+                _title_link(axes, peer, site)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
         for axes in grid[-1]:
@@ -96,10 +92,12 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 def has_varying_delay(log: Log) -> bool:
     """True if some link is stated as more than one constant delay."""
+    return not all(map(has_one_constant_delay, _stated_models(log).values()))
+
+
+def _stated_models(log: Log) -> dict[str, list[StatedModel]]:
     changed = list_changes(log)
-    return not all(
-        has_one_constant_delay(list_stated_models(log, link, changed)) for link in log.scenario.links
-    )
+    return {link: list_stated_models(log, link, changed) for link in log.scenario.links}
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
@@ -153,6 +151,10 @@ def _age_axis(axes: Axes, values: Array) -> None:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     else:
         axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
+
+
+def _title_link(axes: Axes, peer: str, site: str) -> None:
+    axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
 
 
 def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:

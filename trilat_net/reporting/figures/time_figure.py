@@ -11,7 +11,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from ...analysis.timeline import AppliedChange, find_mode_intervals, list_changes
+from ...analysis.timeline import find_mode_intervals, list_changes
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...log.record_columns import Ints
@@ -39,6 +39,11 @@ _NUMBER: dict[str, Any] = {
 }
 
 
+def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
+    """Returns the signal of all sites whose values follow from their records."""
+    return lambda site: (log[site].tick, log[site].t_s, values(log[site]))
+
+
 @contextmanager
 def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
     """Yields an empty figure in the style of all figures."""
@@ -47,13 +52,7 @@ def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeF
 
 
 class TimeFigure:
-    """A figure of a log over time.
-
-    Args:
-        log: the log.
-        form: width and type size.
-        height_in: height, in.
-    """
+    """A figure of a log over time."""
 
     def __init__(self, log: Log, form: FigureSize, height_in: float) -> None:
         self.log = log
@@ -61,10 +60,6 @@ class TimeFigure:
         self._small_pt = form.small_pt
         self._changes = list(enumerate(list_changes(log), 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
-
-    def records(self, values: Callable[[SiteLog], Array]) -> SiteSignal:
-        """Returns the signal of all sites whose values follow from their records."""
-        return lambda site: (self.log[site].tick, self.log[site].t_s, values(self.log[site]))
 
     def trace(self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any) -> None:
         """Draws values over the records of a site, shape (K,); `options` replace those of the site's line."""
@@ -96,25 +91,18 @@ class TimeFigure:
             for mode, from_s, to_s in self._modes[site]:
                 depth = _BACK if mode == "return" else _AWAY
                 axes.axvspan(from_s, to_s, color=colour, alpha=depth, linewidth=0.0, zorder=0.5)
-        for n, changed in self._changes_of(sites, link):
+        for n, changed in self._changes:
+            if changed.site not in sites or (link and changed.change.link != link):
+                continue
             at_s, place = changed.change.at_s, axes.get_xaxis_transform()
             axes.axvline(at_s, zorder=0.6, **_CHANGE)
             if numbered:
                 axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)
 
-    def finish(
-        self,
-        lowest: Sequence[Axes],
-        entries: Sequence[tuple[str, dict[str, Any]]],
-        *,
-        links: bool = False,
-    ) -> None:
+    def finish(self, lowest: Sequence[Axes], entries: style.LegendEntries, *, links: bool = False) -> None:
         """Gives the lowest panels their time axis, the figure its legend, and explains its markers.
 
-        Args:
-            lowest: the panels.
-            entries: (text, options of the line).
-            links: whether only changes of links are marked.
+        With `links`, only changes of links are marked.
         """
         style.set_time_axis(self.log, lowest)
         style.add_legend(self.figure, entries)
@@ -131,7 +119,3 @@ class TimeFigure:
         if lines:
             text = style.typeset("\n".join(lines))
             self.figure.supxlabel(text, x=0.01, ha="left", fontsize=self._small_pt, color=style.REFERENCE)
-
-    def _changes_of(self, sites: Sequence[str], link: str) -> list[tuple[int, AppliedChange]]:
-        own = [(n, c) for n, c in self._changes if c.site in sites]
-        return [(n, c) for n, c in own if c.change.link == link] if link else own
