@@ -8,7 +8,6 @@ from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual_network import (
     Deliveries,
-    PeerTicks,
     complete_deliveries,
     recorded_deliveries,
     retime_deliveries,
@@ -18,7 +17,7 @@ from trilat_net.net.wire import encode_state
 
 TICKS = 120
 PEERS = ("m1", "m2")
-SENDERS = [PeerTicks(1000, TICKS - 1)] * 2
+SENDERS = [1000] * 2, [TICKS - 1] * 2
 
 Sample = tuple[int, int]
 """Index of the peer, tick of the sample."""
@@ -75,7 +74,7 @@ def entries(came: Deliveries) -> set[Sample]:
 
 def test_of_a_whole_log_it_is_what_the_records_list() -> None:
     part = short(steady(3))
-    came = complete_deliveries(part, SENDERS)
+    came = complete_deliveries(part, *SENDERS)
     assert came == recorded_deliveries(part)
     assert came.at == {state.tick: state.rx for state in part.states}
     assert (came.first, came.last, came.unrecorded) == (0, TICKS - 1, frozenset())
@@ -83,7 +82,7 @@ def test_of_a_whole_log_it_is_what_the_records_list() -> None:
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_on_a_steady_network_what_is_missing_is_found_at_its_own_ticks(lost: set[int], ticks: int) -> None:
-    whole, came = short(steady(ticks)), complete_deliveries(short(steady(ticks), lost), SENDERS)
+    whole, came = short(steady(ticks)), complete_deliveries(short(steady(ticks), lost), *SENDERS)
     assert came.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.at.items() if at}
     assert pairs == {state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx}
@@ -95,7 +94,7 @@ def test_on_any_network_every_sample_that_came_is_there_once_and_no_record_is_to
 ) -> None:
     """In order, of samples older than the newest that a record lists: of later ones nobody knows."""
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
-    came = complete_deliveries(gapped, SENDERS)
+    came = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
         assert came.at[state.tick] == state.rx
     assert sum(map(len, came.at.values())) == len(entries(came))
@@ -109,14 +108,14 @@ def test_on_any_network_every_sample_that_came_is_there_once_and_no_record_is_to
 
 def test_what_never_came_does_not_come() -> None:
     """Sample 50 was lost, far from any gap."""
-    came = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), SENDERS)
+    came = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
     assert (0, 50) not in entries(came)
     assert {(1, 50), (0, 20), (0, 79)} <= entries(came)
 
 
 def test_fewer_than_half_of_the_records_are_too_few() -> None:
     with pytest.raises(LogError, match="s has records of 59 of 120 ticks"):
-        complete_deliveries(short(steady(), set(range(10, 71))), SENDERS)
+        complete_deliveries(short(steady(), set(range(10, 71))), *SENDERS)
 
 
 rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])

@@ -4,7 +4,7 @@ Two criteria: equal bits on the platform that made the log, else |a - b| <= 1e-9
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from ..core.ticks import TickRecord
@@ -18,13 +18,7 @@ NumberEquality = Callable[[float, float], bool]
 
 
 class RecordDifference(NamedTuple):
-    """A field of a record that differs from the execution.
-
-    Attributes:
-        field: the field, with the index of the number in it.
-        logged: its value in the log.
-        computed: its value in the execution.
-    """
+    """A field of a record, with the index of the number in it, that differs from the execution."""
 
     site: str
     tick: int
@@ -79,37 +73,28 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
 def find_first_difference(
     logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality
 ) -> RecordDifference | None:
-    """Returns the first field in which a record differs from an execution, or None.
+    """Returns the first field in which a record differs from an execution, or None."""
+    for field, a, b, same in _compare_fields(logged, computed, peers, equal):
+        if not same:
+            return RecordDifference(logged.site, logged.tick, field, a, b)
+    return None
 
-    Args:
-        logged: the record.
-        computed: the output of `Site.step`.
-        peers: the site's peers in scenario order.
-        equal: criterion for two numbers.
-    """
 
-    def differ(field: str, a: Any, b: Any) -> RecordDifference:
-        return RecordDifference(logged.site, logged.tick, field, a, b)
-
-    for field, value in (
-        ("tick", computed.tick),
-        ("t_ns", computed.t_ns),
-        ("mode", computed.mode.name.lower()),
-    ):
-        if getattr(logged, field) != value:
-            return differ(field, getattr(logged, field), value)
+def _compare_fields(
+    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality
+) -> Iterator[tuple[str, Any, Any, bool]]:
+    """Yields every field with both values, and whether they agree."""
+    mode = computed.mode.name.lower()
+    yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
+    yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns
+    yield "mode", logged.mode, mode, logged.mode == mode
     for field in STATE_VECTORS:
         for n, (a, b) in enumerate(zip(getattr(logged, field), getattr(computed, field), strict=True)):
-            if not equal(float(a), b):
-                return differ(f"{field}[{n}]", float(a), b)
+            yield f"{field}[{n}]", float(a), b, equal(float(a), b)
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
-        if logged.used.get(peer) != used.get(peer):
-            return differ(f"used[{peer}]", logged.used.get(peer), used.get(peer))
-    if logged.rx_crc != computed.rx_crc:
-        return differ("rx (its CRC-32)", logged.rx_crc, computed.rx_crc)
-    if logged.cmd != computed.cmd:
-        return differ("cmd", logged.cmd, computed.cmd)
-    if not _equal_lists(logged.mem, computed.mem, equal):
-        return differ("mem", logged.mem, computed.mem)
-    return None
+        before, now = logged.used.get(peer), used.get(peer)
+        yield f"used[{peer}]", before, now, before == now
+    yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
+    yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
+    yield "mem", logged.mem, computed.mem, _equal_lists(logged.mem, computed.mem, equal)

@@ -40,8 +40,7 @@ def check_fusable(scenario: Scenario) -> None:
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
-    ratio = _largest_ratio(scenario)
-    if ratio > MAX_ARRIVALS:
+    if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
         raise ScenarioError(
             f"the fastest site makes {ratio} ticks within one of the slowest, at most {MAX_ARRIVALS} "
             "are taken",

@@ -29,12 +29,7 @@ RECORDS_LABEL = "records"
 
 
 class LogCheckReport(NamedTuple):
-    """The result of executing a log again.
-
-    Attributes:
-        result: every site executed from its records.
-        lines: that and the other checks, a line each.
-    """
+    """The result of executing a log again, and a line for that and for every other check."""
 
     result: VerifyResult
     lines: list[CheckLine]

@@ -8,10 +8,12 @@ network of the log. Without changes both give the log, bit for bit. Both sides o
 same instants: records of the log that the rerun executed too.
 """
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,20 +23,27 @@ from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
+from ..errors import LogError
 from ..log.log_file import LogFile
 from ..log.log_reader import Log, open_log
+from ..log.log_writer import LogWriter
 from ..log.mcap_reader import Progress
 from ..log.mcap_writer import Sink
 from ..log.record_columns import Ints
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..log.site_log import SiteLog
+from ..net.messages import READABLE, State
+from ..net.wire import decode
 from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
-from .rerun_log import write_rerun_log
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
-from .verify import find_executed_sites, find_user_laws
+from .resumption import read_output
+from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry
+from .verify import EXECUTED_SITES_KEY, find_executed_sites, find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
+
+RERUN_DRIVER = "rerun"
 
 
 class LogAndRerun(NamedTuple):
@@ -48,7 +57,6 @@ class SiteEffect(NamedTuple):
     """The effect of a rerun on one site. Figures are None if nothing could be compared.
 
     Attributes:
-        site: the site.
         executed: executed ticks.
         compared: of those, the ones at whose time the log has a record.
         identical: of those, the ones of which every computed field has the same bits (with changes: except
@@ -88,8 +96,6 @@ class LinkEffect(NamedTuple):
 
     Attributes:
         link: as in "m1->s".
-        age_mean_ms: mean over the ticks, ms.
-        age_max_ms: maximum, ms.
     """
 
     link: str
@@ -105,15 +111,7 @@ class LinkEffect(NamedTuple):
 def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, deliveries: Deliveries, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns the effect of a rerun on one site, and on the links over which it receives.
-
-    Args:
-        log: the log.
-        request: the rerun.
-        site: the site after its last tick.
-        deliveries: its arrivals.
-        ticks: its ticks, in order.
-    """
+    """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
     before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
     after = SiteLog(site.name, before.peers, rate_hz, [tick.payload for tick in executed], "rerun")
@@ -179,15 +177,7 @@ _REPR_LENGTH = 120
 
 @dataclass(frozen=True, repr=False)
 class Rerun:
-    """A log and its rerun.
-
-    Attributes:
-        before: the log.
-        request: the sites and changes of the rerun.
-        ticks: every executed tick, in order of execution.
-        sites: per executed site the effect.
-        links: the effect on the links over which these sites receive.
-    """
+    """A log and its rerun: every executed tick, and the effects per executed site and per link to it."""
 
     before: Log
     request: RerunRequest
@@ -205,13 +195,37 @@ class Rerun:
         """The rerun as a log: the executed sites, and the others as recorded."""
         return open_in_memory(self.write)
 
-    def write(self, stream: Sink) -> None:
-        """Writes the rerun as a log into a stream, which stays open.
+    def write(self, stream: Sink, views_hz: float = 0.0) -> None:
+        """Writes the rerun as a log into a stream, which stays open; see `LogWriter` for the views.
+
+        Executed sites are written anew, recorded sites byte for byte. The file names its source log by
+        SHA-256, the executed sites and the changes; its scenario is the one that holds in it. Executed sites
+        have no measured values (timing, round trips).
 
         Raises:
+            LogError: the log's epoch is no time.
             LogRefused: the disk refused.
         """
-        write_rerun_log(self.before, self.request, self.ticks, stream)
+        log, request = self.before, self.request
+        session, epoch_unix_ns = log.session["session"], _read_epoch_unix_ns(log)
+        metadata = rerun_metadata(log, request)
+        writer = LogWriter(
+            stream, request.scenario, session, RERUN_DRIVER, epoch_unix_ns, metadata, views_hz=views_hz
+        )
+        channels, entries = {}, []
+        for name in log.sites:
+            boot = log[name].states[0].boot if len(log[name]) else 0
+            rate_hz = request.scenario.sites[name].rate_hz
+            own = channels[name] = SiteChannels(session, name, boot, log[name].peers, rate_hz)
+            if name in request.recorded:
+                entries.append(_copy_recorded(log, name, own))
+            else:
+                entries.append(_encode_executed([tick for tick in self.ticks if tick.site == name], own))
+        for entry in merge(*entries, key=lambda entry: entry.t_ns):
+            channels[entry.site].write(entry, writer, epoch_unix_ns)
+        writer.finish(
+            {key: text for each in channels.values() for key, text in each.describe_accounts().items()}
+        )
 
     def save(self, path: Path, *, force: bool = False) -> None:
         """Writes the rerun as a log with standard channels into a file; `force` lets it replace one.
@@ -221,7 +235,7 @@ class Rerun:
             LogRefused: the disk refused.
         """
         with LogFile(path, force=force) as stream:
-            write_rerun_log(self.before, self.request, self.ticks, stream, VIZ_HZ)
+            self.write(stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
@@ -293,19 +307,62 @@ def rerun(
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)
     request = resolve_rerun_request(before, names, set, closed_loop=closed_loop)
+    sites: dict[str, SiteEffect] = {}
+    links: dict[str, LinkEffect] = {}
     with process.pause_gc():
         execution = RerunExecution(before, request)
         ticks = list(execution.run(progress))
-        by_site: dict[str, list[RerunTick]] = {name: [] for name in request.replaced}
-        for tick in ticks:
-            by_site[tick.site].append(tick)
-        sites: dict[str, SiteEffect] = {}
-        links: dict[str, LinkEffect] = {}
-        for name, own in by_site.items():
-            site, deliveries = execution.sites[name], execution.deliveries[name]
-            sites[name], over = compare_site_rerun(before, request, site, deliveries, own)
+        for name, site in execution.sites.items():
+            own = [tick for tick in ticks if tick.site == name]
+            sites[name], over = compare_site_rerun(before, request, site, execution.deliveries[name], own)
             links |= {link.link: link for link in over}
     return Rerun(before, request, ticks, sites, links)
+
+
+def _read_epoch_unix_ns(log: Log) -> int:
+    written = log.session.get("epoch_unix_ns", "0")
+    if not written.isdecimal() or int(written) > LAST_LOG_NS:
+        raise LogError(f"{log.source}: its epoch_unix_ns is no time: {written[:40]!r}")
+    return int(written)
+
+
+def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
+    """Returns the session metadata that name the source log and the changes."""
+    digests = {}
+    for path in map(Path, log.sources):
+        if path.is_file():  # a log in memory has none
+            with path.open("rb") as stream:
+                digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return {
+        "rerun_mode": request.mode,
+        "rerun_of": " ".join(path.name for path in digests),
+        "rerun_of_sha256": " ".join(digests.values()),
+        "rerun_of_driver": log.driver,
+        EXECUTED_SITES_KEY: " ".join(request.replaced),
+        "rerun_changes": "; ".join(describe_rerun_changes(request)),
+    }
+
+
+def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
+    """Yields everything that a recorded site published, in order of time."""
+    part = log[name]
+    events = [event for event in log.events if event.member == name]
+    events.sort(key=lambda event: event.t_ns)  # those before the epoch come first
+    return merge(
+        (channels.record(state, payload) for state, payload in zip(part.states, part.payloads, strict=True)),
+        (channels.stats(stats) for stats in log.link_stats(name)),
+        (channels.event(event, n) for n, event in enumerate(events)),
+        key=lambda entry: entry.t_ns,
+    )
+
+
+def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iterator[SiteEntry]:
+    """Yields everything that an executed site publishes, in order of time."""
+    for tick in ticks:
+        state = decode(tick.payload, State, READABLE)
+        yield channels.record(state, tick.payload)
+        yield from channels.follow(read_output(state, channels.peers), tick.stats)
+    yield channels.end()
 
 
 def _nested_json(values: dict[str, Any]) -> dict[str, Any]:

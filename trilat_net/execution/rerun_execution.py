@@ -24,23 +24,13 @@ from .difference import RecordDifference, equal_bits, equal_record, find_first_d
 from .rerun_request import RerunRequest
 from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, read_output
 from .verify import find_last_ticks
-from .virtual_network import (
-    Deliveries,
-    PeerTicks,
-    complete_deliveries,
-    recorded_deliveries,
-    retime_deliveries,
-)
+from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
 
 class RerunTick(NamedTuple):
     """One tick of an executed site.
 
     Attributes:
-        site: the site.
-        tick: the tick.
-        t_ns: its nominal time, ns since the epoch.
-        mode: the site's mode.
         payload: its record as it would be published; the log's own if `kept`.
         same: True if the log has a record of that tick of which every computed field has the same bits.
         kept: True if the log's record stands, because too little is known to execute it.
@@ -60,22 +50,12 @@ class RerunTick(NamedTuple):
 class RerunSite:
     """One site, executed again against its deliveries.
 
-    Args:
-        scenario: the scenario of the rerun.
-        part: the site's records.
-        deliveries: its arrivals.
-        samples: per peer, in scenario order, its samples by tick; those of executed peers appear in it as
-            they are computed.
-        ends: per peer the last tick that it made.
-        commands: per tick the changes that were ordered then.
-        changed: whether the rerun changes anything.
+    Samples of executed peers appear in `inputs` as they are computed.
 
     Attributes:
-        name: the site.
         k: its next tick.
         first: the first difference from the log's records.
         lacking: number of samples that arrived and are not in the log.
-        diverged: whether it has left its limits.
         output: its last record.
     """
 
@@ -86,9 +66,7 @@ class RerunSite:
         scenario: Scenario,
         part: SiteLog,
         deliveries: Deliveries,
-        samples: Sequence[Mapping[int, ReceivedMotion]],
-        ends: Sequence[int],
-        commands: Mapping[int, Sequence[CoreChange]],
+        inputs: RecordedInputs[CoreChange],
         *,
         changed: bool,
     ) -> None:
@@ -98,8 +76,7 @@ class RerunSite:
         self.lacking = 0
         self.diverged = False
         self._site = Site(scenario.setup(part.name))
-        self._part, self._deliveries, self._changed = part, deliveries, changed
-        self._inputs = RecordedInputs(part, samples, ends, commands)
+        self._part, self._deliveries, self._changed, self._inputs = part, deliveries, changed, inputs
         self._last = min(deliveries.last, scenario.ticks(part.name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
         self._recorded: list[int] = part.tick.tolist() if same_rate else []
@@ -191,15 +168,7 @@ class RerunSample(NamedTuple):
 
 
 class RerunExecution:
-    """The sites of a rerun, executed.
-
-    Args:
-        log: the log.
-        request: the rerun.
-
-    Attributes:
-        sites: the executed sites.
-        deliveries: their arrivals.
+    """The sites of a rerun, executed, and their deliveries.
 
     Raises:
         LogError: the log does not tell enough.
@@ -219,9 +188,7 @@ class RerunExecution:
                 request.scenario,
                 log[name],
                 self.deliveries[name],
-                [samples[peer] for peer in log[name].peers],
-                [self._ends[peer] for peer in log[name].peers],
-                log.commands(name),
+                RecordedInputs(log[name], samples, self._ends, log.commands(name)),
                 changed=bool(request.changes),
             )
             for name in request.replaced
@@ -233,9 +200,7 @@ class RerunExecution:
             return recorded_deliveries(part)
         before = [original.sites[peer].rate_hz for peer in part.peers]
         after = [scenario.sites[peer].rate_hz for peer in part.peers]
-        found = complete_deliveries(
-            part, [PeerTicks(hz, self._ends[p]) for hz, p in zip(before, part.peers, strict=True)]
-        )
+        found = complete_deliveries(part, before, [self._ends[peer] for peer in part.peers])
         rate_hz = scenario.sites[name].rate_hz
         if (part.rate_hz, before) == (rate_hz, after):
             return found

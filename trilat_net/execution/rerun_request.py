@@ -20,13 +20,7 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 
 
 class ChangedValue(NamedTuple):
-    """One value that the rerun changes.
-
-    Attributes:
-        key: its dotted path in the resolved scenario.
-        before: its value in the log.
-        after: its value in the rerun.
-    """
+    """One value that the rerun changes, by its dotted path in the resolved scenario."""
 
     key: str
     before: Any
@@ -41,8 +35,6 @@ class RerunRequest:
         original: the scenario of the log.
         scenario: the scenario of the rerun: changed for the executed sites, the log's for the others.
         replaced: the executed sites, in scenario order.
-        recorded: the others.
-        changes: the changed values.
         without_effect: requested changes of recorded sites, which change nothing.
     """
 
@@ -62,13 +54,7 @@ class RerunRequest:
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Checks a request for a rerun and resolves its scenario.
-
-    Args:
-        log: the log.
-        replace: the sites to execute.
-        overrides: the changes, as `load_scenario` takes them.
-        closed_loop: whether to execute all sites.
+    """Checks a request for a rerun and resolves its scenario, with overrides as `load_scenario` takes them.
 
     Raises:
         UsageError: the sites are not named, or in two ways.

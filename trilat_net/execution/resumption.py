@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 
 from ..core.delay import MAX_DELAY_US
 from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, PlantState, TickRecord
+from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
 from ..core.two_link_arm import JOINTS
 from ..log.site_log import SiteLog
 from ..net.messages import State
@@ -62,21 +62,18 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     )
 
 
-def read_plant_state(state: State) -> PlantState:
-    """Returns the measured state of an external arm at a tick: the q and qd of the record."""
-    return PlantState(state.q, state.qd)
-
-
 class RecordedInputs(Generic[Change]):
     """Arrivals, changes and resumption of one site, from its records and those of its peers.
 
     Args:
         part: the site's records.
-        samples: per peer, in scenario order, its samples by tick.
-        ends: per peer the last tick that it made.
+        samples: per site its samples by tick.
+        ends: per site the last tick that it made.
         changes: per tick the changes that the site took in.
 
     Attributes:
+        samples: per peer, in scenario order, its samples by tick.
+        ends: per peer the last tick that it made.
         assumed: per peer the samples that are assumed to have arrived where no record is.
         lacking: per peer the samples that arrived and whose own record is missing.
     """
@@ -84,14 +81,16 @@ class RecordedInputs(Generic[Change]):
     def __init__(
         self,
         part: SiteLog,
-        samples: Sequence[Mapping[int, ReceivedMotion]],
-        ends: Sequence[int],
+        samples: Mapping[str, Mapping[int, ReceivedMotion]],
+        ends: Mapping[str, int],
         changes: Mapping[int, Sequence[Change]],
     ) -> None:
-        self._part, self._samples, self._ends = part, samples, ends
+        self._part = part
+        self.samples = [samples[peer] for peer in part.peers]
+        self.ends = [ends[peer] for peer in part.peers]
         self._changes = sorted(changes.items(), reverse=True)
-        self.assumed: list[set[int]] = [set() for _ in samples]
-        self.lacking: list[set[int]] = [set() for _ in samples]
+        self.assumed: list[set[int]] = [set() for _ in part.peers]
+        self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def take_changes(self, tick: int) -> list[tuple[int, Change]]:
         """Returns the changes up to a tick that have not been taken yet, each with its own tick."""
@@ -105,7 +104,7 @@ class RecordedInputs(Generic[Change]):
         """Returns the arrivals that entries list, and the entries whose sample no record holds."""
         arrivals: list[Arrival] = []
         missing: list[ArrivalEntry] = []
-        samples = self._samples
+        samples = self.samples
         for entry in entries:
             peer, tick, latency_us = entry
             sample = samples[peer].get(tick) if 0 <= peer < len(samples) else None
@@ -126,7 +125,7 @@ class RecordedInputs(Generic[Change]):
         if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
             return False
         in_use = read_output(states[n - 1], self._part.peers).used
-        return all(used < 0 or used in known for used, known in zip(in_use, self._samples, strict=True))
+        return all(used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True))
 
     def resume(self, site: Site, n: int) -> None:
         """Brings a site into its state at record n, if it `can_resume` there."""
@@ -135,7 +134,7 @@ class RecordedInputs(Generic[Change]):
         in_use: list[Arrival | None] = []
         waiting: list[Arrival] = []
         for j, used in enumerate(last.used):
-            sample = self._samples[j].get(used)
+            sample = self.samples[j].get(used)
             in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd, 0, sample.tau_x))
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
@@ -164,7 +163,7 @@ class RecordedInputs(Generic[Change]):
         states = self._part.states
         records, ticks = self._listing[peer]
         place = bisect_left(records, n)
-        next_listed = ticks[place] if place < len(records) else self._ends[peer] + 1
+        next_listed = ticks[place] if place < len(records) else self.ends[peer] + 1
         newest = max(-(-states[n].t_ns * rate_hz // NS_PER_S) - 1, next_listed - 1)
         before = (
             tick for state in states[max(0, n - _LOOK_BACK) : n] for j, tick, _ in state.rx if j == peer
@@ -174,7 +173,7 @@ class RecordedInputs(Generic[Change]):
         probable: set[int] = set()
         # a waiting sample was sent within the longest delay there is
         oldest = (states[n].t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
-        for tick in range(max(used + 1, oldest), min(max(newest, highest), self._ends[peer]) + 1):
+        for tick in range(max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1):
             listed = self._first_listed[peer].get(tick)
             if listed is None and tick <= newest:
                 probable.add(tick)
@@ -185,7 +184,7 @@ class RecordedInputs(Generic[Change]):
     @cached_property
     def _first_listed(self) -> list[dict[int, int]]:
         """Per peer and sample, the first record (by its place) that lists it."""
-        listed: list[dict[int, int]] = [{} for _ in self._samples]
+        listed: list[dict[int, int]] = [{} for _ in self.samples]
         for m, state in enumerate(self._part.states):
             for peer, tick, _ in state.rx:
                 if 0 <= peer < len(listed):
@@ -195,7 +194,7 @@ class RecordedInputs(Generic[Change]):
     @cached_property
     def _listing(self) -> list[tuple[list[int], list[int]]]:
         """Per peer the records (by their places) that list samples of it, and the first that each lists."""
-        listing: list[tuple[list[int], list[int]]] = [([], []) for _ in self._samples]
+        listing: list[tuple[list[int], list[int]]] = [([], []) for _ in self.samples]
         for m, state in enumerate(self._part.states):
             seen = set()
             for peer, tick, _ in state.rx:

@@ -4,7 +4,7 @@ Invariant: messages of older schema versions are written in the present one; a m
 keeps its bytes.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -29,14 +29,11 @@ class SiteEntry(NamedTuple):
     """One message of the file.
 
     Attributes:
-        site: its site.
         t_ns: its time, ns since the epoch; entries are written in this order.
         sent_ns: its sending time on the sender's clock.
         channel: its channel, as in "state".
         sequence: its sequence number in the file.
         number: its number in its channel, for the account.
-        payload: its bytes.
-        message: its content.
     """
 
     site: str
@@ -50,15 +47,7 @@ class SiteEntry(NamedTuple):
 
 
 class SiteChannels:
-    """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts.
-
-    Args:
-        session: the session of the log that is written.
-        site: the site.
-        boot: its process start.
-        peers: its peers in scenario order.
-        rate_hz: its tick rate.
-    """
+    """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts."""
 
     def __init__(self, session: str, site: str, boot: int, peers: tuple[str, ...], rate_hz: int) -> None:
         self.peers = peers
@@ -71,20 +60,19 @@ class SiteChannels:
         self._t_ns = 0
         self.ticks = 0
 
-    def follow(self, output: TickRecord, stats: LinkStats | None) -> Iterable[SiteEntry]:
+    def follow(self, output: TickRecord, stats: LinkStats | None) -> Sequence[SiteEntry]:
         """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
         self.ticks, self._t_ns = output.tick + 1, output.t_ns
-        return () if stats is None and output.mode is self._mode else self._follow(output, stats)
-
-    def _follow(self, output: TickRecord, stats: LinkStats | None) -> Iterator[SiteEntry]:
-        if stats is not None:
-            yield self.stats(stats)
+        entries = [] if stats is None else [self.stats(stats)]
         if output.mode is not self._mode:
             self._mode = output.mode
             if output.mode is Mode.DIVERGED:
-                yield self.new_event("diverged", describe_divergence(self._site, output), output.t_ns)
+                entries.append(
+                    self.new_event("diverged", describe_divergence(self._site, output), output.t_ns)
+                )
             else:
-                yield self.new_event("mode", describe_mode(self._site, output), output.t_ns)
+                entries.append(self.new_event("mode", describe_mode(self._site, output), output.t_ns))
+        return entries
 
     def end(self, t_ns: int | None = None) -> SiteEntry:
         """Returns the entry of the event that ends the site's run, by default at its last tick."""

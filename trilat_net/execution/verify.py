@@ -14,7 +14,7 @@ from typing import NamedTuple
 from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.site_step import MAX_CHANGES, Site
-from ..core.ticks import MAX_ARRIVALS, CoreChange, TickInput
+from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
@@ -30,7 +30,7 @@ from .difference import (
     equal_to_tolerance,
     find_first_difference,
 )
-from .resumption import ArrivalEntry, RecordedInputs, read_output, read_plant_state
+from .resumption import ArrivalEntry, RecordedInputs, read_output
 
 
 @dataclass(slots=True)
@@ -39,7 +39,6 @@ class VerifyResult:
 
     Attributes:
         whole_run: True if whole runs were executed and bits compared; False if tick by tick, to 1e-9.
-        records: records in the log.
         identical: records of which every computed field agreed.
         unjudged: records behind gaps that could not be judged.
         differing: records that differ.
@@ -72,7 +71,6 @@ class LoggedUserLaw(NamedTuple):
 
     Attributes:
         code: the law, as in "package.module:Law".
-        sites: the sites that it controls.
         changed: how its file differs from the one that ran; "" if it does not.
     """
 
@@ -132,12 +130,10 @@ class SiteVerifier:
         self._scenario, self._log, self._result = scenario, site_log, result
         self._external = site_log.name in scenario.external
         self._law_failed = False
-        self._samples = [by_tick[peer] for peer in site_log.peers]
-        self._ends = [ends[peer] for peer in site_log.peers]
         self._own_end = ends[site_log.name]
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
-        self._inputs = RecordedInputs(site_log, self._samples, self._ends, changes)
+        self._inputs = RecordedInputs(site_log, by_tick, ends, changes)
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
@@ -155,24 +151,20 @@ class SiteVerifier:
                 self._certain = False
             expected = state.tick + 1
             try:
-                if self._law_failed or not (self._certain or self._resume(n)):
-                    result.unjudged += 1
-                else:
+                if not self._certain and not self._law_failed and self._inputs.can_resume(n):
+                    for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
+                        self._site.order(change)
+                    self._inputs.resume(self._site, n)
+                    self._certain = True
+                if self._certain and not self._law_failed:
                     self._verify_record(n, state)
+                else:
+                    result.unjudged += 1
             except LawFailed as failed:
                 self._law_failed = True
                 result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
         if expected <= self._own_end:
             result.gaps.append((name, expected, self._own_end))
-
-    def _resume(self, n: int) -> bool:
-        if not self._inputs.can_resume(n):
-            return False
-        for change in self._parse_changes(self._log.states[n].tick - 1)[0]:  # ordered in the gap
-            self._site.order(change)
-        self._inputs.resume(self._site, n)
-        self._certain = True
-        return True
 
     def _verify_record(self, n: int, state: State) -> None:
         """Executes the tick of record n and compares the result with the record."""
@@ -186,11 +178,17 @@ class SiteVerifier:
             arrivals, missing = self._inputs.arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
-        plant = read_plant_state(state) if self._external else None
+        plant = PlantState(state.q, state.qd) if self._external else None
         output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
-        difference = invalid_change or invalid or self._compare_sender(state)
+        difference = invalid_change or invalid
+        for name, found, expected in (
+            ("boot", state.boot, states[0].boot),
+            ("site", state.site, self._log.name),
+        ):
+            if difference is None and found != expected:
+                difference = RecordDifference(self._log.name, state.tick, name, found, expected)
         if difference is None and not equal_record(state, output, peers):
             difference = find_first_difference(state, output, peers, self._equal)
             if difference is not None and self._inputs.in_doubt(state, output):
@@ -201,12 +199,6 @@ class SiteVerifier:
             result.identical += 1
         else:
             result.add_difference(difference)
-
-    def _compare_sender(self, state: State) -> RecordDifference | None:
-        boot, name = self._log.states[0].boot, self._log.name
-        if state.boot != boot:
-            return RecordDifference(name, state.tick, "boot", state.boot, boot)
-        return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
         """Returns the changes up to a tick that were not executed yet; an invalid one is a difference."""
@@ -222,11 +214,11 @@ class SiteVerifier:
     def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
         """Returns the arrivals of a record up to the first that no peer can have sent, which differs."""
         for n, (peer, tick, _) in enumerate(state.rx):
-            if not 0 <= peer < len(self._samples):
+            if not 0 <= peer < len(self._inputs.samples):
                 invalid = RecordDifference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
                 return state.rx[:n], invalid
-            if tick not in self._samples[peer] and not 0 <= tick <= self._ends[peer]:
-                valid, where = f"a tick from 0 to {self._ends[peer]}", f"rx[{self._log.peers[peer]}]"
+            if tick not in self._inputs.samples[peer] and not 0 <= tick <= self._inputs.ends[peer]:
+                valid, where = f"a tick from 0 to {self._inputs.ends[peer]}", f"rx[{self._log.peers[peer]}]"
                 return state.rx[:n], RecordDifference(state.site, state.tick, where, tick, valid)
         return state.rx, None
 

@@ -46,9 +46,7 @@ PlantSchedule = Mapping[str, Mapping[int, PlantState]]
 def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
     """Refuses a scenario that virtual time cannot run, before anything is written.
 
-    Args:
-        scenario: the experiment.
-        as_named: whether the files of user laws must have the hashes that the scenario names.
+    With `as_named` the files of user laws must have the hashes that the scenario names.
 
     Raises:
         ScenarioError: an arm is external, or a user law cannot be made, or its file has another hash.
@@ -80,15 +78,9 @@ def execute_virtual(
 ) -> Iterator[SiteTick]:
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
-    A site whose network is not ready lets the others go first. A run that diverges ends with the ticks of
-    that instant.
-
-    Args:
-        scenario: the experiment.
-        network: the network; by default every sample arrives at the next tick.
-        commands: changes ordered during the run.
-        measured: states of external arms.
-        ends: the last tick of sites that make fewer than the scenario has.
+    A site whose network is not ready lets the others go first; by default every sample arrives at the next
+    tick. A run that diverges ends with the ticks of that instant. `ends` holds the last tick of sites that
+    make fewer than the scenario has.
 
     Raises:
         ScenarioError: an arm is external and `measured` lacks it.
@@ -157,13 +149,9 @@ def write_virtual_log(
 ) -> bool:
     """Runs a scenario in virtual time and writes its log, which is finished however the run ends.
 
-    Args:
-        scenario: the experiment.
-        stream: destination of the log; stays open.
-        network: the network; by default every sample arrives at the next tick.
-        stopped: polled; True ends the run, and the file is finished with the ticks so far.
-        views_hz: rate of the standard channels, Hz, see `log.ros2.viz_channels`.
-        as_named: see `check_virtual`.
+    The stream stays open. Once `stopped` is True the run ends, and the file is finished with what there is.
+    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network` is as for
+    `execute_virtual`, `as_named` as for `check_virtual`.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.

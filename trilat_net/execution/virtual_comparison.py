@@ -11,7 +11,7 @@ import msgspec
 
 from .. import process
 from ..core.site_step import Site
-from ..core.ticks import TickRecord
+from ..core.ticks import PlantState, TickRecord
 from ..errors import LawFailed
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
@@ -24,7 +24,6 @@ from .difference import (
     equal_record,
     find_first_difference,
 )
-from .resumption import read_plant_state
 from .verify import find_last_ticks
 from .virtual_network import Network, RecordedNetwork
 
@@ -33,7 +32,6 @@ class RecordComparison(NamedTuple):
     """Agreement of a log with another execution.
 
     Attributes:
-        records: records compared.
         identical: records of which every computed field has the same bits.
         first: the first difference, by tick and then by site, or None.
     """
@@ -44,15 +42,7 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """A sample that arrived after it was due.
-
-    Attributes:
-        site: its receiver.
-        peer: its sender.
-        tick: its own tick.
-        due_tick: the receiver's tick at which it was due.
-        arrived_tick: the receiver's tick at which it arrived.
-    """
+    """A sample of a peer that arrived at a site after it was due; the last two are the site's ticks."""
 
     site: str
     peer: str
@@ -70,12 +60,9 @@ class LateSample(NamedTuple):
 def compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
-    """Compares every record of a log with another execution, bit for bit.
+    """Compares every record of a log with another execution, (site, record) in any order, bit for bit.
 
-    Args:
-        log: the log.
-        executed: the other execution: (site, record), in any order.
-        arrivals: whether arrivals must be equal too, or only what was computed from them.
+    Without `arrivals` only what was computed from them must be equal.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = identical = 0
@@ -139,7 +126,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
     states = {name: log[name].states for name in log.sites}
-    arms = {name: {s.tick: read_plant_state(s) for s in states[name]} for name in log.scenario.external}
+    arms = {name: {s.tick: PlantState(s.q, s.qd) for s in states[name]} for name in log.scenario.external}
     ends = find_last_ticks(log)
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}

@@ -34,11 +34,7 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Every sample arrives at the first tick of the receiver after its stamp.
-
-    Args:
-        rates: tick rate of every site, Hz, in scenario order.
-    """
+    """Every sample arrives at the first tick of the receiver after its stamp; `rates` by site, Hz."""
 
     def __init__(self, rates: Mapping[str, int]) -> None:
         self._rates = rates
@@ -123,13 +119,6 @@ class Deliveries(NamedTuple):
     last: int
 
 
-class PeerTicks(NamedTuple):
-    """The tick rate of a peer, Hz, and the last tick that it made."""
-
-    rate_hz: int
-    last: int
-
-
 def recorded_deliveries(part: SiteLog) -> Deliveries:
     """Returns the arrivals of a site that its records list."""
     counts, rows = part.arrivals
@@ -142,7 +131,7 @@ def recorded_deliveries(part: SiteLog) -> Deliveries:
     return Deliveries(at, frozenset(), min(at, default=0), max(at, default=-1))
 
 
-def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveries:
+def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]) -> Deliveries:
     """Returns the arrivals of a site at every tick from its first record to its last.
 
     At ticks without a record those samples arrive that no record lists and that can have arrived there: after
@@ -151,7 +140,8 @@ def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveri
 
     Args:
         part: the site's records.
-        senders: its peers, in scenario order.
+        rates_hz: per peer the tick rate.
+        ends: per peer the last tick that it made.
 
     Raises:
         LogError: fewer than half of those ticks have a record.
@@ -166,8 +156,8 @@ def complete_deliveries(part: SiteLog, senders: Sequence[PeerTicks]) -> Deliveri
         )
     missing = [tick for tick in range(known.first, known.last) if tick not in at]
     assumed: dict[int, list[list[int]]] = {}
-    for peer, sender in enumerate(senders):
-        for tick, entry in _assume_arrivals(known, missing, part.rate_hz, peer, sender):
+    for peer, (peer_hz, end) in enumerate(zip(rates_hz, ends, strict=True)):
+        for tick, entry in _assume_arrivals(known, missing, part.rate_hz, peer, peer_hz, end):
             assumed.setdefault(tick, []).append(entry)
     filled = at | {tick: sorted(entries) for tick, entries in assumed.items()}
     return known._replace(at=filled, unrecorded=frozenset(missing))
@@ -184,23 +174,23 @@ def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[i
 
 
 def _assume_arrivals(
-    known: Deliveries, missing: list[int], rate_hz: int, peer: int, sender: PeerTicks
+    known: Deliveries, missing: list[int], rate_hz: int, peer: int, peer_hz: int, end: int
 ) -> Iterator[tuple[int, list[int]]]:
     """Yields the missing tick at which each sample of a peer arrived that no record lists, and its entry."""
     first = _find_first_arrivals(known, peer)
     listed = sorted(first)
-    lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // sender.rate_hz for m in listed]
+    lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // peer_hz for m in listed]
     lag_ns = median_low(lags_ns) if lags_ns else NS_PER_S // rate_hz
     delay_us = median_low(us for _, us in first.values()) if first else 0
-    newest = min(sender.last, known.last * sender.rate_hz // rate_hz)
+    newest = min(end, known.last * peer_hz // rate_hz)
     for m in range(newest + 1):
-        due = -(-(m * NS_PER_S // sender.rate_hz + lag_ns) * rate_hz // NS_PER_S)
+        due = -(-(m * NS_PER_S // peer_hz + lag_ns) * rate_hz // NS_PER_S)
         if m in first or due < known.first:
             continue
         place = bisect_left(listed, m)
         before = first[listed[place - 1]][0] if place else known.first
         after = first[listed[place]][0] if place < len(listed) else known.last
-        sent = m * rate_hz // sender.rate_hz + 1  # nothing arrives before it was sent
+        sent = m * rate_hz // peer_hz + 1  # nothing arrives before it was sent
         start = bisect_left(missing, max(min(before, after), sent))
         stop = bisect_left(missing, max(before, after) + 1)
         if start < stop:
@@ -219,14 +209,8 @@ def retime_deliveries(
     """Returns the arrivals over the same network for sites that tick at other rates.
 
     A sample is under way for as long as the last sample of the log that was not stamped later, from its stamp
-    to the tick that received it; if that one never arrived, neither does this one.
-
-    Args:
-        deliveries: the arrivals of a site by the log.
-        rate_hz: its rate in the log.
-        new_rate_hz: its rate in the rerun.
-        rates_hz: per peer the rate in the log.
-        new_rates_hz: per peer the rate in the rerun.
+    to the tick that received it; if that one never arrived, neither does this one. Rates, Hz: the site's and
+    its peers', in the log and in the rerun.
     """
     end_ns = deliveries.last * NS_PER_S // rate_hz
     at: dict[int, list[ArrivalEntry]] = {}
