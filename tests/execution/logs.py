@@ -1,7 +1,7 @@
 """Logs to ask what if of, and what a rerun of them says of each tick."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from tests.log_editing import edited, opened, recorded
@@ -11,8 +11,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import STATE_VECTORS, State
 from trilat_net.scenario import load_scenario
 
-SITES = ("m1", "m2", "s")
-TICKS = 120
+OTHER_PLATFORM = {"fingerprint": "0" * 16}
 
 
 def numbers(state: State) -> list[list[float]]:
@@ -33,13 +32,17 @@ def simulated(name: str, overrides: Mapping[str, Any]) -> Log:
     return opened(stream.getvalue())
 
 
-def without_records(lost: Mapping[str, Sequence[int]], data: bytes | None = None) -> Log:
+def without_records(
+    lost: Mapping[str, Collection[int]],
+    data: bytes | None = None,
+    session: dict[str, str] | None = None,
+) -> Log:
     """A short log that lacks some records."""
 
     def record(r: dict[str, Any]) -> dict[str, Any] | None:
         return None if r["tick"] in lost.get(r["site"], ()) else r
 
-    return opened(edited(recorded("paper") if data is None else data, record=record))
+    return opened(edited(recorded("paper") if data is None else data, record=record, session=session))
 
 
 def all_identical(again: Rerun) -> bool:

@@ -70,10 +70,10 @@ def agree(scenario: Scenario) -> None:
 @pytest.mark.parametrize("name", list_shipped())
 def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
     scenario = load_scenario(name)
-    agree(load_scenario(name, {"duration_s": min(scenario.duration_s, 4.0)}))
+    agree(load_scenario(name, {"duration_s": min(scenario.duration_s, 2.0)}))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     name=st.sampled_from(["free", "paper", "p_d_margin", "asymmetric", "windup"]),
     scheme=st.sampled_from(["second_order", "digital"]),
@@ -100,7 +100,7 @@ def test_a_run_that_diverges_ends_with_the_ticks_of_that_instant() -> None:
     np.testing.assert_array_equal(fused.records, before)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
 def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})

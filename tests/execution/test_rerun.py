@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import trilat_net
-from tests.execution.deliveries import Sample, delivered
+from tests.execution.deliveries import SITES, TICKS, Sample, delivered, never, site_sets, under_way
 from tests.log_editing import edited, opened, recorded
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.core.site_step import Site
@@ -16,19 +15,14 @@ from trilat_net.execution.difference import TOLERANCE, equal_record
 from trilat_net.execution.rerun import rerun
 from trilat_net.scenario import list_shipped, load_scenario
 
-from .logs import SITES, TICKS, all_identical, motion, simulated
+from .logs import all_identical, motion, simulated
 
 GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("v*.mcap"))
 SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
-subsets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
-samples = st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110))
-under_way = st.dictionaries(samples, st.integers(1, 40), max_size=60)
-never = st.frozensets(samples, max_size=40)
-
 
 @pytest.mark.parametrize("name", list_shipped())
-@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+@pytest.mark.parametrize("scheme", ["second_order", pytest.param("digital", marks=pytest.mark.long)])
 def test_nothing_changed_any_site_is_the_logs_bit_for_bit(name: str, scheme: str) -> None:
     log = opened(recorded(name, {"duration_s": 0.3, "scheme": scheme}))
     for site in log.sites:
@@ -62,7 +56,7 @@ def test_logs_of_every_version_with_changes_losses_and_stale_peers_are_too(
 
 
 @settings(max_examples=15)
-@given(delays=under_way, lost=never, replace=subsets)
+@given(delays=under_way, lost=never, replace=site_sets)
 def test_samples_late_reordered_or_never_come_as_they_came(
     delays: dict[Sample, int], lost: frozenset[Sample], replace: list[str]
 ) -> None:

@@ -4,24 +4,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.execution.deliveries import Sample, delivered, first_in_first_out
+from tests.execution.deliveries import (
+    SITES,
+    TICKS,
+    Sample,
+    delivered,
+    first_in_first_out,
+    gaps,
+    site_sets,
+    under_way,
+)
 from tests.log_editing import edited, opened, recorded
 from trilat_net.errors import LogError
 from trilat_net.execution.rerun import rerun
 
-from .logs import SITES, TICKS, all_identical, motion, without_records
-
-subsets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
-under_way = st.dictionaries(
-    st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110)), st.integers(1, 40), max_size=60
-)
-gaps = st.dictionaries(
-    st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=25), min_size=1
-)
+from .logs import all_identical, motion, without_records
 
 
 @settings(max_examples=15)
-@given(lost=gaps, replace=subsets, delays=under_way)
+@given(lost=gaps(25), replace=site_sets, delays=under_way)
 def test_behind_a_gap_it_is_the_log_again_and_what_cannot_be_known_stands(
     lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
 ) -> None:
@@ -43,7 +44,7 @@ def numbers_of(state: object) -> list[object]:
 
 @settings(max_examples=15)
 @given(
-    replace=subsets,
+    replace=site_sets,
     lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50),
     data=st.data(),
 )

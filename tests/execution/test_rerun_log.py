@@ -14,7 +14,8 @@ from trilat_net.execution.verify import find_executed_sites, verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 
-from .logs import SITES, TICKS, without_records
+from .deliveries import SITES, TICKS
+from .logs import without_records
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "v2.mcap"
 

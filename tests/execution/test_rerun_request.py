@@ -9,7 +9,7 @@ from tests.log_editing import opened, recorded
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.rerun_request import RerunRequest, describe_rerun_changes, resolve_rerun_request
 
-from .logs import SITES
+from .deliveries import SITES
 
 Overrides = Mapping[str, Any] | Sequence[str]
 

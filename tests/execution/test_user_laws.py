@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from tests.execution.logs import numbers
+from tests.execution.deliveries import SITES, TICKS
+from tests.execution.logs import OTHER_PLATFORM, numbers, without_records
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.core.ticks import PlantState
 from trilat_net.errors import LawFailed, ScenarioError
@@ -18,9 +19,6 @@ from trilat_net.scenario import load_scenario
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
-TICKS = 120
-SITES = ("m1", "m2", "s")
-OTHER_PLATFORM = {"fingerprint": "0" * 16}
 
 
 def own(law: str = LAW, **more: Any) -> bytes:
@@ -42,20 +40,13 @@ def test_a_law_that_repeats_the_papers_gives_its_bits(name: str) -> None:
     assert twins.fed.identical == twins.plain.identical == 3 * TICKS
 
 
-def missing(data: bytes, site: str, first: int, last: int, session: dict[str, str] | None = None) -> bytes:
-    def record(r: Record) -> Record | None:
-        return None if r["site"] == site and first <= r["tick"] <= last else r
-
-    return edited(data, record=record, session=session)
-
-
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_behind_a_gap_it_goes_on_from_its_memory(session: dict[str, str] | None) -> None:
     """As much can be judged as of a law of ours."""
-    verdict = verify(opened(missing(own(), "s", 50, 60, session)))
+    verdict = verify(without_records({"s": range(50, 61)}, own(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.passed
-    ours = verify(opened(missing(recorded("paper", SHORT), "s", 50, 60, session)))
+    ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
     assert verdict.identical > 3 * TICKS - 50
 
@@ -65,7 +56,7 @@ def test_a_memory_that_does_not_say_all_is_found_out(session: dict[str, str] | N
     """Where nothing has to be recalled it passes; behind a gap, or tick by tick, it does not."""
     data = own("tests.laws:Forgetful")
     assert verify(opened(data)).passed
-    verdict = verify(opened(missing(data, "s", 50, 60, session)))
+    verdict = verify(without_records({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
     assert verdict.first.field.startswith(("theta_hat", "tau"))
 
@@ -197,9 +188,9 @@ def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | Non
 
 def test_an_arm_outside_is_executed_behind_a_gap_too() -> None:
     """As much can be judged as of an arm of ours."""
-    verdict = verify(opened(missing(external_log(), "s", 40, 44)))
+    verdict = verify(without_records({"s": range(40, 45)}, external_log()))
     assert verdict.passed
-    ours = verify(opened(missing(recorded("two_sites", SHORT), "s", 40, 44)))
+    ours = verify(without_records({"s": range(40, 45)}, recorded("two_sites", SHORT)))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 
 

@@ -8,18 +8,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.execution.deliveries import Sample, delivered, first_in_first_out
+from tests.execution.deliveries import (
+    SITES,
+    TICKS,
+    Sample,
+    delivered,
+    first_in_first_out,
+    gaps,
+    never,
+    under_way,
+)
+from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded, without
 from trilat_net.execution.verify import verify
+from trilat_net.net.messages import STATE_VECTORS
 from trilat_net.scenario import list_shipped
 
-SITES = ("m1", "m2", "s")
-TICKS = 120
-VECTORS = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
-OTHER_PLATFORM = {"fingerprint": "0" * 16}
+VECTORS = STATE_VECTORS
 
 ticks = st.one_of(st.sampled_from([0, 1, 2, TICKS - 2, TICKS - 1]), st.integers(0, TICKS - 1))
-some_ticks = st.sampled_from([0, 1, 21, 22, 60, TICKS - 1])
 
 
 def flipped(value: float, bit: int) -> float:
@@ -64,7 +71,7 @@ def test_a_diverged_run_is_identical_to_its_last_record() -> None:
     assert verdict.identical == verdict.records
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(
     site=st.sampled_from(SITES),
     field=st.sampled_from(sorted(VECTORS)),
@@ -87,7 +94,7 @@ def test_one_bit_of_a_vector_is_found_and_named(
     assert verdict.first.logged.hex() != verdict.first.computed.hex()
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(site=st.sampled_from(SITES), tick=ticks, peer=st.integers(0, 1), bit=st.integers(0, 12))
 def test_one_bit_of_used_is_found_and_named(site: str, tick: int, peer: int, bit: int) -> None:
     name = [other for other in SITES if other != site][peer]
@@ -109,7 +116,7 @@ def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
     assert first[:3] == (site, tick, "mode")
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     site=st.sampled_from(SITES), tick=ticks.filter(bool), arrival=st.integers(0, 1), bit=st.integers(0, 12)
 )
@@ -174,12 +181,6 @@ def test_one_other_number_in_the_embedded_scenario_is_found(old: str, new: str) 
     assert first.tick <= 25
 
 
-def judged(site: str, lost: set[int], whole_run: bool = True) -> Any:
-    """The verdict on a log that lacks some records of a site."""
-    session = {} if whole_run else OTHER_PLATFORM
-    return verify(opened(edited(recorded("paper"), record=without(site, lost), session=session)))
-
-
 def ranges(lost: set[int]) -> list[tuple[int, int]]:
     starts = sorted(t for t in lost if t - 1 not in lost)
     ends = sorted(t for t in lost if t + 1 not in lost)
@@ -191,7 +192,7 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
     "lost", [{0}, {0, 1, 2}, {1}, {40}, set(range(40, 45)), {40, 42}, {10, 50, 51, 90}, set(range(5, 80))]
 )
 def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[int]) -> None:
-    verdict = judged(site, lost)
+    verdict = verify(without_records({site: lost}))
     assert verdict.passed, str(verdict.first)
     assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
     assert verdict.records == 3 * TICKS - len(lost)
@@ -203,46 +204,34 @@ def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize("first", [TICKS - 1, TICKS - 10])
 def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
-    verdict = judged(site, set(range(first, TICKS)))
+    verdict = verify(without_records({site: range(first, TICKS)}))
     assert verdict.passed, str(verdict.first)
     assert verdict.gaps == [(site, first, TICKS - 1)]
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     site=st.sampled_from(SITES),
-    gaps=st.lists(st.tuples(st.integers(0, TICKS - 2), st.integers(1, 12)), min_size=1, max_size=4),
+    holes=st.lists(st.tuples(st.integers(0, TICKS - 2), st.integers(1, 12)), min_size=1, max_size=4),
     whole_run=st.booleans(),
 )
-def test_gaps_are_never_a_false_alarm(site: str, gaps: list[tuple[int, int]], whole_run: bool) -> None:
-    lost = {t for start, length in gaps for t in range(start, start + length) if t < TICKS - 1}
-    verdict = judged(site, lost, whole_run)
+def test_gaps_are_never_a_false_alarm(site: str, holes: list[tuple[int, int]], whole_run: bool) -> None:
+    lost = {t for start, length in holes for t in range(start, start + length) if t < TICKS - 1}
+    verdict = verify(without_records({site: lost}, session={} if whole_run else OTHER_PLATFORM))
     assert verdict.passed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == ranges(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
 
 
-@settings(max_examples=30)
-@given(
-    lost=st.dictionaries(
-        st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=30), min_size=2
-    )
-)
+@settings(max_examples=15)
+@given(lost=gaps(30, least=2))
 def test_gaps_of_several_sites_are_never_a_false_alarm(lost: dict[str, set[int]]) -> None:
-    def record(r: Record) -> Record | None:
-        return None if r["tick"] in lost.get(r["site"], ()) else r
-
-    verdict = verify(opened(edited(recorded("paper"), record=record)))
+    verdict = verify(without_records(lost))
     assert verdict.passed, str(verdict.first)
     assert {gap[0] for gap in verdict.gaps} == set(lost)
 
 
-samples = st.tuples(st.sampled_from(SITES), st.integers(0, 1), st.integers(0, 110))
-under_way = st.dictionaries(samples, st.integers(1, 40), max_size=60)
-never = st.frozensets(samples, max_size=40)
-
-
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(delays=under_way, never=never)
 def test_samples_out_of_order_late_or_never_are_no_difference(
     delays: dict[Sample, int], never: frozenset[Sample]
@@ -251,26 +240,14 @@ def test_samples_out_of_order_late_or_never_are_no_difference(
     assert verdict.identical == verdict.records == 3 * TICKS
 
 
-@settings(max_examples=50)
-@given(
-    delays=under_way,
-    never=never,
-    lost=st.dictionaries(
-        st.sampled_from(SITES), st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=20), max_size=2
-    ),
-    whole_run=st.booleans(),
-)
+@settings(max_examples=20)
+@given(delays=under_way, never=never, lost=gaps(20, least=0, most=2), whole_run=st.booleans())
 def test_gaps_where_samples_come_late_or_never_are_no_false_alarm(
     delays: dict[Sample, int], never: frozenset[Sample], lost: dict[str, set[int]], whole_run: bool
 ) -> None:
     """On links that keep their order, as those of a session do."""
-
-    def record(r: Record) -> Record | None:
-        return None if r["tick"] in lost.get(r["site"], ()) else r
-
-    session = {} if whole_run else OTHER_PLATFORM
     data = delivered(first_in_first_out(delays), never)
-    verdict = verify(opened(edited(data, record=record, session=session)))
+    verdict = verify(without_records(lost, data, {} if whole_run else OTHER_PLATFORM))
     assert verdict.passed, str(verdict.first)
 
 

@@ -23,7 +23,7 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
     return load_scenario("free", {**changes, "duration_s": duration_s, "link.delay_ms": delay_ms})
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
 def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: tuple[int, ...]) -> None:
     scenario = small(rate_hz)
@@ -37,7 +37,7 @@ def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: tuple[int
         assert scenario.ticks(name) == max(1, round(Fraction(1, 10) * rate_hz[index]))
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
 def test_every_sample_arrives_once_in_order_at_the_first_tick_after_its_stamp(
     rate_hz: tuple[int, ...],
@@ -78,7 +78,7 @@ def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
     return [stepped.output._replace(rx_crc=0) for stepped in ran]
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(slack=st.lists(st.integers(0, 17), min_size=1, max_size=12))
 def test_the_network_decides_nothing_as_long_as_samples_come_before_they_are_due(slack: list[int]) -> None:
     scenario = small((1000, 1000, 1000))

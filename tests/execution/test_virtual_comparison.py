@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.execution.deliveries import DUE, PEERS, SCENARIO, delivered
+from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, delivered
 from tests.log_editing import edited, opened, recorded
 from trilat_net.execution.virtual_comparison import (
     compare_with_virtual,
@@ -14,17 +14,17 @@ from trilat_net.execution.virtual_comparison import (
 from trilat_net.log.log_reader import Log
 
 
-def opened_delivered(delays: dict[tuple[str, int, int], int]) -> Log:
+def opened_delivered(delays: dict[Sample, int]) -> Log:
     return opened(delivered(delays))
 
 
 links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integers(0, 80))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, DUE), max_size=30))
 def test_a_run_without_late_samples_equals_plain_virtual_time(
-    delays: dict[tuple[str, int, int], int],
+    delays: dict[Sample, int],
 ) -> None:
     twins = compare_with_virtual(opened_delivered(delays))
     assert twins.late == []
@@ -32,10 +32,10 @@ def test_a_run_without_late_samples_equals_plain_virtual_time(
     assert twins.plain == (360, 360, None)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, 39), min_size=1, max_size=30))
 def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
-    delays: dict[tuple[str, int, int], int],
+    delays: dict[Sample, int],
 ) -> None:
     log = opened_delivered(delays)
     twins = compare_with_virtual(log)
