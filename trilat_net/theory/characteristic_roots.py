@@ -14,12 +14,13 @@ hundred rows out to all cores and busy-waits, which takes a hundred times as lon
 core.
 """
 
+import cmath
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.linalg
@@ -82,34 +83,81 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
     return None
 
 
-class Pencil(Protocol):
-    """A matrix function with characteristic roots."""
+class Pencil(NamedTuple):
+    """Delta(s) = s I - A - sum_k A_k exp(-s T_k), or (z I - A - sum_k A_k z^-d_k) / h with z = exp(s h).
+
+    Attributes:
+        A: shape (n, n).
+        delays: T_k, s, or d_k, ticks, shape (K,).
+        Ad: A_k, shape (K, n, n).
+        period_s: h of a sampled loop, s; None: a continuous one.
+    """
+
+    A: Array
+    delays: NDArray[Any]
+    Ad: Array
+    period_s: float | None = None
 
     def at(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative, shape (n, n) each."""
+        h_s, eye = self.period_s or 1.0, np.eye(len(self.A))
+        lead, slope = (s, 1.0) if self.period_s is None else (cmath.exp(s * h_s),) * 2
+        delayed = np.exp(-s * h_s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
+        delta = (lead * eye - self.A - delayed.sum(axis=0)) / h_s
+        derivative = slope * eye + (self.delays[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
+        return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def size(self, s: complex) -> float:
         """Returns the sum of the norms of the terms of Delta(s): residuals are relative to it."""
+        h_s = self.period_s or 1.0
+        lead = abs(s) if self.period_s is None else math.exp(s.real * h_s)
+        delayed = np.exp(-s.real * h_s * self.delays) @ np.linalg.norm(self.Ad, axis=(1, 2))
+        return float((lead + np.linalg.norm(self.A) + delayed) / h_s)
 
     def taylor(self, power: int) -> Array:
         """Returns the coefficient of s^power of Delta about 0, shape (n, n)."""
+        lead = 1.0 if self.period_s is not None or power == 1 else 0.0
+        own = lead * np.eye(len(self.A)) - (self.A if power == 0 else 0.0)
+        scale = (self.period_s or 1.0) ** (power - 1) / math.factorial(power)
+        coefficient: Array = scale * (own - np.einsum("k,kab->ab", (-self.delays) ** power, self.Ad))
+        return coefficient
+
+    @property
+    def delayed_states(self) -> NDArray[np.intp]:
+        """Places of the states that act after a delay."""
+        return np.flatnonzero(np.abs(self.Ad).sum(axis=(0, 1)))
 
 
-class PencilRoot(NamedTuple):
-    """A root of a pencil.
+class MovingPart(NamedTuple):
+    """A loop without the states that nothing changes, or that change nothing.
 
     Attributes:
-        s: the root, 1/s.
-        multiplicity: number of its vectors.
-        participation: of each state, shape (n,): abs of the diagonal of the residue of Delta(s)^-1, which
-            does not depend on units.
-        residual: abs(Delta(s) v) over the size of Delta's terms.
+        pencil: its characteristic equation.
+        names: of its states.
+        constant: number of states left out, each with a root at zero.
     """
 
-    s: complex
-    multiplicity: int
-    participation: Array
-    residual: float
+    pencil: Pencil
+    names: tuple[str, ...]
+    constant: int
+
+
+def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
+    """Returns the part of a loop that moves."""
+    still = 0.0 if pencil.period_s is None else np.eye(len(names))
+    effects = np.abs(pencil.A - still) + np.abs(pencil.Ad).sum(axis=0)  # of state j on the rate of state i
+    kept = list(range(len(names)))
+    while True:
+        inner = effects[np.ix_(kept, kept)]
+        idle = [place for n, place in enumerate(kept) if not inner[n].any() or not inner[:, n].any()]
+        if not idle:
+            break
+        kept.remove(idle[0])
+    rows, columns = np.ix_(kept, kept)
+    Ad = pencil.Ad[:, rows, columns]
+    acts = Ad.any(axis=(1, 2))
+    moving = pencil._replace(A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts])
+    return MovingPart(moving, tuple(names[place] for place in kept), len(names) - len(kept))
 
 
 class CharacteristicRoot(NamedTuple):
@@ -171,7 +219,9 @@ class Spectrum(NamedTuple):
         return "at the edge" if re >= -STABILITY_EDGE_PER_S or self.drifting else "stable"
 
 
-def solve_for_root(pencil: Pencil, first: complex) -> PencilRoot | None:
+def _solve_for_root(
+    pencil: Pencil, first: complex, names: Sequence[str], period_rad_s: float
+) -> CharacteristicRoot | None:
     """Returns the root that Newton's method finds from a first guess, 1/s, or None if it finds none."""
     s = complex(first)
     with np.errstate(all="ignore"):
@@ -187,18 +237,27 @@ def solve_for_root(pencil: Pencil, first: complex) -> PencilRoot | None:
                 return None
             if abs(step) <= _STEP_TOLERANCE * (1.0 + abs(s)):
                 break
-        return _check_root(pencil, s)
+        shares = _measure_participation(pencil, s)
+    if shares is None:
+        return None
+    imag = math.remainder(s.imag, period_rad_s) if math.isfinite(period_rad_s) else s.imag
+    states = np.round(shares[1] / shares[1].max(), 6)  # equal ones stay in their order
+    order = [int(n) for n in np.argsort(-states, kind="stable") if states[n] >= _NAMED_SHARE]
+    rounded = complex(s.real, abs(imag) if abs(imag) > SAME_ROOT_TOLERANCE else 0.0)
+    return CharacteristicRoot(rounded, shares[0], tuple(names[n] for n in order))
 
 
-def _check_root(pencil: Pencil, s: complex) -> PencilRoot | None:
-    """Returns the root at s with its participations; None if the residual is too large."""
+def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
+    """Returns the number of vectors of a root at s, and each state's participation; None if it is no root.
+
+    Participation is the abs of the diagonal of the residue of Delta(s)^-1, which does not depend on units.
+    """
     delta, derivative = pencil.at(s)
     if not np.isfinite(delta).all():
         return None
     left, values, right = np.linalg.svd(delta)
     size = pencil.size(s)
-    residual = float(values[-1]) / size
-    if not residual <= ROOT_RESIDUAL_TOLERANCE:
+    if not float(values[-1]) / size <= ROOT_RESIDUAL_TOLERANCE:
         return None
     count = int(np.sum(values <= _SAME_VALUE * size))
     W, V = left[:, -count:], right[-count:].conj().T
@@ -206,22 +265,7 @@ def _check_root(pencil: Pencil, s: complex) -> PencilRoot | None:
         residue = V @ np.linalg.solve(W.conj().T @ derivative @ V, W.conj().T)
     except np.linalg.LinAlgError:
         return None
-    return PencilRoot(s, count, np.abs(np.diag(residue)), residual)
-
-
-def select_moving_states(effects: Array) -> list[int]:
-    """Returns the places of the states that move and move others; each of the rest has a root at zero.
-
-    Args:
-        effects: abs of the effect of state j on the rate of state i, shape (n, n).
-    """
-    kept = list(range(len(effects)))
-    while True:
-        inner = effects[np.ix_(kept, kept)]
-        idle = [place for n, place in enumerate(kept) if not inner[n].any() or not inner[:, n].any()]
-        if not idle:
-            return kept
-        kept.remove(idle[0])
+    return count, np.abs(np.diag(residue))
 
 
 def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
@@ -263,34 +307,19 @@ def refine_roots(
             wanted, because Newton's method may change their order.
         period_rad_s: imaginary parts that differ by it are the same, as those of sampled loops are.
     """
-    found: list[PencilRoot] = []
+    found: list[CharacteristicRoot] = []
     dropped = 0
     for guess in candidates:
         if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
             continue
         if len(found) >= (tries or wanted + 2):
             break
-        root = solve_for_root(pencil, complex(guess))
+        root = _solve_for_root(pencil, complex(guess), names, period_rad_s)
         if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
             dropped += 1
-            continue
-        if math.isfinite(period_rad_s):
-            root = root._replace(s=complex(root.s.real, math.remainder(root.s.imag, period_rad_s)))
-        if not any(_is_same(root.s, other.s) for other in found):
+        elif all(abs(root.s - one.s) >= SAME_ROOT_TOLERANCE * (1.0 + abs(root.s)) for one in found):
             found.append(root)
-    found.sort(key=lambda one: -one.s.real)
-    return [_name_root(one, names) for one in found[:wanted]], dropped
-
-
-def _is_same(a: complex, b: complex) -> bool:
-    return min(abs(a - b), abs(a - b.conjugate())) < SAME_ROOT_TOLERANCE * (1.0 + abs(a))
-
-
-def _name_root(root: PencilRoot, names: Sequence[str]) -> CharacteristicRoot:
-    s = complex(root.s.real, abs(root.s.imag) if abs(root.s.imag) > SAME_ROOT_TOLERANCE else 0.0)
-    share = np.round(root.participation / root.participation.max(), 6)  # equal ones stay in their order
-    order = [int(n) for n in np.argsort(-share, kind="stable") if share[n] >= _NAMED_SHARE]
-    return CharacteristicRoot(s, root.multiplicity, tuple(names[n] for n in order))
+    return sorted(found, key=lambda one: -one.s.real)[:wanted], dropped
 
 
 def sort_root_guesses(values: Complex, zeros: int) -> Complex:

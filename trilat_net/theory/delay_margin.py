@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-from .characteristic_roots import Complex, limit_blas_threads
-from .delay_roots import DelayPencil, compute_delay_spectrum, extract_moving_part
+from .characteristic_roots import Complex, Pencil, limit_blas_threads
+from .delay_roots import compute_delay_spectrum, find_moving_part
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
@@ -140,8 +140,8 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 def find_axis_crossings(loop: LinearLoop) -> list[AxisCrossing]:
     """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`."""
-    pencil = extract_moving_part(set_common_delay(loop, 1.0)).pencil
-    if not len(pencil.delays_s):
+    pencil = find_moving_part(set_common_delay(loop, 1.0)).pencil
+    if not len(pencil.delays):
         return []
     with limit_blas_threads():
         sweep = _FrequencySweep(pencil)
@@ -171,7 +171,7 @@ def _merge(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
 class _FrequencySweep:
     """The eigenvalues of G(j w) over frequency."""
 
-    def __init__(self, pencil: DelayPencil) -> None:
+    def __init__(self, pencil: Pencil) -> None:
         self._A, self._delayed = pencil.A, pencil.delayed_states
         self._Ad = pencil.Ad[0][:, self._delayed]
         self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))

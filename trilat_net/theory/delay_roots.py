@@ -8,22 +8,19 @@ Vermiglio, "Pseudospectral differencing methods for characteristic roots of dela
 SIAM J. Scientific Computing 27 (2005); nodes after Trefethen, "Spectral Methods in MATLAB" (2000).
 """
 
-import math
-from typing import NamedTuple
-
 import numpy as np
 from numpy.polynomial.chebyshev import chebder, chebvander
-from numpy.typing import NDArray
 
 from ..core.vectors import Array
 from .characteristic_roots import (
     CharacteristicRoot,
-    Complex,
+    MovingPart,
+    Pencil,
     Spectrum,
     count_zero_roots,
+    extract_moving_part,
     limit_blas_threads,
     refine_roots,
-    select_moving_states,
     sort_root_guesses,
 )
 from .linear_loop import LinearLoop
@@ -34,80 +31,21 @@ MAX_GENERATOR_SIZE = 1600
 _ROOT_AGREEMENT = 1e-9
 
 
-class DelayPencil(NamedTuple):
-    """Delta(s) = s I - A - sum_k A_k exp(-s T_k).
-
-    Attributes:
-        A: shape (n, n).
-        delays_s: shape (K,), s.
-        Ad: shape (K, n, n).
-    """
-
-    A: Array
-    delays_s: Array
-    Ad: Array
-
-    def at(self, s: complex) -> tuple[Complex, Complex]:
-        """See `Pencil`."""
-        eye = np.eye(len(self.A))
-        delayed = np.exp(-s * self.delays_s)[:, np.newaxis, np.newaxis] * self.Ad
-        delta = s * eye - self.A - delayed.sum(axis=0)
-        derivative = eye + (self.delays_s[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
-        return delta.astype(np.complex128), derivative.astype(np.complex128)
-
-    def size(self, s: complex) -> float:
-        """See `Pencil`."""
-        delayed = np.exp(-s.real * self.delays_s) @ np.linalg.norm(self.Ad, axis=(1, 2))
-        return float(abs(s) + np.linalg.norm(self.A) + delayed)
-
-    def taylor(self, power: int) -> Array:
-        """See `Pencil`."""
-        factors = (-self.delays_s) ** power / math.factorial(power)
-        own = {0: -self.A, 1: np.eye(len(self.A))}.get(power, np.zeros_like(self.A))
-        coefficient: Array = own - np.einsum("k,kab->ab", factors, self.Ad)
-        return coefficient
-
-    @property
-    def delayed_states(self) -> NDArray[np.intp]:
-        """Places of the states that act after a delay."""
-        return np.flatnonzero(np.abs(self.Ad).sum(axis=(0, 1)))
-
-
-class MovingPart(NamedTuple):
-    """A loop without the states that nothing changes, or that change nothing.
-
-    Attributes:
-        pencil: its characteristic equation.
-        names: of its states.
-        constant: number of states left out, each with a root at zero.
-    """
-
-    pencil: DelayPencil
-    names: tuple[str, ...]
-    constant: int
-
-
-def extract_moving_part(loop: LinearLoop) -> MovingPart:
+def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop that moves."""
-    n = len(loop.A)
-    Ad = np.array([term.A for term in loop.delayed]).reshape(-1, n, n)
+    Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    kept = select_moving_states(np.abs(loop.A) + np.abs(Ad).sum(axis=0))
-    rows, columns = np.ix_(kept, kept)
-    inner = Ad[:, rows, columns]
-    acts = np.array([bool(matrix.any()) for matrix in inner], dtype=bool)
-    pencil = DelayPencil(loop.A[rows, columns], delays_s[acts], inner[acts])
-    return MovingPart(pencil, tuple(loop.names[place] for place in kept), n - len(kept))
+    return extract_moving_part(Pencil(loop.A, delays_s, Ad), loop.names)
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
     """Returns the rightmost roots of a loop; conjugate ones and multiple ones count once in `wanted`."""
     with limit_blas_threads():
-        pencil, names, constant = extract_moving_part(loop)
+        pencil, names, constant = find_moving_part(loop)
         zeros, drifting = count_zero_roots(pencil)
         if not len(names):
             return Spectrum((), constant + zeros, drifting, 0, 0)
-        has_delays = len(pencil.delays_s) > 0
+        has_delays = len(pencil.delays) > 0
         order, before = _INITIAL_ORDER if has_delays else 0, None
         while True:
             matrix = discretise_generator(pencil, order) if has_delays else pencil.A
@@ -125,20 +63,20 @@ def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> b
     )
 
 
-def discretise_generator(pencil: DelayPencil, order: int) -> Array:
+def discretise_generator(pencil: Pencil, order: int) -> Array:
     """Returns the discretised generator: the state, and the history of its delayed part at Chebyshev nodes.
 
     Args:
         pencil: the characteristic equation, with at least one delay.
         order: the degree M of the polynomial.
     """
-    delayed, longest_s, n = pencil.delayed_states, float(pencil.delays_s.max()), len(pencil.A)
+    delayed, longest_s, n = pencil.delayed_states, float(pencil.delays.max()), len(pencil.A)
     c = len(delayed)
     whole = np.zeros((n + order * c, n + order * c))
     whole[:n, :n] = pencil.A
     # history over [-longest, 0] as a polynomial of x in [-1, 1]
     for weights, Ad in zip(
-        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays_s / longest_s), pencil.Ad, strict=True
+        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays / longest_s), pencil.Ad, strict=True
     ):
         whole[:n, delayed] += weights[0] * Ad[:, delayed]
         whole[:n, n:] += np.kron(weights[1:], Ad[:, delayed])

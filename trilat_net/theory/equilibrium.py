@@ -18,9 +18,9 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
-from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop, locate_states
+from .linear_loop import LinearLoop, find_loop_states, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import ESTIMATE, STATE_SIZE, Q, describe_switching_points, has_estimate
+from .site_dynamics import ESTIMATE, Q, describe_switching_points, has_estimate
 
 MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""
@@ -118,19 +118,9 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     The derivatives of the angles are zero.
     """
     x = gather_site_arguments(conditions, rest)
-    rates = [conditions.rates(i, x[i]) for i in range(len(conditions.sites))]
-    return _stack_states(conditions, [(np.zeros(JOINTS), one.qdd, one.estimate) for one in rates])
-
-
-def _stack_states(conditions: OperatingConditions, values: list[tuple[Array, Array, Array]]) -> Array:
-    """Returns values of (q, qd, theta_hat) of every site in the order of the loop's states."""
-    return np.concatenate(
-        [
-            part
-            for site, parts in zip(conditions.sites, values, strict=True)
-            for part in (parts if has_estimate(site) else parts[:2])
-        ]
-    )
+    rates = [conditions.rates(i, own) for i, own in enumerate(x)]
+    states = np.array([np.concatenate([np.zeros(JOINTS), one.qdd, one.estimate]) for one in rates])
+    return states[find_loop_states(conditions)]
 
 
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
@@ -168,13 +158,10 @@ def _movable_states(loop: LinearLoop) -> list[int]:
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
-    q, theta_hat = rest.q.copy(), rest.theta_hat.copy()
-    for i, at in enumerate(locate_states(conditions)):
-        own = step[at]
-        q[i] += own[Q]
-        if len(own) == STATE_SIZE:
-            theta_hat[i] += own[ESTIMATE]
-    return rest._replace(q=q, theta_hat=theta_hat)
+    mask = find_loop_states(conditions)
+    states = np.zeros(mask.shape)
+    states[mask] = step
+    return rest._replace(q=rest.q + states[:, Q], theta_hat=rest.theta_hat + states[:, ESTIMATE])
 
 
 def predict_from_start(conditions: OperatingConditions, start: Equilibrium) -> Equilibrium:
@@ -186,12 +173,8 @@ def predict_from_start(conditions: OperatingConditions, start: Equilibrium) -> E
     """
     rest = find_nearest_equilibrium(conditions, start)
     for _ in range(3):
-        still = np.zeros(JOINTS)
-        differences = [
-            (q, still, theta)
-            for q, theta in zip(start.q - rest.q, start.theta_hat - rest.theta_hat, strict=True)
-        ]
-        deviation = _stack_states(conditions, differences)
+        moved = np.hstack([start.q - rest.q, np.zeros_like(rest.q), start.theta_hat - rest.theta_hat])
+        deviation = moved[find_loop_states(conditions)]
         kept = _project_on_zero_roots(linearise_loop(conditions, rest), deviation)
         if kept is None:
             break

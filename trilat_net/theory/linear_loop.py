@@ -6,10 +6,10 @@ Invariant: x are deviations from the equilibrium, in the order of the scenario's
 the joints that an operator adds; y are the joint velocities.
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
@@ -82,43 +82,6 @@ class LinearLoop(NamedTuple):
         return total
 
 
-class LinearSite(NamedTuple):
-    """One site of the loop.
-
-    Attributes:
-        at: places of its states in x.
-        rates: derivatives of its rates, see `differentiate_site_rates`.
-    """
-
-    at: slice
-    rates: SiteRates
-
-    @property
-    def own(self) -> slice:
-        """Its states among a site's STATE_SIZE numbers."""
-        return slice(0, self.at.stop - self.at.start)
-
-    @property
-    def q(self) -> slice:
-        """Places of its angles in x."""
-        return slice(self.at.start, self.at.start + JOINTS)
-
-    @property
-    def qd(self) -> slice:
-        """Places of its velocities in x."""
-        return slice(self.at.start + JOINTS, self.at.start + 2 * JOINTS)
-
-    @property
-    def dynamic(self) -> slice:
-        """Places of its velocities and estimates in x."""
-        return slice(self.at.start + JOINTS, self.at.stop)
-
-    @property
-    def dynamic_rates(self) -> Array:
-        """Derivatives of qdd and, if it adapts, of the estimate: shape (2 or 7, ARGUMENT_COUNT)."""
-        return np.vstack([self.rates.qdd, self.rates.estimate[: self.own.stop - QD.stop]])
-
-
 def linearise_scenario(scenario: Scenario, rest: Equilibrium) -> LinearLoop:
     """Returns the loop of a scenario, linearised at an equilibrium, see `find_equilibrium`.
 
@@ -138,59 +101,49 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     return x
 
 
-def locate_states(conditions: OperatingConditions) -> list[slice]:
-    """Returns the places of every site's states in the loop's state."""
-    sizes = [STATE_SIZE if has_estimate(site) else QD.stop for site in conditions.sites]
-    return [slice(end - size, end) for size, end in zip(sizes, itertools.accumulate(sizes), strict=True)]
+def find_loop_states(conditions: OperatingConditions) -> NDArray[np.bool_]:
+    """Returns which states of every site are in the loop, shape (N, STATE_SIZE): estimates if it learns."""
+    mask = np.ones((len(conditions.sites), STATE_SIZE), dtype=bool)
+    mask[[not has_estimate(site) for site in conditions.sites], ESTIMATE] = False
+    return mask
 
 
-def linearise_sites(conditions: OperatingConditions, rest: Equilibrium) -> list[LinearSite]:
-    """Returns every site, linearised by itself."""
+def differentiate_rates(conditions: OperatingConditions, rest: Equilibrium) -> list[SiteRates]:
+    """Returns the derivatives of the rates of every site by itself, see `differentiate_site_rates`."""
     x = gather_site_arguments(conditions, rest)
-    return [
-        LinearSite(at, differentiate_site_rates(site, x[i]))
-        for i, (site, at) in enumerate(zip(conditions.sites, locate_states(conditions), strict=True))
-    ]
+    return [differentiate_site_rates(site, own) for site, own in zip(conditions.sites, x, strict=True)]
 
 
 def linearise_loop(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
     """Returns the loop under given conditions, linearised at an equilibrium."""
-    sites = linearise_sites(conditions, rest)
-    n, m = sites[-1].at.stop, JOINTS * len(sites)
-    A, B, C = np.zeros((n, n)), np.zeros((n, m)), np.zeros((m, n))
-    for i, site in enumerate(sites):
-        A[site.q, site.qd] = np.eye(JOINTS)
-        A[site.dynamic, site.at] = site.dynamic_rates[:, site.own]
-        B[site.dynamic, _ports(i)] = site.dynamic_rates[:, EXTERNAL_TORQUE]
-        C[_ports(i), site.qd] = np.eye(JOINTS)
-    names = tuple(
-        f"{name}.{state}"
-        for name, site in zip(conditions.names, sites, strict=True)
-        for state in STATE_NAMES[site.own]
-    )
+    rates, mask, count = differentiate_rates(conditions, rest), find_loop_states(conditions), len(rest.q)
+    kept = np.flatnonzero(mask)
+    size, everywhere = count * STATE_SIZE, np.arange(count * JOINTS)
+
+    def collect(A: Array, B: Array) -> tuple[Array, Array]:
+        """Returns matrices of blocks, (i, row, j, column), as matrices of the loop's states and inputs."""
+        square, inputs = A.reshape(size, size), B.reshape(size, -1)
+        return square[np.ix_(kept, kept)], inputs[np.ix_(kept, everywhere)]
+
+    A, B = np.zeros((count, STATE_SIZE, count, STATE_SIZE)), np.zeros((count, STATE_SIZE, count, JOINTS))
+    C = np.zeros((count, JOINTS, count, STATE_SIZE))
+    terms: dict[float, tuple[Array, Array]] = {}
+    for i, own in enumerate(rates):
+        by = np.vstack([np.eye(JOINTS, ARGUMENT_COUNT, QD.start), own.qdd, own.estimate])
+        A[i, :, i], B[i, :, i], C[i, :, i, QD] = by[:, :STATE_SIZE], by[:, EXTERNAL_TORQUE], np.eye(JOINTS)
+        for j in np.flatnonzero(conditions.alpha[i]):
+            delay_s, share = float(conditions.age_s[i, j]), conditions.alpha[i, j]
+            late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
+            late_A[i, :, j, Q] += share * by[:, Q_DES]
+            late_A[i, :, j, QD] += share * by[:, QD_DES]
+            reflected, on_arm = share * by[:, PEER_TORQUE], rates[j].external + rates[j].held
+            late_A[i, :, j] += reflected @ on_arm[:, :STATE_SIZE]
+            late_B[i, :, j] += reflected @ on_arm[:, EXTERNAL_TORQUE]
+    names = np.array([[f"{name}.{state}" for state in STATE_NAMES] for name in conditions.names])
     inputs, outputs = (
         tuple(f"{name}.{kind}{j + 1}" for name in conditions.names for j in range(JOINTS))
         for kind in ("tau", "qd")
     )
-    return LinearLoop(names, inputs, outputs, A, B, C, _delayed_terms(conditions, sites))
-
-
-def _delayed_terms(conditions: OperatingConditions, sites: list[LinearSite]) -> tuple[DelayedTerm, ...]:
-    """Returns the effect of the peers, one entry per distinct delay."""
-    n, m = sites[-1].at.stop, JOINTS * len(sites)
-    terms: dict[float, DelayedTerm] = {}
-    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
-        delay_s, share = float(conditions.age_s[i, j]), conditions.alpha[i, j]
-        term = terms.setdefault(delay_s, DelayedTerm(delay_s, np.zeros((n, n)), np.zeros((n, m))))
-        receiver, peer = sites[i], sites[j]
-        term.A[receiver.dynamic, peer.q] += share * receiver.dynamic_rates[:, Q_DES]
-        term.A[receiver.dynamic, peer.qd] += share * receiver.dynamic_rates[:, QD_DES]
-        reflected = share * receiver.dynamic_rates[:, PEER_TORQUE]
-        on_arm = peer.rates.external + peer.rates.held
-        term.A[receiver.dynamic, peer.at] += reflected @ on_arm[:, peer.own]
-        term.B[receiver.dynamic, _ports(int(j))] += reflected @ on_arm[:, EXTERNAL_TORQUE]
-    return tuple(terms[delay_s] for delay_s in sorted(terms))
-
-
-def _ports(i: int) -> slice:
-    return slice(JOINTS * i, JOINTS * (i + 1))
+    delayed = tuple(DelayedTerm(delay_s, *collect(*terms[delay_s])) for delay_s in sorted(terms))
+    output = C.reshape(-1, size)[np.ix_(everywhere, kept)]
+    return LinearLoop(tuple(names[mask].tolist()), inputs, outputs, *collect(A, B), output, delayed)

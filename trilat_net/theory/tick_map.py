@@ -11,13 +11,11 @@ theta_k = eta_k + h/2 f_k and eta_{k+1} = eta_k + h f_k. `digital`: theta_k = et
 eta_{k+1} = eta_k + h f_k, and the torque on the arm is tau_k.
 """
 
-import cmath
 import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
 from ..core.site_setup import Scheme, SiteSetup
@@ -25,14 +23,16 @@ from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
 from .characteristic_roots import (
     Complex,
+    MovingPart,
+    Pencil,
     Spectrum,
     count_zero_roots,
+    extract_moving_part,
     limit_blas_threads,
     refine_roots,
-    select_moving_states,
     sort_root_guesses,
 )
-from .linear_loop import STATE_NAMES, linearise_sites
+from .linear_loop import STATE_NAMES, differentiate_rates
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
     ARGUMENT_COUNT,
@@ -120,48 +120,6 @@ def linearise_site_tick(site: SiteSetup, rates: SiteRates, h_s: float) -> SiteTi
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
 
 
-class TickPencil(NamedTuple):
-    """Delta(s) = (z I - S - sum_d S_d z^-d) / h with z = exp(s h).
-
-    Attributes:
-        h_s: the period, s.
-        S: shape (n, n).
-        ticks: the delays d, shape (K,).
-        Sd: shape (K, n, n).
-    """
-
-    h_s: float
-    S: Array
-    ticks: NDArray[np.int64]
-    Sd: Array
-
-    def at(self, s: complex) -> tuple[Complex, Complex]:
-        """See `Pencil`."""
-        z = cmath.exp(s * self.h_s)
-        eye = z * np.eye(len(self.S))
-        delayed = np.exp(-s * self.h_s * self.ticks)[:, np.newaxis, np.newaxis] * self.Sd
-        delta = (eye - self.S - delayed.sum(axis=0)) / self.h_s
-        return delta, eye + (self.ticks[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
-
-    def size(self, s: complex) -> float:
-        """See `Pencil`."""
-        delayed = np.exp(-s.real * self.h_s * self.ticks) @ np.linalg.norm(self.Sd, axis=(1, 2))
-        return float((math.exp(s.real * self.h_s) + np.linalg.norm(self.S) + delayed) / self.h_s)
-
-    def taylor(self, power: int) -> Array:
-        """See `Pencil`."""
-        factors = (-self.ticks.astype(np.float64)) ** power
-        own = np.eye(len(self.S)) - (self.S if power == 0 else 0.0)
-        scale = self.h_s ** (power - 1) / math.factorial(power)
-        coefficient: Array = scale * (own - np.einsum("k,kab->ab", factors, self.Sd))
-        return coefficient
-
-    @property
-    def delayed_states(self) -> NDArray[np.intp]:
-        """Places of the states that act after a delay."""
-        return np.flatnonzero(np.abs(self.Sd).sum(axis=(0, 1)))
-
-
 def find_common_rate_hz(conditions: OperatingConditions) -> int | None:
     """Returns the tick rate of all sites, Hz; None if they have several."""
     rates = {site.rate_hz for site in conditions.sites}
@@ -182,35 +140,36 @@ def compute_sampled_spectrum(
     if find_common_rate_hz(conditions) is None:
         return None
     pencil, names, constant = build_tick_pencil(conditions, rest)
+    h_s = 1.0 / conditions.sites[0].rate_hz
 
     def logarithms(matrix: Array) -> Complex:
         """Returns ln(z) / h of the eigenvalues that are not next to zero, 1/s."""
         z = np.linalg.eigvals(matrix).astype(np.complex128)
-        return (np.log(z[np.abs(z) > 1e-8]) / pencil.h_s).astype(np.complex128)
+        return (np.log(z[np.abs(z) > 1e-8]) / h_s).astype(np.complex128)
 
     with limit_blas_threads():
         zeros, drifting = count_zero_roots(pencil)
-        size = len(names) + int(pencil.ticks.max(initial=0)) * len(pencil.delayed_states)
+        size = len(names) + int(pencil.delays.max(initial=0)) * len(pencil.delayed_states)
         if size <= MAX_COMPANION_SIZE:
             guesses = sort_root_guesses(logarithms(build_companion_matrix(pencil)), zeros)
             tries = wanted + 2
         else:
             guesses = np.concatenate(
-                [near, logarithms(pencil.S), logarithms(pencil.S + pencil.Sd.sum(axis=0))]
+                [near, logarithms(pencil.A), logarithms(pencil.A + pencil.Ad.sum(axis=0))]
             )
             guesses = sort_root_guesses(guesses[np.abs(guesses) > 1e-6], 0)
             tries = len(guesses)
-        roots, dropped = refine_roots(pencil, guesses, names, wanted, tries, 2.0 * math.pi / pencil.h_s)
+        roots, dropped = refine_roots(pencil, guesses, names, wanted, tries, 2.0 * math.pi / h_s)
     return Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
 
 
-def build_companion_matrix(pencil: TickPencil) -> Array:
+def build_companion_matrix(pencil: Pencil) -> Array:
     """Returns the matrix that carries the state, and the past of its delayed part, from tick to tick."""
-    n, delayed = len(pencil.S), pencil.delayed_states
-    depth, c = int(pencil.ticks.max(initial=0)), len(delayed)
+    n, delayed = len(pencil.A), pencil.delayed_states
+    depth, c = int(pencil.delays.max(initial=0)), len(delayed)
     whole = np.zeros((n + depth * c, n + depth * c))
-    whole[:n, :n] = pencil.S
-    for d, Sd in zip(pencil.ticks, pencil.Sd, strict=True):
+    whole[:n, :n] = pencil.A
+    for d, Sd in zip(pencil.delays, pencil.Ad, strict=True):
         whole[:n, n + (d - 1) * c : n + d * c] += Sd[:, delayed]
     if depth:
         whole[n + np.arange(c), delayed] = 1.0
@@ -218,18 +177,12 @@ def build_companion_matrix(pencil: TickPencil) -> Array:
     return whole
 
 
-def build_tick_pencil(
-    conditions: OperatingConditions, rest: Equilibrium
-) -> tuple[TickPencil, tuple[str, ...], int]:
-    """Returns the characteristic equation of the moving part, its names, and the number of constant states.
-
-    All sites must have one rate.
-    """
+def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> MovingPart:
+    """Returns the part of the sampled loop that moves; all sites must have one rate."""
     h_s = 1.0 / conditions.sites[0].rate_hz
-    linear_sites = linearise_sites(conditions, rest)
     maps = [
-        linearise_site_tick(site, linear.rates, h_s)
-        for site, linear in zip(conditions.sites, linear_sites, strict=True)
+        linearise_site_tick(site, rates, h_s)
+        for site, rates in zip(conditions.sites, differentiate_rates(conditions, rest), strict=True)
     ]
     ends = np.cumsum([0, *(len(one.P) for one in maps)])
     at = [slice(a, b) for a, b in itertools.pairwise(ends)]
@@ -241,8 +194,4 @@ def build_tick_pencil(
         S_d[at[i], at[j]] += conditions.alpha[i, j] * maps[i].Q @ maps[j].sent
     ticks = np.array(sorted(Sd), dtype=np.int64)
     delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
-    kept = select_moving_states(np.abs(S - np.eye(len(S))) + np.abs(delayed).sum(axis=0))
-    rows, columns = np.ix_(kept, kept)
-    names = [name for one in maps for name in one.names]
-    pencil = TickPencil(h_s, S[rows, columns], ticks, delayed[:, rows, columns])
-    return pencil, tuple(names[place] for place in kept), len(S) - len(kept)
+    return extract_moving_part(Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names])
