@@ -1,4 +1,7 @@
-"""A sweep on a Dask cluster of two workers on loopback, and by loky on the same two cores."""
+"""A sweep on a Dask cluster of two workers on loopback, by loky, and by two processes without any pool.
+
+The three take turns, and each runs alone: a cluster that idles beside the others costs them some per cent.
+"""
 
 import json
 import os
@@ -10,7 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from trilat_net.studies.executor import open_worker_pool
+from trilat_net.process import worker_pool
+from trilat_net.studies.executor import open_worker_pool, run_batch
 from trilat_net.studies.sweep import plan_sweep
 from trilat_net.studies.sweep.sweep_cell import CellTask, run_cell
 
@@ -19,6 +23,11 @@ CELLS = 2000
 REPEATS = 3
 WARMED = 40
 """Cells before the clock runs: processes start and load the compiled core."""
+SETTINGS = {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+}
+"""As docs/sweep.md recommends."""
 OVER = f"control.Kd=2:{2 + 0.001 * (CELLS - 1):g}:0.001"
 
 
@@ -27,7 +36,7 @@ def started_cluster(folder: Path) -> Iterator[str]:
     """Yields the address of a scheduler with workers of one thread each."""
     file = folder / "scheduler.json"
     dask = [sys.executable, "-m", "dask"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": {**os.environ}}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": {**os.environ, **SETTINGS}}
     local = ["--host", "127.0.0.1", "--no-dashboard"]
     processes = [
         subprocess.Popen([*dask, "scheduler", *local, "--port", "0", "--scheduler-file", str(file)], **quiet)  # type: ignore[call-overload]
@@ -45,14 +54,32 @@ def started_cluster(folder: Path) -> Iterator[str]:
             process.wait()
 
 
-def cells_per_s(tasks: list[CellTask], on: str | None) -> float:
+def pool_cells_per_s(tasks: list[CellTask], on: str | None) -> float:
     with open_worker_pool(None if on else WORKERS, on) as pool:
-        while pool.workers < WORKERS:
-            time.sleep(0.1)
         pool.map(run_cell, tasks[:WARMED])
         begun = time.perf_counter()
         pool.map(run_cell, tasks)
         return len(tasks) / (time.perf_counter() - begun)
+
+
+def cluster_cells_per_s(tasks: list[CellTask]) -> float:
+    with tempfile.TemporaryDirectory() as folder, started_cluster(Path(folder)) as address:
+        while True:
+            with open_worker_pool(None, address) as pool:
+                if pool.workers == WORKERS:
+                    break
+        return pool_cells_per_s(tasks, address)
+
+
+def plain_cells_per_s(tasks: list[CellTask]) -> float:
+    """Every process has its share of the cells from the start."""
+    with worker_pool(WORKERS) as executor:
+        for share in (tasks[:WARMED], tasks):
+            began = time.perf_counter()
+            parts = [executor.submit(run_batch, run_cell, share[n::WORKERS]) for n in range(WORKERS)]
+            for part in parts:
+                part.result()
+        return len(tasks) / (time.perf_counter() - began)
 
 
 def run() -> list[str]:
@@ -60,22 +87,19 @@ def run() -> list[str]:
     tasks = [sweep.task(n, sweep.seeds[0]) for n in range(sweep.cells)]
     for task in tasks[:3]:
         run_cell(task)
-    begun = time.perf_counter()
-    for task in tasks[:WARMED]:
-        run_cell(task)
-    cell_s = (time.perf_counter() - begun) / WARMED
-    with tempfile.TemporaryDirectory() as folder, started_cluster(Path(folder)) as address:
-        while True:
-            with open_worker_pool(None, address) as pool:
-                if pool.workers == WORKERS:
-                    break
-        rates = [(cells_per_s(tasks, None), cells_per_s(tasks, address)) for _ in range(REPEATS)]
-    ratios = sorted(dask / loky for loky, dask in rates)
-    loky, dask = (max(one) for one in zip(*rates, strict=True))
+    rounds = [
+        (plain_cells_per_s(tasks), pool_cells_per_s(tasks, None), cluster_cells_per_s(tasks))
+        for _ in range(REPEATS)
+    ]
+
+    def median(above: int, below: int) -> float:
+        return sorted(rates[above] / rates[below] for rates in rounds)[REPEATS // 2]
+
+    plain, loky, dask = (max(rates) for rates in zip(*rounds, strict=True))
     return [
-        f"{len(tasks)} cells of free, {1e3 * cell_s:.0f} ms each alone, by {WORKERS} processes; "
-        f"best of {REPEATS}, in turn:",
-        f"  loky: {loky:.1f} cells/s, overhead {100.0 * (1.0 - loky * cell_s / WORKERS):.1f} %",
-        f"  Dask on loopback: {dask:.1f} cells/s; median of Dask over loky {ratios[REPEATS // 2]:.3f} "
-        "(bar: >= 0.9)",
+        f"{len(tasks)} cells of free by {WORKERS} processes, best of {REPEATS}, in turn; ratios: medians:",
+        f"  without a pool: {plain:.1f} cells/s, {1e3 * WORKERS / plain:.1f} ms each",
+        f"  loky: {loky:.1f} cells/s, overhead {100.0 * (1.0 - median(1, 0)):.1f} % (bar: < 5 %)",
+        f"  Dask on loopback: {dask:.1f} cells/s, overhead {100.0 * (1.0 - median(2, 0)):.1f} %; "
+        f"over loky {median(2, 1):.3f} (bar: >= 0.9)",
     ]

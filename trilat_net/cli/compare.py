@@ -100,8 +100,7 @@ def _run_tuning(
     """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
     from ..files import make_results_folder
     from ..studies.executor import count_workers
-    from ..studies.tuning.tuning_figure import write_tuning
-    from ..studies.tuning.tuning_tables import tuning_to_json
+    from ..studies.tuning.tuning_report import tuning_to_json, write_tuning
 
     workers = count_workers(jobs, on)
     chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
@@ -119,7 +118,7 @@ def _run_tuning(
 
 def _print_procedure(asked: "TuningPlan", workers: int) -> None:
     """Prints the conditions that all laws share, and the expected duration of the search."""
-    from ..studies.tuning.tuning_tables import describe_procedure
+    from ..studies.tuning.tuning_report import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
     print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
@@ -138,7 +137,7 @@ def _format_duration(seconds: float) -> str:
 
 def _print_tuned(found: "TuningResult") -> None:
     """Prints the laws, every front, the gains of the paper, and the commands of the best points."""
-    from ..studies.tuning.tuning_tables import (
+    from ..studies.tuning.tuning_report import (
         list_class_meanings,
         tabulate_front,
         tabulate_laws,

@@ -318,10 +318,10 @@ def _print_cell_commands(path: Path, number: int) -> None:
 
     results = read_results(path)
     for row in results.of_cell(number):
-        found = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
-        if found.note:
-            print_note(found.note)
-        print_line(found.command)
+        command, note = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
+        if note:
+            print_note(note)
+        print_line(command)
 
 
 app = typer.Typer()

@@ -120,9 +120,6 @@ def _make_probe() -> Callable[[Sequence[tuple[str, str]]], tuple[WorkerIdentity,
 class DaskCluster:
     """A connection to a Dask scheduler; a context, which closes it and cancels what is under way.
 
-    Args:
-        address: of the scheduler, as in tcp://10.0.0.5:8786.
-
     Raises:
         UsageError: Dask is not installed, the scheduler does not answer, or it has no worker.
     """

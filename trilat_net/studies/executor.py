@@ -8,6 +8,7 @@ died runs again, at most `MAX_LOSSES` times in all; the last times alone, so tha
 the one that ends its workers.
 """
 
+import textwrap
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
@@ -30,7 +31,11 @@ Workers = str | Executor | None
 
 BATCH_S = 0.4
 """The duration of a batch of items, about: at 20 ms an item its overhead is below 1 %."""
-MAX_BATCH = 200
+CLUSTER_BATCH_S = 2.0
+"""The same on a cluster, where a batch costs its scheduler, its worker and this process some 20 ms in all."""
+MAX_BATCH = 400
+_SMALLEST = 16
+"""The last batches are no smaller than this part of a whole one."""
 MAX_LOSSES = 3
 _BATCHES_PER_WORKER = 2
 """One at work and one that waits, so that no worker is idle."""
@@ -82,9 +87,9 @@ class _Batch(NamedTuple):
 class _Feed(Generic[T]):
     """The items that wait, and how many of them make the next batch."""
 
-    def __init__(self, items: Iterable[T], count: int | None, workers: int) -> None:
+    def __init__(self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S) -> None:
         self._new = enumerate(items)
-        self._left, self._workers = count, workers
+        self._left, self._workers, self._batch_s = count, workers, batch_s
         self._again: deque[tuple[int, T]] = deque()
         self._suspects: deque[tuple[int, T]] = deque()
         self._losses: Counter[int] = Counter()
@@ -100,9 +105,10 @@ class _Feed(Generic[T]):
             return [self._suspects.popleft()] if idle else []
         if self._again:
             return [self._again.popleft()]
-        size = min(MAX_BATCH, int(BATCH_S * self._runs / self._wall_s)) if self._wall_s > 0.0 else 1
+        size = min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s)) if self._wall_s > 0.0 else 1
         if self._left is not None:  # small batches at the end leave no worker idle
-            size = min(size, self._left // (2 * self._workers * _BATCHES_PER_WORKER))
+            share = self._left // (2 * self._workers * _BATCHES_PER_WORKER)
+            size = min(size, max(share, size // _SMALLEST))
         batch = list(islice(self._new, max(1, size)))
         if self._left is not None:
             self._left -= len(batch)
@@ -174,7 +180,7 @@ class WorkerPool:
         if self._executor is None:
             yield from enumerate(map(function, items))
             return
-        feed = _Feed(items, count, self.workers)
+        feed = _Feed(items, count, self.workers, BATCH_S if self._cluster is None else CLUSTER_BATCH_S)
         pending: dict[Future[_BatchResult], _Batch] = {}
         try:
             while True:
@@ -237,7 +243,8 @@ class WorkerPool:
             return
         for number, item in gone:
             if lost is None:
-                raise RunFailed(f"{name_item(item)} ended {MAX_LOSSES} worker processes{self._hint}")
+                name = textwrap.shorten(str(item), _MAX_NAME, placeholder="...")
+                raise RunFailed(f"{name} ended {MAX_LOSSES} worker processes{self._hint}")
             yield number, lost(item)
 
     def _replace(self, broken: Executor) -> None:
@@ -246,12 +253,6 @@ class WorkerPool:
             raise RunFailed(f"a worker process was ended{self._hint}") from None
         if broken is self._executor:
             self._executor = self._restart()
-
-
-def name_item(item: object) -> str:
-    """Returns an item's text, cut to a length that people read."""
-    text = str(item)
-    return text if len(text) <= _MAX_NAME else f"{text[:_MAX_NAME]}..."
 
 
 @contextmanager
@@ -280,15 +281,12 @@ def open_worker_pool(
         else:
             count = jobs or count_cores()
             count = count if most is None else min(count, most)
-            yield _open_processes(stack, count, hint) if count > 1 else WorkerPool(None, 1)
 
+            def start() -> Executor:
+                opened: AbstractContextManager[Executor] = worker_pool(count)
+                return stack.enter_context(opened)
 
-def _open_processes(stack: ExitStack, count: int, hint: str) -> WorkerPool:
-    def start() -> Executor:
-        opened: AbstractContextManager[Executor] = worker_pool(count)
-        return stack.enter_context(opened)
-
-    return WorkerPool(start(), count, start, hint=hint)
+            yield WorkerPool(start(), count, start, hint=hint) if count > 1 else WorkerPool(None, 1)
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:

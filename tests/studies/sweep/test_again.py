@@ -31,8 +31,8 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResul
     assert any(row["diverged_s"] is not None for row in results.rows)
     assert any(row["extended"] for row in results.rows)
     for row in results.rows:
-        found = build_reproduce_command(results, row, tmp_path)
-        words = shlex.split(found.command)
+        command, note = build_reproduce_command(results, row, tmp_path)
+        words = shlex.split(command)
         done = trilat(*words[1:], cwd=tmp_path)
         outcome = results.outcome(row)
         assert done.code == (0 if outcome.diverged_s is None else 1), done
@@ -46,7 +46,7 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResul
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)
         ran_s = outcome.ran_s if outcome.diverged_s is not None else outcome.ran_s - 0.01
         assert ended_s == pytest.approx(ran_s)
-        assert (found.note, row["command"]) == ("", found.command)
+        assert (note, row["command"]) == ("", command)
 
 
 def test_where_the_scenario_has_changed_the_rows_own_is_named(results: SweepResults, tmp_path: Path) -> None:
@@ -54,14 +54,14 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(results: SweepResu
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
     try:
-        found = build_reproduce_command(results, row, tmp_path)
+        command, note = build_reproduce_command(results, row, tmp_path)
     finally:
         source.write_text(SHORT)
-    assert "is not what was swept any more" in found.note
+    assert "is not what was swept any more" in note
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
-    words = shlex.split(found.command)
+    words = shlex.split(command)
     trilat(*words[1:], cwd=tmp_path)
     assert classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad == row["end_error_rad"]
     source.rename(source.with_suffix(".away"))
-    assert "or not here" in build_reproduce_command(results, row, tmp_path).note
+    assert "or not here" in build_reproduce_command(results, row, tmp_path)[1]
     source.with_suffix(".away").rename(source)

@@ -12,10 +12,10 @@ from trilat_net.studies.sweep.stability_map import (
     format_override,
     format_override_value,
     panel_scenarios,
+    trace_linear_analysis,
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.studies.sweep.theory_lines import trace_linear_analysis
 from trilat_net.theory import compute_growth_rates
 
 from .maps import KEYS, rows

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.theory_lines import evaluate_criterion
+from trilat_net.studies.sweep.stability_map import evaluate_criterion
 
 GAIN = st.floats(0.1, 50.0)
 DELAY_MS = st.integers(1, 5000)

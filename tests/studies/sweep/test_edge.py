@@ -5,25 +5,25 @@ import itertools
 import pytest
 
 from trilat_net.studies.sweep.cell_result import CellClass
-from trilat_net.studies.sweep.map_plane import MapEdge, find_map_edges
+from trilat_net.studies.sweep.map_plane import StableInterval, find_map_edges
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn
 
 YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 
-def up(column: tuple[CellClass, ...]) -> list[MapEdge]:
+def up(column: tuple[CellClass, ...]) -> list[StableInterval]:
     """The edges of the first column of a map in which all are like this one."""
     found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
-    return [edge for edge in find_map_edges(found, found.panels[0]) if edge.x == DELAYS_MS[0]]
+    return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
 
 
 def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
     found = drawn()
     measured = find_map_edges(found, found.panels[0])
-    assert [edge.x for edge in measured] == [100, 200, 300, 400]
-    for edge in measured:
-        assert edge.low <= 5e-3 * edge.x <= edge.high
+    assert [x for x, _ in measured] == [100, 200, 300, 400]
+    for x, edge in measured:
+        assert edge.low <= 5e-3 * x <= edge.high
         assert not edge.stable_below
 
 
@@ -49,4 +49,4 @@ def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
     three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
     assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
     draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
-    assert all(edge.low > 1.0 or edge.high > 1.0 for edge in find_map_edges(draw, draw.panels[0]))
+    assert all(edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0]))

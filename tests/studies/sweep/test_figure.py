@@ -14,7 +14,7 @@ from trilat_net.reporting.figure_size import make_print_size
 from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.map_page import CLASS_COLOURS, draw_stability_map
 from trilat_net.studies.sweep.map_plane import CELL_CLASSES, MapPlane
-from trilat_net.studies.sweep.theory_lines import TheoryLine
+from trilat_net.studies.sweep.stability_map import TheoryLine
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 

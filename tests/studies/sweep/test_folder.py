@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
+from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import UsageError
+from trilat_net.log.log_layout import collect_provenance
 from trilat_net.studies.sweep import sweep_folder as folders
 from trilat_net.studies.sweep.sweep_folder import PLAN_FILE, open_sweep_folder, prepare_sweep_folder
 
@@ -60,11 +62,12 @@ def test_a_scenario_that_was_edited_since_is_refused(begun: Path) -> None:
 
 
 def test_another_arithmetic_or_program_is_refused(begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = folders._made_with()
-    monkeypatch.setattr(folders, "_made_with", lambda: {**now, "arithmetic": "0" * 16})
-    assert f"another kind of arithmetic: there {now['arithmetic']}, here 0000" in refused(begun)
-    versions = {**now["versions"], "version_numba": "0.1"}
-    monkeypatch.setattr(folders, "_made_with", lambda: {**now, "versions": versions})
+    with monkeypatch.context() as patch:
+        patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
+        words = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
+        assert words in refused(begun)
+    older = {**collect_provenance(), "version_numba": "0.1"}
+    monkeypatch.setattr(folders, "collect_provenance", lambda: older)
     with pytest.raises(UsageError, match=r"another version of the program: .*numba 0\.1"):
         open_sweep_folder(begun)
 

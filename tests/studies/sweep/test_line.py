@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.map_plane import PlaneAxis
-from trilat_net.studies.sweep.theory_lines import (
+from trilat_net.studies.sweep.stability_map import (
     StabilityCriterion,
     find_criterion_edge,
     trace_closed_form,

@@ -9,11 +9,11 @@ from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
 from trilat_net.studies.sweep import cell_result
 from trilat_net.studies.sweep.cell_result import CellClass, CellResult
+from trilat_net.studies.sweep.map_plane import StableInterval
 from trilat_net.studies.sweep.margin_search import (
     GridPointMargin,
     KeyMargin,
     SearchRange,
-    StableInterval,
     build_margin_command,
     build_margin_page,
     format_range_axis,

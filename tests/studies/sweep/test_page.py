@@ -7,8 +7,7 @@ import pytest
 
 from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.map_page import build_map_page, tabulate_classes, tabulate_edges, write_map
-from trilat_net.studies.sweep.stability_map import StabilityMap
-from trilat_net.studies.sweep.theory_lines import TheoryLine
+from trilat_net.studies.sweep.stability_map import StabilityMap, TheoryLine
 
 from .maps import DAMPINGS, DELAYS_MS, drawn
 

@@ -8,7 +8,8 @@ import pytest
 import trilat_net
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.trials.measure_run import BATCH_RECORDS, RunMetrics, measure_log, measure_virtual_run
+from trilat_net.studies.record_batches import BATCH_RECORDS
+from trilat_net.studies.trials.measure_run import RunMetrics, measure_log, measure_virtual_run
 
 RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
 SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}

@@ -16,8 +16,9 @@ def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
     """Otherwise V' <= 0 does not stand, and a law would be searched where it cannot work."""
     scenario, knowledge = trio(), build_model_information(percent)
     truth = scenario.sites["s"].arm.theta
-    assert (np.array(knowledge.low(scenario, "s")) < truth).all()
-    assert (np.array(knowledge.high(scenario, "s")) > truth).all()
+    low, high = knowledge.box_sides(scenario, "s")
+    assert (np.array(low) < truth).all()
+    assert (np.array(high) > truth).all()
 
 
 @given(percent=SHARES)

@@ -8,8 +8,7 @@ import pytest
 
 from trilat_net.studies.tuning import TuningResult
 from trilat_net.studies.tuning.final_posture import CandidateClass
-from trilat_net.studies.tuning.tuning_figure import write_tuning
-from trilat_net.studies.tuning.tuning_tables import tabulate_front, tabulate_laws
+from trilat_net.studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
 
 from .experiments import asked
 

@@ -12,7 +12,7 @@ from trilat_net.studies.tuning.candidate import measure_candidate
 from trilat_net.studies.tuning.final_posture import CandidateClass
 from trilat_net.studies.tuning.pareto_search import dominates, find_pareto_front
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
-from trilat_net.studies.tuning.tuning_tables import tuning_to_json
+from trilat_net.studies.tuning.tuning_report import tuning_to_json
 
 from .experiments import asked
 

@@ -83,7 +83,7 @@ def check_sweepable(scenario: Scenario) -> None:
 
     Raises:
         ScenarioError: a link has the delay of a real network, which here would be one tick; or see
-            `sim.fused.check_fuses`.
+            `check_fusable`.
     """
     if scenario.measured:
         raise ScenarioError(
@@ -97,9 +97,9 @@ def check_sweepable(scenario: Scenario) -> None:
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and returns what became of it.
 
-    A run that has not made itself plain when its time is over (see `plain`) goes on for as long again, and so
-    on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for a
-    trend of a run in which anything is drawn: such errors wander, and a slow trend is chance.
+    A run that is not conclusive when its time is over (see `is_conclusive`) goes on for as long again, and
+    so on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for
+    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance.
 
     Args:
         text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
@@ -114,11 +114,8 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
-    wanders = (
-        scenario.random
-        and outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
-        and not _pronounced(outcome)
-    )
+    trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
+    wanders = scenario.random and trend and not _pronounced(outcome)
     return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED) if wanders else outcome
 
 
@@ -126,9 +123,9 @@ def is_conclusive(outcome: CellResult) -> bool:
     """True where a longer run would hardly be called something else.
 
     That is: it left its limits; or it came to rest; or it grows, and the largest speed at least doubled over
-    the second half; or neither that nor the largest error changed by more than `FLAT`. Near the edge of
-    stability a finite run looks steady whatever it does later, and what decays may hide what grows slowly
-    until it is gone.
+    the second half; or neither that nor the largest error changed by more than `FLAT_LOG_CHANGE`. Near the
+    edge of stability a finite run looks steady whatever it does later, and what decays may hide what grows
+    slowly until it is gone.
     """
     if outcome.motion is EndBehaviour.BOUNDED:
         return max(map(abs, _changes(outcome))) <= FLAT_LOG_CHANGE
@@ -152,6 +149,8 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
 def _cell_result(run: FusedRun, extended: int) -> CellResult:
     maxima = run.maxima
     end = classify_run_end(maxima, run.ran_s, run.diverged_s)
+    rates = (end.error.rate_per_s, end.speed.rate_per_s)
+    error_rate, speed_rate = (rate if math.isfinite(rate) else None for rate in rates)
     return CellResult(
         verdict=CLASS_OF_MOTION[end.behaviour],
         motion=end.behaviour,
@@ -159,13 +158,9 @@ def _cell_result(run: FusedRun, extended: int) -> CellResult:
         extended=extended,
         end_error_rad=end.end_error_rad,
         end_speed_rad_s=end.end_speed_rad_s,
-        error_rate_per_s=_finite(end.error.rate_per_s),
-        speed_rate_per_s=_finite(end.speed.rate_per_s),
+        error_rate_per_s=error_rate,
+        speed_rate_per_s=speed_rate,
         peak_error_rad=max(float(values[:, 0].max()) for values in maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

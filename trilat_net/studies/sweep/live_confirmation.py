@@ -16,22 +16,16 @@ from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
 from ...scenario import Scenario, parse_scenario
 from .cell_result import CLASS_OF_MOTION, CellClass
+from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
 """A live session lasts as long as the cell ran: longer ones are passed over, s."""
 _BEYOND_S = 0.5
 """A cell that diverged runs so much longer than it needed to, s: not to end on the very tick."""
 
-CellRow = Mapping[str, Any]
-
 
 class LiveSession(NamedTuple):
-    """How a live session went.
-
-    Attributes:
-        log: its log, which may be missing.
-        problems: what went wrong, in order.
-    """
+    """A live session that ended: its log, which may be missing, and what went wrong, in order."""
 
     log: Path
     problems: Sequence[str]
@@ -46,13 +40,13 @@ class ConfirmedCell(NamedTuple):
 
     Attributes:
         row: the cell, as its results have it.
-        virtual: its verdict in virtual time.
-        live: the verdict of the log; None where there is none.
+        virtual: its class in virtual time.
+        live: the class of the log; None where there is none.
         text: what the log shows in numbers, or what went wrong.
         log: where it lies; None where there is none.
     """
 
-    row: CellRow
+    row: ResultRow
     virtual: CellClass
     live: CellClass | None
     text: str
@@ -65,8 +59,8 @@ class ConfirmedCell(NamedTuple):
 
 
 def choose_cells_near_edges(
-    rows: Sequence[CellRow], axes: Sequence[str], count: int, longest_s: float = MAX_SESSION_S
-) -> list[CellRow]:
+    rows: Sequence[ResultRow], axes: Sequence[str], count: int, longest_s: float = MAX_SESSION_S
+) -> list[ResultRow]:
     """Returns cells next to edges, as many on the stable side as on the other.
 
     How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
@@ -84,44 +78,41 @@ def choose_cells_near_edges(
     """
     if count < 1:
         raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
-    places, order = _places(rows, axes)
+    places = _index_rows(rows, axes)
     away = _steps_away(places, len(axes))
     if not away:
         raise UsageError("no two cells along an axis were decided differently: there is no edge to confirm")
     chosen = []
     for side in (True, False):
-        ours = {
-            place: steps
-            for place, steps in away.items()
-            if CellClass(places[place]["verdict"]).stable is side
-        }
-        brief = [place for place in ours if places[place]["ran_s"] <= longest_s]
+        brief = [
+            place
+            for place in away
+            if CellClass(places[place]["verdict"]).stable is side and places[place]["ran_s"] <= longest_s
+        ]
         if not brief:
             word = "stable" if side else "other"
             raise UsageError(f"every cell on the {word} side of an edge ran longer than {longest_s:g} s")
-        farthest = sorted(ours[place] for place in brief)[min(count, len(brief)) - 1]
-        near = [places[place] for place in brief if ours[place] <= farthest]
-        chosen += _spread(near, order, count)
+        farthest = sorted(away[place] for place in brief)[min(count, len(brief)) - 1]
+        near = [place for place in brief if away[place] <= farthest]
+        near.sort(key=lambda place: (*map(str, place[2:]), *place[:2]))
+        spread = np.linspace(0, len(near) - 1, min(count, len(near))).round().astype(int)
+        chosen += [places[near[n]] for n in spread]
     return chosen
 
 
-def confirm_cell(row: CellRow, run: SessionRunner, longest_s: float = MAX_SESSION_S) -> ConfirmedCell:
+def confirm_cell(row: ResultRow, run: SessionRunner, longest_s: float = MAX_SESSION_S) -> ConfirmedCell:
     """Runs a cell over a network and compares verdicts."""
     virtual = CellClass(row["verdict"])
     extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
-    scenario = parse_scenario(row["scenario"])
-    scenario = msgspec.structs.replace(
-        scenario, duration_s=min(row["ran_s"] + extra_s, longest_s + _BEYOND_S)
-    )
+    lasts_s = min(row["ran_s"] + extra_s, longest_s + _BEYOND_S)
+    scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=lasts_s)
     session = run(scenario, f"cell-{row['cell']}")
     log = session.log if session.log.exists() else None
     try:
         found = classify_log_end(open_log(session.log))
     except LogError as error:
         return ConfirmedCell(row, virtual, None, "; ".join([*session.problems, str(error)]), log)
-    if (
-        session.problems and found.behaviour is not EndBehaviour.DIVERGED
-    ):  # one that diverges ends all, as it should
+    if session.problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
         return ConfirmedCell(row, virtual, None, "; ".join(session.problems), log)
     return ConfirmedCell(row, virtual, CLASS_OF_MOTION[found.behaviour], found.text, log)
 
@@ -129,25 +120,21 @@ def confirm_cell(row: CellRow, run: SessionRunner, longest_s: float = MAX_SESSIO
 GridIndex = tuple[Any, ...]
 
 
-def _places(
-    rows: Sequence[CellRow], axes: Sequence[str]
-) -> tuple[dict[GridIndex, CellRow], Callable[[CellRow], GridIndex]]:
-    """Returns rows by place: numbers of the axes' values, then law and seed; and how a row is placed."""
-    values = [sorted({row[key] for row in rows}, key=_sortable) for key in axes]
+def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
+    """Returns rows by the numbers of their values along the axes, then law and seed."""
+    values = [sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one)) for key in axes]
     numbers = [{value: n for n, value in enumerate(some)} for some in values]
-
-    def place(row: CellRow) -> GridIndex:
-        where = [number[row[key]] for key, number in zip(axes, numbers, strict=True)]
-        return (*where, row.get("law"), row.get("seed"))
-
-    return {place(row): row for row in rows}, place
-
-
-def _sortable(value: Any) -> tuple[bool, Any]:
-    return isinstance(value, str), value
+    return {
+        (
+            *(number[row[key]] for key, number in zip(axes, numbers, strict=True)),
+            row.get("law"),
+            row.get("seed"),
+        ): row
+        for row in rows
+    }
 
 
-def _steps_away(places: Mapping[GridIndex, CellRow], axes: int) -> dict[GridIndex, int]:
+def _steps_away(places: Mapping[GridIndex, ResultRow], axes: int) -> dict[GridIndex, int]:
     """Returns of decided places how many steps along an axis the first one is that was decided otherwise."""
     stable = {place: CellClass(row["verdict"]).stable for place, row in places.items()}
     lines: dict[GridIndex, list[GridIndex]] = {}
@@ -162,11 +149,3 @@ def _steps_away(places: Mapping[GridIndex, CellRow], axes: int) -> dict[GridInde
             if others:
                 away[place] = min(min(others), away.get(place, min(others)))
     return away
-
-
-def _spread(rows: Sequence[CellRow], order: Callable[[CellRow], GridIndex], count: int) -> list[CellRow]:
-    """Returns some rows, as evenly apart as they can be in the order of their places."""
-    ordered = sorted(rows, key=lambda row: tuple(map(str, order(row)[2:])) + order(row)[:2])
-    if len(ordered) <= count:
-        return ordered
-    return [ordered[n] for n in np.linspace(0, len(ordered) - 1, count).round().astype(int)]

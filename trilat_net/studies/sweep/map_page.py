@@ -30,17 +30,14 @@ from .cell_result import CellClass
 from .live_confirmation import ConfirmedCell
 from .map_plane import (
     CELL_CLASSES,
-    STABLE_CLASSES,
-    UNSTABLE_CLASSES,
-    MapEdge,
     MapPanel,
     MapPlane,
     PlaneAxis,
+    StableInterval,
     find_map_edges,
     label_axis,
 )
-from .stability_map import StabilityMap
-from .theory_lines import TheoryLine
+from .stability_map import StabilityMap, TheoryLine
 
 CLASS_COLOURS = {
     CellClass.CONVERGED: "#d3e4f3",
@@ -80,11 +77,9 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], f
             axes.set_axis_off()
         for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
             _draw_panel(axes, plane, panel, drawn)
-            _entitle(
-                axes,
-                panel.title,
-                round((form.width_in - 0.6 * (plane.seeds > 1)) * _LETTERS_PER_IN / columns),
-            )
+            letters = round((form.width_in - 0.6 * (plane.seeds > 1)) * _LETTERS_PER_IN / columns)
+            broken = len(panel.title) > letters
+            axes.set_title(panel.title.replace(", ", ",\n") if broken else panel.title)
         for n, axes in enumerate(grid[: len(plane.panels)]):
             _scale(axes, plane)
             axes.tick_params(labelleft=n % columns == 0 and bool(plane.y.key))
@@ -118,37 +113,30 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Th
     x, y = _bounds(plane.x), _bounds(plane.y)
     axes.grid(visible=False)
     axes.set_facecolor("#f4f4f4")  # where nothing has run
-    ran = panel.runs > 0
-    undecided = _undecided(panel)
     if plane.seeds > 1:
         shown = np.ma.masked_invalid(panel.share)
         axes.pcolormesh(x, y, shown, cmap=_shares(), vmin=0.0, vmax=1.0, rasterized=True)
     else:
-        classes = np.ma.masked_where(~ran, panel.counts.argmax(axis=2))
+        classes = np.ma.masked_where(panel.runs == 0, panel.counts.argmax(axis=2))
         norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
         palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
         axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
-    if undecided.any():
-        _hatch(axes, x, y, undecided)
+    _hatch(axes, x, y, _undecided(panel))
     for line in lines:
         _draw_line(axes, plane, line)
 
 
 def _draw_line(axes: Axes, plane: MapPlane, line: TheoryLine) -> None:
     """Draws where a line is zero, out to the borders of the outermost cells."""
-    x, y, spare = plane.x.places, plane.y.places, line.spare
-    bounds = _bounds(plane.x), _bounds(plane.y)
-    x = np.concatenate([bounds[0][:1], x, bounds[0][-1:]])
-    y = np.concatenate([bounds[1][:1], y, bounds[1][-1:]])
-    spare = _extended(_extended(spare).T).T
+    x, y = (
+        np.concatenate([ends[:1], places, ends[-1:]])
+        for ends, places in ((_bounds(plane.x), plane.x.places), (_bounds(plane.y), plane.y.places))
+    )
+    spare = np.ma.masked_invalid(_extended(_extended(line.spare).T).T)
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
-    drawn = axes.contour(
-        x, y, np.ma.masked_invalid(spare), [0.0], colors=look["color"], linewidths=look["linewidth"]
-    )
-    drawn.set(
-        linestyle=look["linestyle"],
-        path_effects=[Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()],
-    )
+    drawn = axes.contour(x, y, spare, [0.0], colors=look["color"], linewidths=look["linewidth"])
+    halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
+    drawn.set(linestyle=look["linestyle"], path_effects=halo)
 
 
 def _extended(rows: Array) -> Array:
@@ -161,11 +149,6 @@ def _extended(rows: Array) -> Array:
 def _undecided(panel: MapPanel) -> Any:
     """Returns where half of the runs or more are undecided, shape (y, x)."""
     return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
-
-
-def _entitle(axes: Axes, text: str, letters: int) -> None:
-    """Gives a panel its title, in as many lines as it needs."""
-    axes.set_title(text if len(text) <= letters else text.replace(", ", ",\n"))
 
 
 def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
@@ -181,9 +164,8 @@ def _bounds(side: PlaneAxis) -> Array:
     places = side.places
     if len(places) == 1:
         return np.array([places[0] - 0.5, places[0] + 0.5])
-    between = 0.5 * (places[1:] + places[:-1])
-    ends = [1.5 * places[0] - 0.5 * places[1]], [1.5 * places[-1] - 0.5 * places[-2]]
-    bounds: Array = np.concatenate([ends[0], between, ends[1]])
+    extended = _extended(places)
+    bounds: Array = np.concatenate([extended[:1], 0.5 * (places[1:] + places[:-1]), extended[-1:]])
     return bounds
 
 
@@ -206,10 +188,8 @@ def _scale(axes: Axes, plane: MapPlane) -> None:
 
 def _shares() -> LinearSegmentedColormap:
     """Returns the colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
-    ends = [
-        CLASS_COLOURS[verdict] for verdict in (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
-    ]
-    return LinearSegmentedColormap.from_list("share", ends)
+    classes = (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
+    return LinearSegmentedColormap.from_list("share", [CLASS_COLOURS[one] for one in classes])
 
 
 def _draw_scale(figure: Figure, grid: Sequence[Axes]) -> None:
@@ -223,10 +203,10 @@ def _draw_scale(figure: Figure, grid: Sequence[Axes]) -> None:
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """Writes how many runs were stable, of the decided ones, into places where not all agree: if they fit."""
-    width_pt = 72.0 * axes.get_window_extent().width / axes.figure.dpi / len(plane.x.values)
-    height_pt = 72.0 * axes.get_window_extent().height / axes.figure.dpi / len(plane.y.values)
-    stable = panel.counts[:, :, STABLE_CLASSES].sum(axis=2)
-    decided = stable + panel.counts[:, :, UNSTABLE_CLASSES].sum(axis=2)
+    extent = axes.get_window_extent()
+    width_pt = 72.0 * extent.width / axes.figure.dpi / len(plane.x.values)
+    height_pt = 72.0 * extent.height / axes.figure.dpi / len(plane.y.values)
+    stable, decided = panel.stable, panel.decided
     letters = 2 * len(str(plane.seeds)) + 1
     if width_pt < letters * _LETTER * _COUNT_PT or height_pt < 1.2 * _COUNT_PT:
         return
@@ -240,18 +220,15 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[Theor
     """Draws the legend above the panels: the classes that occur, then the lines."""
     counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
     handles: list[Any] = []
-    for n, verdict in enumerate(CELL_CLASSES):
-        if verdict is CellClass.UNDECIDED:
-            if not any(_undecided(panel).any() for panel in plane.panels):
-                continue
-        elif not counts[n] or plane.seeds > 1:
-            continue
-        look: Any = {"facecolor": CLASS_COLOURS[verdict], "edgecolor": "#6b6b6b"}
-        if verdict is CellClass.UNDECIDED:
-            look = {**_HATCHED}
-        look["linewidth"] = 0.5
-        word = "half or more undecided" if plane.seeds > 1 else verdict.value
-        handles.append(Patch(label=word, **look))
+    if plane.seeds == 1:
+        handles += [
+            Patch(label=one.value, facecolor=CLASS_COLOURS[one], edgecolor="#6b6b6b", linewidth=0.5)
+            for one, count in zip(CELL_CLASSES, counts, strict=True)
+            if count and one is not CellClass.UNDECIDED
+        ]
+    if any(_undecided(panel).any() for panel in plane.panels):
+        word = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
+        handles.append(Patch(label=word, **{**_HATCHED, "linewidth": 0.5}))
     named = {line.label: line for some in lines for line in some}
     handles += [
         Line2D([], [], label=text, **_LINE_STYLES[line.rank % len(_LINE_STYLES)])
@@ -294,8 +271,9 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
     """Returns the page of a map, as Markdown."""
     parts = [f"# {chart.title}", "```sh\n" + "\n".join(chart.commands) + "\n```", f"![map]({picture})"]
     parts.append(tabulate_classes(chart.plane).markdown())
-    if meanings := _meanings(chart):
-        parts.append("\n".join(f"- {one}" for one in meanings))
+    meanings = dict.fromkeys(f"{line.text}: {line.about}" for lines in chart.lines for line in lines)
+    if notes := [*meanings, *chart.remarks]:
+        parts.append("\n".join(f"- {one}" for one in notes))
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
         table = tabulate_edges(chart.plane, panel, lines)
         if table.rows:
@@ -323,29 +301,22 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]
     for line in lines:
         heads += [line.text, "difference"]
     rows = []
-    for edge in find_map_edges(plane, panel) if plane.y.key else []:
-        row = [f"{edge.x:g}", f"{edge.low:g} to {edge.high:g}", "below" if edge.stable_below else "above"]
+    for x, edge in find_map_edges(plane, panel) if plane.y.key else []:
+        row = [f"{x:g}", f"{edge.low:g} to {edge.high:g}", "below" if edge.stable_below else "above"]
         for line in lines:
-            row += _compare_with_line(plane, edge, line)
+            row += _compare_with_line(edge, line.crossings(plane.x.values.index(x), plane.y))
         rows.append(tuple(row))
     return TextTable(tuple(heads), rows)
 
 
-def _compare_with_line(plane: MapPlane, edge: MapEdge, line: TheoryLine) -> list[str]:
-    """Returns where a line crosses the column of an edge, next to it, and how far that is from it."""
-    values = line.crossings(plane.x.values.index(edge.x), plane.y)
+def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[str]:
+    """Returns which of the values where a line crosses is next to an edge, and how far that is from it."""
     if not values:
         return ["-", "-"]
     value = min(values, key=lambda one: abs(one - edge.middle))
     if edge.low <= value <= edge.high:
         return [f"{value:.4g}", "within"]
     return [f"{value:.4g}", f"{100.0 * (value / edge.middle - 1.0):+.1f} %"]
-
-
-def _meanings(chart: StabilityMap) -> list[str]:
-    """Returns what the lines are, each once, and the remarks."""
-    meanings = {line.text: line.about for lines in chart.lines for line in lines}
-    return [f"{text}: {about}" for text, about in meanings.items()] + list(chart.remarks)
 
 
 def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:

@@ -68,25 +68,25 @@ def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
     number = ""
     if last.isdigit() and folders:  # one of several joints or parameters
         *folders, last, number = *folders, f"[{last}]"
-    word, unit = _parts(last)
-    return f"{word}{number}{_owner(folders, scenario)}", unit
+    endings = [ending for ending in _UNITS if last.endswith(ending)]
+    ending = max(endings, key=len, default="")
+    unit = _GAINS.get(last) or _UNITS.get(ending, "")
+    word = last.removesuffix(ending)
+    if last not in _GAINS and (unit or len(word) > 3):
+        word = word.replace("_", " ")
+    return f"{word}{number}{_describe_owner(folders, scenario)}", unit
 
 
-def _parts(last: str) -> tuple[str, str]:
-    """Returns the words of a key, and its unit or ""."""
-    if last in _GAINS:
-        return last, _GAINS[last]
-    for ending, unit in sorted(_UNITS.items(), key=lambda pair: -len(pair[0])):
-        if last.endswith(ending):
-            return last.removesuffix(ending).replace("_", " "), unit
-    return last if len(last) <= 3 else last.replace("_", " "), ""
-
-
-def _owner(folders: list[str], scenario: Scenario | None) -> str:
+def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
     """Returns whose key it is, in words; "" for a group's."""
     match folders:
         case ["sites", site, ("hands" | "environment") as group, number]:
-            return f", {_kind(site, group, number, scenario)} of {site}"
+            kind = "hand" if group == "hands" else "environment"
+            if scenario is not None and site in scenario.sites and number.isdigit():
+                some = getattr(scenario.sites[site], group)
+                if int(number) < len(some):
+                    kind = str(some[int(number)].__struct_config__.tag).replace("_", " ")
+            return f", {kind} of {site}"
         case ["sites", site, *_]:
             return f" of {site}"
         case ["links", link, *_]:
@@ -97,33 +97,15 @@ def _owner(folders: list[str], scenario: Scenario | None) -> str:
             return ""
 
 
-def _kind(site: str, group: str, number: str, scenario: Scenario | None) -> str:
-    """Returns what kind of hand or environment a number means; the group's word where that is not known."""
-    if scenario is not None and site in scenario.sites and number.isdigit():
-        spec = scenario.sites[site]
-        some = spec.hands if group == "hands" else spec.environment
-        if int(number) < len(some):
-            return str(some[int(number)].__struct_config__.tag).replace("_", " ")
-    return "hand" if group == "hands" else "environment"
-
-
 RunCounts = NDArray[np.int64]
 
 CELL_CLASSES = tuple(CellClass)
-"""The order of the last axis of `Panel.counts`."""
-STABLE_CLASSES = np.array([verdict.stable is True for verdict in CELL_CLASSES])
-UNSTABLE_CLASSES = np.array([verdict.stable is False for verdict in CELL_CLASSES])
+"""The order of the last axis of `MapPanel.counts`."""
 MAX_PANELS = 12
 
 
 class PlaneAxis(NamedTuple):
-    """One axis of a plane.
-
-    Attributes:
-        key: what it sets, dotted.
-        values: the numbers that it takes, rising, in the unit of the key.
-        label: what it is called.
-    """
+    """One axis of a plane: a dotted key, the numbers that it takes, rising, in its unit, and a label."""
 
     key: str
     values: tuple[float, ...]
@@ -156,7 +138,7 @@ class MapPanel(NamedTuple):
     Attributes:
         title: where it lies along the axes that are not drawn; "" where there are none.
         settings: the same as overrides, key by key; "law" among them where laws were swept.
-        counts: runs per place and verdict, shape (y, x, 4), in the order of `VERDICTS`.
+        counts: runs per place and class, shape (y, x, 4), in the order of `CELL_CLASSES`.
     """
 
     title: str
@@ -170,27 +152,31 @@ class MapPanel(NamedTuple):
         return total
 
     @property
+    def stable(self) -> RunCounts:
+        """Stable runs per place, shape (y, x)."""
+        stable: RunCounts = self.counts[:, :, [verdict.stable is True for verdict in CELL_CLASSES]].sum(
+            axis=2
+        )
+        return stable
+
+    @property
+    def decided(self) -> RunCounts:
+        """Decided runs per place, shape (y, x)."""
+        return self.runs - self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
+
+    @property
     def share(self) -> Array:
         """Share of stable runs among the decided ones, shape (y, x); NaN where none was decided."""
-        stable, unstable = (
-            self.counts[:, :, STABLE_CLASSES].sum(axis=2),
-            self.counts[:, :, UNSTABLE_CLASSES].sum(axis=2),
-        )
-        decided = stable + unstable
+        stable, decided = self.stable, self.decided
         share: Array = np.full(decided.shape, np.nan)
         np.divide(stable, decided, out=share, where=decided > 0)
         return share
 
 
 class MapPlane(NamedTuple):
-    """What a map shows.
+    """What a map shows of a scenario: a panel per place of the axes that are not drawn.
 
-    Attributes:
-        scenario: the name of what was run.
-        x: the axis to the right.
-        y: the axis upwards; a single value with an empty label where only one axis was swept.
-        panels: one per place of the other axes.
-        seeds: how many runs a place has at most.
+    Where only one axis was swept, y has an empty key and a single value.
     """
 
     scenario: str
@@ -253,20 +239,20 @@ def _title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
     return ", ".join(words)
 
 
-class MapEdge(NamedTuple):
-    """A change between stable and not, up a column.
+class StableInterval(NamedTuple):
+    """A change between stable and not, along one key.
 
     Attributes:
-        x: the column's value.
-        low: the last value of the y axis below the change.
+        low: the last value below it that was decided.
         high: the first one above it.
-        stable_below: whether the places below are the stable ones.
+        stable_below: whether what lies below is the stable side.
+        sharp: True if nothing between the two stayed undecided.
     """
 
-    x: float
     low: float
     high: float
     stable_below: bool
+    sharp: bool = True
 
     @property
     def middle(self) -> float:
@@ -274,18 +260,14 @@ class MapEdge(NamedTuple):
         return 0.5 * (self.low + self.high)
 
 
-def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[MapEdge]:
-    """Returns the edges of a panel, column by column, each from below."""
+def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StableInterval]]:
+    """Returns the edges of a panel with the values of their columns, each column from below."""
     found = []
+    y = plane.y.values
     for x, share in zip(plane.x.values, panel.share.T, strict=True):
-        found += [
-            MapEdge(x, plane.y.values[a], plane.y.values[b], bool(share[a] > 0.5)) for a, b in _changes(share)
-        ]
+        decided = np.flatnonzero(np.isfinite(share) & (share != 0.5))
+        stable = share[decided] > 0.5
+        for n in np.flatnonzero(stable[1:] != stable[:-1]):
+            low, high = decided[n : n + 2].tolist()
+            found.append((x, StableInterval(y[low], y[high], bool(stable[n]), high == low + 1)))
     return found
-
-
-def _changes(share: Array) -> list[tuple[int, int]]:
-    """Returns the places below and above every change of a column's majority."""
-    decided = np.flatnonzero(np.isfinite(share) & (share != 0.5))
-    stable = share[decided] > 0.5
-    return [(int(decided[n]), int(decided[n + 1])) for n in np.flatnonzero(stable[1:] != stable[:-1])]

@@ -20,11 +20,16 @@ from ...scenario import Scenario
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import cell_result
-from .map_plane import label_axis
-from .stability_map import build_sweep_command, format_override, format_override_value
+from .map_plane import StableInterval, label_axis
+from .stability_map import (
+    build_sweep_command,
+    evaluate_criterion,
+    find_criterion_edge,
+    format_override,
+    format_override_value,
+)
 from .sweep_cell import SweepCell, SweepSource
 from .sweep_plan import SweepPlan
-from .theory_lines import evaluate_criterion, find_criterion_edge
 
 SCAN_POINTS = 9
 """Values of the scan: islands that are wider than an eighth of the range are seen."""
@@ -33,32 +38,6 @@ _MOST = 60
 
 StabilityTest = Callable[[float], bool | None]
 """Returns True if a run at a value is stable, None if undecided."""
-
-
-class StableInterval(NamedTuple):
-    """Location of an edge.
-
-    Attributes:
-        low: the last value below it that was decided.
-        high: the first one above it.
-        stable_below: whether what lies below is the stable side.
-        sharp: True if the two are within the tolerance; else values between them were undecided.
-    """
-
-    low: float
-    high: float
-    stable_below: bool
-    sharp: bool
-
-    @property
-    def middle(self) -> float:
-        """The value half way."""
-        return 0.5 * (self.low + self.high)
-
-    @property
-    def half_width(self) -> float:
-        """Half of what is not known."""
-        return 0.5 * (self.high - self.low)
 
 
 class KeyMargin(NamedTuple):
@@ -88,7 +67,7 @@ def search_key_margin(
     """Returns the edges between two values.
 
     Args:
-        stable: runs and judges one value.
+        stable: runs and classifies one value.
         low: the first value of the range.
         high: the last one.
         tolerance: how wide an edge may be, over its value.
@@ -113,21 +92,14 @@ def search_key_margin(
 
 def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool) -> StableInterval:
     """Returns an edge between two values that were decided and differ, narrowed from both sides."""
-    below = ask(low) is True
-    side = {value: ask(value) for value in (low, high)}
-
-    def is_low(value: float) -> bool:
-        return ask(value) is side[first]
-
-    def is_not_high(value: float) -> bool:
-        return ask(value) is not side[last]
-
-    first, last = low, high
-    low, above = _halved(is_low, low, high, tolerance, whole)
-    if ask(above) is not None:
-        return StableInterval(low, above, below, sharp=True)
-    _, high = _halved(is_not_high, above, high, tolerance, whole)
-    return StableInterval(low, high, below, sharp=False)
+    first, last = ask(low), ask(high)
+    low, above = _halved(lambda value: ask(value) is first, low, high, tolerance, whole)
+    sharp = ask(above) is not None
+    if sharp:
+        high = above
+    else:
+        _, high = _halved(lambda value: ask(value) is not last, above, high, tolerance, whole)
+    return StableInterval(low, high, first is True, sharp)
 
 
 def _halved(
@@ -135,8 +107,7 @@ def _halved(
 ) -> tuple[float, float]:
     """Returns the last value at which something holds and the first at which it does not, by bisection."""
     for _ in range(_MOST):
-        wide = high - low > (1.0 if whole else tolerance * max(abs(low), abs(high)))
-        if not wide:
+        if high - low <= (1.0 if whole else tolerance * max(abs(low), abs(high))):
             break
         middle = 0.5 * (low + high)
         middle = float(np.floor(middle)) if whole else middle
@@ -148,14 +119,7 @@ def _halved(
 
 
 class SearchRange(NamedTuple):
-    """Where edges are looked for.
-
-    Attributes:
-        key: along which key, dotted.
-        low: from.
-        high: to.
-        tolerance: how wide an edge may be, over its value.
-    """
+    """Where edges are looked for; `tolerance`: how wide an edge may be, over its value."""
 
     key: str
     low: float
@@ -164,32 +128,28 @@ class SearchRange(NamedTuple):
 
 
 class MarginTask(NamedTuple):
-    """One place to be searched: picklable, and all that a process needs."""
+    """A grid point to be searched: picklable, and all that a process needs."""
 
     written: SweepSource
-    overrides: tuple[str, ...]
+    cell: SweepCell
     seed: int
     longest_s: float
     range: SearchRange
 
     def __str__(self) -> str:
-        return f"the search at {', '.join(self.overrides) or 'the scenario'}, seed {self.seed}"
-
-
-MarginFinding = tuple[KeyMargin, tuple[float, ...], str, float | None]
-"""Margin, linear edges, what is to be known of them, edge in closed form."""
+        return f"the search at {', '.join(self.cell.overrides) or 'the scenario'}, seed {self.seed}"
 
 
 class GridPointMargin(NamedTuple):
-    """One place that was searched.
+    """A grid point that was searched.
 
     Attributes:
-        cell: the place; its values lie along the axes.
+        cell: the grid point; its values lie along the axes.
         seed: of its runs.
         margin: what the runs show.
         linear: where the linear analysis has edges in the range, from below.
         remark: what is to be known of those, or "".
-        closed: where the condition in closed form has its edge; None where it has none in the range.
+        closed: where the criterion in closed form has its edge; None where it has none in the range.
     """
 
     cell: SweepCell
@@ -239,52 +199,42 @@ def search_margins(
         ScenarioError: some value makes no scenario.
         RunFailed: a process was ended.
     """
-    cells = [plan.cell(first) for first in range(0, plan.cells, 2)]
-    places = [
-        (cell, seed)
-        for cell in cells
-        for seed in (plan.seeds if plan.written.scenario(*cell.overrides).random else plan.seeds[:1])
-    ]
-    searches = [
-        MarginTask(plan.written, cell.overrides[:-1], seed, plan.longest_s, within) for cell, seed in places
-    ]
+    searches = []
+    for number in range(0, plan.cells, 2):  # the last axis has the two ends of the range
+        end = plan.cell(number)
+        cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
+        seeds = plan.seeds if plan.written.scenario(*end.overrides).random else plan.seeds[:1]
+        searches += [MarginTask(plan.written, cell, seed, plan.longest_s, within) for seed in seeds]
     with open_worker_pool(jobs, on, most=len(searches)) as pool:
-        findings = pool.map(search_margin_task, searches, progress)
-    return [
-        GridPointMargin(cell._replace(values=cell.values[:-1]), seed, *finding)
-        for (cell, seed), finding in zip(places, findings, strict=True)
-    ]
+        return pool.map(search_margin_task, searches, progress)
 
 
-def search_margin_task(one: MarginTask) -> MarginFinding:
-    """Searches one place, and asks theory for the same.
+def search_margin_task(task: MarginTask) -> GridPointMargin:
+    """Searches one grid point, and asks theory for the same.
 
     Raises:
         ScenarioError: some value makes no scenario.
     """
-    within = one.range
+    key, low, high, tolerance = task.range
 
     def at(value: float) -> Scenario:
-        return one.written.scenario(*one.overrides, format_override(within.key, value), f"seed={one.seed}")
+        more = format_override(key, value), f"seed={task.seed}"
+        return task.written.scenario(*task.cell.overrides, *more)
 
     def stable(value: float) -> bool | None:
-        return cell_result.classify_cell(
-            at(value).text, max(one.longest_s, at(value).duration_s)
-        ).verdict.stable
+        scenario = at(value)
+        longest_s = max(task.longest_s, scenario.duration_s)
+        return cell_result.classify_cell(scenario.text, longest_s).verdict.stable
 
-    whole = not _fractions(at, within)
-    found = search_key_margin(stable, within.low, within.high, within.tolerance, whole=whole)
-    closed = find_criterion_edge(lambda value: evaluate_criterion(at(value)), within.low, within.high)
-    return found, *find_root_crossings(at(within.high), within.key, within.low, within.high), closed
-
-
-def _fractions(at: Callable[[float], Scenario], within: SearchRange) -> bool:
-    """Whether a key can have values between whole numbers."""
     try:
-        at(within.low + (within.high - within.low) / 3.0**0.5)
-    except ScenarioError:
-        return False
-    return True
+        at(low + (high - low) / 3.0**0.5)
+        whole = False
+    except ScenarioError:  # the key takes whole numbers only
+        whole = True
+    margin = search_key_margin(stable, low, high, tolerance, whole=whole)
+    closed = find_criterion_edge(lambda value: evaluate_criterion(at(value)), low, high)
+    linear, remark = find_root_crossings(at(high), key, low, high)
+    return GridPointMargin(task.cell, task.seed, margin, linear, remark, closed)
 
 
 def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> TextTable:
@@ -297,16 +247,12 @@ def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridP
     heads += ["linear", "difference", *(["closed form", "difference"] if closed else []), "runs"]
     rows = []
     for one in found:
-        place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values] + (
-            [one.cell.law] if plan.laws else []
-        )
-        place += [str(one.seed)] if seeds else []
+        place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values]
+        place += [*([one.cell.law] if plan.laws else []), *([str(one.seed)] if seeds else [])]
         for span in one.margin.spans or (None,):
-            cells = [
-                *place,
-                *_edge_cells(one.margin, span),
-                *_theory_cells(span, _nearest_linear_edge(one, span)),
-            ]
+            near = within.low if span is None else span.middle
+            linear = min(one.linear, key=lambda edge, near=near: abs(edge - near), default=None)  # type: ignore[misc]
+            cells = [*place, *_edge_cells(one.margin, span), *_theory_cells(span, linear)]
             cells += _theory_cells(span, one.closed) if closed else []
             rows.append((*cells, str(one.margin.runs)))
     return TextTable(tuple(heads), rows)
@@ -321,9 +267,8 @@ def build_margin_page(plan: SweepPlan, within: SearchRange, found: Sequence[Grid
     parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
     islands = sum(len(one.margin.spans) > 1 for one in found)
     if islands:
-        parts.append(
-            f"Stability is not monotone in {islands} of {len(found)} places: they have several edges."
-        )
+        where = f"in {islands} of {len(found)} places"
+        parts.append(f"Stability is not monotone {where}: they have several edges.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -333,10 +278,7 @@ def margins_to_json(plan: SweepPlan, within: SearchRange, found: Sequence[GridPo
     return {
         "command": build_margin_command(plan, within),
         "scenario_sha256": plan.base.sha256,
-        "key": within.key,
-        "low": within.low,
-        "high": within.high,
-        "tolerance": within.tolerance,
+        **within._asdict(),
         "places": [
             {
                 **dict(zip(keys, one.cell.values, strict=True)),
@@ -367,19 +309,9 @@ def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
     if span is None:
         words = {True: "none: all stable", False: "none: nothing stable", None: "none: nothing decided"}
         return [words[margin.stable], "-"]
-    digits = 5 if span.sharp else 4
-    blur = "" if span.sharp else " (undecided between)"
-    return [
-        f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}",
-        "below" if span.stable_below else "above",
-    ]
-
-
-def _nearest_linear_edge(one: GridPointMargin, span: StableInterval | None) -> float | None:
-    """Returns the linear edge that is next to a measured one; the lowest where nothing was measured."""
-    if not one.linear:
-        return None
-    return one.linear[0] if span is None else min(one.linear, key=lambda edge: abs(edge - span.middle))
+    digits, blur = (5, "") if span.sharp else (4, " (undecided between)")
+    place = f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}"
+    return [place, "below" if span.stable_below else "above"]
 
 
 def _theory_cells(span: StableInterval | None, value: float | None) -> list[str]:

@@ -5,9 +5,9 @@ scenario as a line diff against the base text: `apply_diff(diff_lines(text, base
 two texts.
 """
 
-import shlex
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import msgspec
 
 from ...errors import ScenarioError
 from ...scenario import Scenario, parse_scenario
+from ..commands import format_command, set_options
 from . import cell_result
 from .cell_result import CellResult
 
@@ -24,49 +25,28 @@ LineDiff = tuple[str | tuple[int, int], ...]
 
 def diff_lines(text: str, base: str) -> LineDiff:
     """Returns a text as lines of another one and lines of its own."""
-    places: dict[str, int] = {}
     there = base.split("\n")
-    for number, line in enumerate(there):
-        places.setdefault(line, number)
-    found: list[str | tuple[int, int]] = []
+    first = {line: number for number, line in reversed(list(enumerate(there)))}
+    parts: list[str | tuple[int, int]] = []
+    expected = 0  # where the text goes on if it has as many lines as the base up to here
     for line in text.split("\n"):
-        before = found[-1] if found else None
-        if isinstance(before, tuple) and before[1] + 1 < len(there) and there[before[1] + 1] == line:
-            found[-1] = (before[0], before[1] + 1)
-        elif (place := _place(line, there, places, _after(found))) is not None:
-            found.append((place, place))
+        place = expected if there[expected : expected + 1] == [line] else first.get(line)
+        before = parts[-1] if parts else None
+        if place is None:
+            parts.append(line)
+        elif isinstance(before, tuple) and before[1] + 1 == place:
+            parts[-1] = (before[0], place)
         else:
-            found.append(line)
-    return tuple(found)
+            parts.append((place, place))
+        expected = (expected if place is None else place) + 1
+    return tuple(parts)
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
     """Returns the text again."""
     there = base.split("\n")
-    lines: list[str] = []
-    for part in parts:
-        if isinstance(part, str):
-            lines.append(part)
-        else:
-            lines.extend(there[part[0] : part[1] + 1])
-    return "\n".join(lines)
-
-
-def _after(found: Sequence[str | tuple[int, int]]) -> int:
-    """Returns where the text would go on if it had as many lines as the base up to here."""
-    own = 0
-    for part in reversed(found):
-        if isinstance(part, tuple):
-            return part[1] + 1 + own
-        own += 1
-    return own
-
-
-def _place(line: str, there: Sequence[str], places: dict[str, int], expected: int) -> int | None:
-    """Returns a place of a line in the base: where it is expected if it is there, else the first."""
-    if expected < len(there) and there[expected] == line:
-        return expected
-    return places.get(line)
+    lines = ([part] if isinstance(part, str) else there[part[0] : part[1] + 1] for part in parts)
+    return "\n".join(chain.from_iterable(lines))
 
 
 class SweepSource(NamedTuple):
@@ -110,15 +90,7 @@ class SweepCell(NamedTuple):
 
 
 class CellTask(NamedTuple):
-    """One run to be made: picklable, with all that a worker needs.
-
-    Attributes:
-        written: the experiment.
-        number: of the cell.
-        overrides: of the cell.
-        seed: of the run.
-        longest_s: how long it may be extended, s.
-    """
+    """One run of a cell, to be made: picklable, with all that a worker needs."""
 
     written: SweepSource
     number: int
@@ -134,13 +106,9 @@ class CellRun(msgspec.Struct, frozen=True):
     """One finished run.
 
     Attributes:
-        cell: its number.
-        seed: of its chance.
         random: whether another seed would be another run.
         law: the laws of its sites, each once.
-        sha256: names its scenario.
         scenario: its canonical text, as what differs from that of the experiment.
-        outcome: its result.
     """
 
     cell: int
@@ -162,8 +130,7 @@ def run_cell(task: CellTask) -> CellRun:
         scenario = task.written.scenario(*task.overrides, f"seed={task.seed}")
         cell_result.check_sweepable(scenario)
     except ScenarioError as error:
-        where = ", ".join(task.overrides)
-        raise ScenarioError(f"cell {task.number} ({where}): {error}") from None
+        raise ScenarioError(f"cell {task.number} ({', '.join(task.overrides)}): {error}") from None
     outcome = cell_result.classify_cell(scenario.text, max(task.longest_s, scenario.duration_s))
     return CellRun(
         task.number,
@@ -190,11 +157,10 @@ def build_sim_command(
     written: SweepSource, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
     """Returns the command that makes a log of a run."""
-    words = [
-        word
+    others = [
+        text
         for text in (*written.overrides, *overrides)
         if text.partition("=")[0].strip() not in ("seed", "duration_s")
-        for word in ("--set", text)
     ]
-    lasts = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
-    return shlex.join(["trilat", "sim", written.source, *words, *lasts])
+    run = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
+    return format_command("sim", written.source, *set_options(others), *run)

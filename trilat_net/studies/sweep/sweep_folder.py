@@ -9,7 +9,6 @@ import errno
 import hashlib
 import json
 import os
-import shlex
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from ...core.fingerprint import compute_fingerprint
 from ...errors import UsageError
 from ...files import describe_write_error, make_results_folder, write_whole
 from ...log.log_layout import collect_provenance
+from ..commands import format_command
 from .sweep_cell import CellRun
 from .sweep_plan import SweepPlan, plan_from_json
 from .sweep_results import RESULTS_FILE
@@ -34,12 +34,8 @@ RunKey = tuple[int, int]
 class SweepJournal:
     """The runs that are done, in a file that is only ever appended to; a context, which closes it.
 
-    Args:
-        path: the file; made where there is none.
-        sweep: what names the sweep: lines of another one count for nothing.
-
     Attributes:
-        done: the runs, by cell and seed.
+        done: the runs, by cell and seed; lines of another sweep count for nothing.
     """
 
     def __init__(self, path: Path, sweep: str) -> None:
@@ -72,19 +68,16 @@ class SweepJournal:
 
     def _put(self, data: bytes) -> None:
         try:
-            written = self._file.write(data)
+            if self._file.write(data) != len(data):  # a disk that became full takes a part, and says nothing
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise describe_write_error(self._path, error, build_resume_hint(self._path.parent)) from None
-        if written != len(data):  # a disk that became full takes a part, and says nothing
-            full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            raise describe_write_error(self._path, full, build_resume_hint(self._path.parent))
 
 
 def build_resume_hint(folder: Path) -> str:
     """Returns how to go on with a sweep that the disk interrupted."""
-    return (
-        f"what is done is kept: make room, and go on with: trilat sweep --resume {shlex.quote(str(folder))}"
-    )
+    command = format_command("sweep", "--resume", str(folder))
+    return f"what is done is kept: make room, and go on with: {command}"
 
 
 def encode_journal_line(entry: CellRun, sweep: str) -> bytes:
@@ -121,13 +114,7 @@ _DIFFERENCES = {
 
 
 class SweepFolder(NamedTuple):
-    """A folder of results.
-
-    Attributes:
-        path: where it is.
-        plan: the sweep.
-        facts: what names it, with the arithmetic and the versions that it is made with.
-    """
+    """A folder of results; its facts name the sweep, its arithmetic, and the versions it is made with."""
 
     path: Path
     plan: SweepPlan
@@ -149,7 +136,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
     Raises:
         UsageError: it holds something else, or another sweep, or cannot be made.
     """
-    facts = {**plan.facts(), **_made_with()}
+    facts = _describe(plan)
     if path is not None and (path / PLAN_FILE).exists():
         before = _read(path)
         _refuse_other(path, before, facts)
@@ -168,8 +155,7 @@ def open_sweep_folder(path: Path) -> SweepFolder:
     """
     facts = _read(path)
     plan = plan_from_json(facts)
-    now = {**plan.facts(), **_made_with()}
-    _refuse_other(path, facts, now)
+    _refuse_other(path, facts, _describe(plan))
     return SweepFolder(path, plan, facts)
 
 
@@ -211,10 +197,11 @@ def _read(path: Path) -> dict[str, Any]:
     return facts
 
 
-def _made_with() -> dict[str, Any]:
-    """Returns what results depend on besides the plan."""
+def _describe(plan: SweepPlan) -> dict[str, Any]:
+    """Returns all that results depend on."""
     known = collect_provenance()
-    return {"arithmetic": compute_fingerprint(), "versions": {name: known[name] for name in _VERSIONS}}
+    versions = {name: known[name] for name in _VERSIONS}
+    return {**plan.facts(), "arithmetic": compute_fingerprint(), "versions": versions}
 
 
 def _text(facts: Mapping[str, Any]) -> str:

@@ -7,7 +7,8 @@ in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
 
 import math
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import product
 from pathlib import Path
@@ -33,13 +34,7 @@ _HOW = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
 class SweepAxis(NamedTuple):
-    """One axis.
-
-    Attributes:
-        asked: as a person wrote it, "KEY=a:b:step" or "KEY=v1,v2,v3".
-        key: dotted, as an override names it.
-        texts: its values, each as an override's text.
-    """
+    """One axis, asked for as "KEY=a:b:step" or "KEY=v1,v2,v3"; its values are texts of overrides."""
 
     asked: str
     key: str
@@ -96,37 +91,32 @@ def parse_axis(asked: str) -> SweepAxis:
     if key in _ELSEWHERE:
         raise ScenarioError(f"is no axis: {_ELSEWHERE[key]}", path=key)
     parts = _split(text, ":")
-    if len(parts) == 1:
-        return SweepAxis(f"{key}={text}", key, _listed(key, text))
-    if len(parts) != 3:
+    if len(parts) not in (1, 3):
         raise ScenarioError(f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key)
-    return SweepAxis(f"{key}={text}", key, _steps(key, *(_decimal(key, part.strip()) for part in parts)))
+    texts = _listed(key, text) if len(parts) == 1 else _steps(key, *(_decimal(key, part) for part in parts))
+    return SweepAxis(f"{key}={text}", key, texts)
 
 
 def _steps(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
     if step == 0:
         raise ScenarioError(f"a step of 0 never comes from {first:f} to {last:f}", path=key)
-    count = int((last - first) / step + _ON_GRID) + 1
     if (last - first) * step < 0:
-        size = abs(step)
-        right = f"{min(first, last):f}:{max(first, last):f}:{size:f}"
-        raise ScenarioError(
-            f"is empty: a step of {step:f} does not lead from {first:f} to {last:f}; did you mean {right}?",
-            path=key,
-        )
+        right = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
+        problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
+        raise ScenarioError(f"is empty: {problem}; did you mean {right}?", path=key)
+    count = int((last - first) / step + _ON_GRID) + 1
     if count > _MOST:
         raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
     return _Steps(first, step, count)
 
 
 def _decimal(key: str, text: str) -> Decimal:
+    text = text.strip()
     try:
         number = Decimal(text)
     except InvalidOperation:
-        raise ScenarioError(
-            f"a range is of numbers, a:b:step, and {text!r} is none; words go as in KEY=first,second",
-            path=key,
-        ) from None
+        problem = f"a range is of numbers, a:b:step, and {text!r} is none; words go as in KEY=first,second"
+        raise ScenarioError(problem, path=key) from None
     if not number.is_finite():
         raise ScenarioError(f"a range is of finite numbers, and {text!r} is none", path=key)
     if abs(number) > Decimal("1e18") or (number and abs(number) < Decimal("1e-18")):
@@ -219,35 +209,29 @@ class SweepPlan(NamedTuple):
         """
         if not 0 <= number < self.cells:
             raise UsageError(f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}")
-        places = []
-        rest = number
+        places: list[int] = []
         for count in reversed(self.shape):
-            rest, place = divmod(rest, count)
-            places.append(place)
-        return self.cell_at(places[::-1])
+            number, place = divmod(number, count)
+            places.insert(0, place)
+        return self.cell_at(places)
 
     def cell_at(self, places: Sequence[int]) -> SweepCell:
         """Returns a cell by its place: number of the law (0 where none is swept), then along every axis."""
         number = 0
         for count, place in zip(self.shape, places, strict=True):
             number = number * count + place
-        law, *others = places
-        return SweepCell(
-            number,
-            self.laws[law] if self.laws else "",
-            tuple(one.value(n) for one, n in zip(self.axes, others, strict=True)),
-            (
-                *(self.law_overrides[law] if self.laws else ()),
-                *(one.override(n) for one, n in zip(self.axes, others, strict=True)),
-            ),
-        )
+        place, *others = places
+        law, fixed = (self.laws[place], self.law_overrides[place]) if self.laws else ("", ())
+        along = list(zip(self.axes, others, strict=True))
+        values = tuple(axis.value(n) for axis, n in along)
+        return SweepCell(number, law, values, (*fixed, *(axis.override(n) for axis, n in along)))
 
     def task(self, number: int, seed: int) -> CellTask:
         """Returns one run of a cell, to be made."""
         return CellTask(self.written, number, self.cell(number).overrides, seed, self.longest_s)
 
     def facts(self) -> dict[str, Any]:
-        """Returns all that names it, as plain values; `plan_of` reads them."""
+        """Returns all that names it, as plain values; `plan_from_json` reads them."""
         return {
             "source": self.written.source,
             "folder": self.written.folder,
@@ -293,18 +277,13 @@ def plan_sweep(
     axes = tuple(map(parse_axis, over))
     _refuse_twice(axes, laws)
     chosen = tuple(dict.fromkeys(laws))
-    found = SweepPlan(
-        written,
-        base,
-        axes,
-        chosen,
-        tuple(_law_overrides(written, base, law) for law in chosen),
-        _seeds(seeds, base.seed),
-        _longest_s(longest_s, base),
+    forced = tuple(_law_overrides(written, base, law) for law in chosen)
+    plan = SweepPlan(
+        written, base, axes, chosen, forced, _seeds(seeds, base.seed), _longest_s(longest_s, base)
     )
-    for law in range(found.shape[0]):
-        _refuse_unfit(found, law)
-    return found
+    for law in range(plan.shape[0]):
+        _refuse_unfit(plan, law)
+    return plan
 
 
 def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
@@ -315,21 +294,15 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     """
     written = SweepSource(facts["source"], facts["text"], facts["folder"], tuple(facts["overrides"]))
     base = written.scenario()
-    return SweepPlan(
-        written,
-        base,
-        tuple(map(parse_axis, facts["over"])),
-        tuple(facts["laws"]),
-        tuple(_law_overrides(written, base, law) for law in facts["laws"]),
-        tuple(facts["seeds"]),
-        facts["longest_s"],
-    )
+    axes, laws = tuple(map(parse_axis, facts["over"])), tuple(facts["laws"])
+    forced = tuple(_law_overrides(written, base, law) for law in laws)
+    return SweepPlan(written, base, axes, laws, forced, tuple(facts["seeds"]), facts["longest_s"])
 
 
 def _refuse_twice(axes: Sequence[SweepAxis], laws: Sequence[str]) -> None:
-    keys = [one.key for one in axes]
-    for n, key in enumerate(keys):
-        if key in keys[:n]:
+    keys = Counter(one.key for one in axes)
+    for key, count in keys.items():
+        if count > 1:
             raise ScenarioError("is swept twice: give one --over with all its values", path=key)
     if laws and "control.law" in keys:
         raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
@@ -380,7 +353,9 @@ def _refuse_unfit(plan: SweepPlan, law: int) -> None:
     origin = [law] + [0] * len(plan.axes)
     for n, one in enumerate(plan.axes, 1):
         seen: dict[str, str] = {}
-        for place in _sample_indices(len(one.texts)):
+        count = len(one.texts)
+        few = min(count, _CHECKED_VALUES)  # the first, the last, and some between them
+        for place in (k * (count - 1) // max(1, few - 1) for k in range(few)):
             scenario = _checked(plan, [*origin[:n], place, *origin[n + 1 :]])
             text = one.texts[place]
             if scenario.sha256 in seen:
@@ -410,9 +385,3 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
         raise ScenarioError(problem, path=error.path, source=plan.written.source) from None
     return scenario
-
-
-def _sample_indices(count: int) -> Iterator[int]:
-    """Yields the first, the last, and some between them."""
-    few = min(count, _CHECKED_VALUES)
-    return (n * (count - 1) // max(1, few - 1) for n in range(few))

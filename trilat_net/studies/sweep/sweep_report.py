@@ -7,13 +7,13 @@ named instead.
 
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from ...errors import ScenarioError
 from ...files import write_whole
 from ...scenario.scenario_reader import read_source
+from ..commands import format_command
 from .cell_result import CellClass
 from .sweep_cell import SweepSource
 from .sweep_plan import SweepPlan
@@ -31,15 +31,13 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     count = len(plan.seeds)
     seeds = f"seed {plan.seeds[0]}" if count == 1 else f"{count} seeds each where anything is random"
     lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{laws}), {seeds}"]
-    lines += [f"  over {one.asked}: {_values(one.texts)}" for one in plan.axes]
+    for one in plan.axes:
+        texts = one.texts
+        shown = [texts[0], texts[1], "...", texts[-1]] if len(texts) > 4 else texts
+        lines.append(f"  over {one.asked}: {', '.join(shown)}")
     first_s, longest_s = plan.base.duration_s, plan.longest_s
     extended = f", one that is not plain by then up to {longest_s:g} s" if longest_s > first_s else ""
     return [*lines, f"  {first_s:g} s each{extended}"]
-
-
-def _values(texts: Sequence[str]) -> str:
-    shown = [texts[0], texts[1], "...", texts[-1]] if len(texts) > 4 else list(texts)
-    return ", ".join(shown)
 
 
 def summarize_sweep(results: SweepResults) -> Iterator[str]:
@@ -52,9 +50,8 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     if extended:
         longest_s = max(row["ran_s"] for row in extended)
         first_s = results.plan.base.duration_s
-        yield (
-            f"{len(extended)} were not plain after {first_s:g} s and went on, the longest to {longest_s:g} s"
-        )
+        went_on = f"and went on, the longest to {longest_s:g} s"
+        yield f"{len(extended)} were not plain after {first_s:g} s {went_on}"
     if len(results.plan.seeds) > 1:
         yield from _of_seeds(results)
 
@@ -64,9 +61,8 @@ def _of_seeds(results: SweepResults) -> Iterator[str]:
     if fixed:
         yield f"in {_cells(fixed)} nothing is random: one seed was run there, which stands for all"
     doubtful = [place for place in collect_grid_points(results) if place.doubtful]
-    if not doubtful:
-        return
-    yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
+    if doubtful:
+        yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
     for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
         yield f"  {_describe_grid_point(results.plan, place)}"
     if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
@@ -106,31 +102,17 @@ def list_next_commands(folder: Path) -> list[str]:
     ]
 
 
-class ReproduceCommand(NamedTuple):
-    """The command that repeats a row.
-
-    Attributes:
-        command: the command.
-        note: what is to be known of it, or "".
-    """
-
-    command: str
-    note: str = ""
-
-
-def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> ReproduceCommand:
-    """Returns the command that repeats a row."""
+def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> tuple[str, str]:
+    """Returns the command that repeats a row, and a note on it or ""."""
+    source = results.plan.written.source
     if _source_unchanged(results.plan.written, results.plan.cell(row["cell"]).overrides, row):
-        return ReproduceCommand(row["command"])
+        return row["command"], ""
     name = f"cell-{row['cell']}-seed-{row['seed']}"
     file = folder / f"{name}.toml"
     write_whole(file, row["scenario"])
     lasts_s = reproduction_duration_s(results.plan, results.outcome(row))
-    words = ["trilat", "sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap"]
-    source = results.plan.written.source
-    return ReproduceCommand(
-        shlex.join(words), f"{source} is not what was swept any more, or not here; as it ran: {file}"
-    )
+    command = format_command("sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap")
+    return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"
 
 
 def _source_unchanged(written: SweepSource, overrides: tuple[str, ...], row: ResultRow) -> bool:

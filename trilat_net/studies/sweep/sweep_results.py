@@ -23,14 +23,7 @@ from .sweep_cell import CellRun, apply_diff, build_sim_command
 from .sweep_plan import SweepPlan, plan_from_json
 
 
-class ShareInterval(NamedTuple):
-    """Interval of a share."""
-
-    low: float
-    high: float
-
-
-def wilson_interval(successes: int, runs: int) -> ShareInterval:
+def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
     """Returns the 95 % score interval of a share, which has a width even if all runs agree.
 
     Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
@@ -40,9 +33,9 @@ def wilson_interval(successes: int, runs: int) -> ShareInterval:
     from scipy.stats import binomtest  # takes half a second, which most commands can do without
 
     if runs == 0:
-        return ShareInterval(0.0, 1.0)
+        return 0.0, 1.0
     low, high = binomtest(successes, runs).proportion_ci(method="wilson")
-    return ShareInterval(float(low), float(high))
+    return float(low), float(high)
 
 
 RESULTS_FILE = "results.parquet"
@@ -70,12 +63,7 @@ def require_polars() -> Any:
 
 
 class SweepResults(NamedTuple):
-    """Results of a sweep.
-
-    Attributes:
-        plan: the sweep.
-        rows: its runs, by cell and then in the order of the seeds.
-    """
+    """Results of a sweep: its runs by cell, and then in the order of the seeds."""
 
     plan: SweepPlan
     rows: Sequence[ResultRow]
@@ -97,11 +85,9 @@ class SweepResults(NamedTuple):
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
     """Returns the rows that runs make, in their order."""
     order = {seed: n for n, seed in enumerate(plan.seeds)}
-    seeds_of: dict[int, int] = {}
-    for entry in entries:
-        seeds_of[entry.cell] = seeds_of.get(entry.cell, 0) + 1
+    seeds = Counter(entry.cell for entry in entries)
     return [
-        _row(plan, entry, alone=seeds_of[entry.cell] == 1)
+        _row(plan, entry, alone=seeds[entry.cell] == 1)
         for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed]))
     ]
 
@@ -137,28 +123,28 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
     Raises:
         UsageError: polars is not installed.
     """
-    pl = require_polars()
-    kinds = {"verdict": pl.String, "motion": pl.String, "extended": pl.Int64}
-    schema = {
-        "cell": pl.Int64,
-        **{one.key: pl.Float64 if one.numeric else pl.String for one in plan.axes},
-        "law": pl.String,
-        "seed": pl.Int64,
-        "random": pl.Boolean,
-        **{name: kinds.get(name, pl.Float64) for name in CellResult.__struct_fields__},
-        "scenario_sha256": pl.String,
-        "command": pl.String,
-        "scenario": pl.String,
+    kinds: dict[str, type] = {
+        "cell": int,
+        **{one.key: float if one.numeric else str for one in plan.axes},
+        "law": str,
+        "seed": int,
+        "random": bool,
+        **dict.fromkeys(CellResult.__struct_fields__, float),
+        "verdict": str,
+        "motion": str,
+        "extended": int,
+        **dict.fromkeys(("scenario_sha256", "command", "scenario"), str),
     }
+    columns = {name: ([row[name] for row in rows], kind) for name, kind in kinds.items()}
+    plan_text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
+    return _encode_parquet(columns, row_group_size=_ROWS_OF_A_GROUP, metadata={_PLAN_KEY: plan_text})
+
+
+def _encode_parquet(columns: Mapping[str, tuple[Sequence[Any], type]], **options: Any) -> bytes:
+    pl = require_polars()
+    series = {name: pl.Series(name, values, dtype=kind) for name, (values, kind) in columns.items()}
     made = io.BytesIO()
-    pl.DataFrame(
-        {name: pl.Series(name, [row[name] for row in rows], dtype=kind) for name, kind in schema.items()}
-    ).write_parquet(
-        made,
-        compression="zstd",
-        row_group_size=_ROWS_OF_A_GROUP,
-        metadata={_PLAN_KEY: json.dumps(facts, ensure_ascii=False, sort_keys=True)},
-    )
+    pl.DataFrame(series).write_parquet(made, compression="zstd", **options)
     return made.getvalue()
 
 
@@ -187,14 +173,7 @@ GRID_POINTS_FILE = "places.parquet"
 
 
 class GridPoint(NamedTuple):
-    """One cell with all its seeds.
-
-    Attributes:
-        cell: its number.
-        law: the laws of its sites.
-        values: along every axis.
-        counts: how many runs came to each verdict, in the order of `Verdict`.
-    """
+    """One cell with all its seeds: how many runs came to each class, in the order of `CellClass`."""
 
     cell: int
     law: str
@@ -217,54 +196,38 @@ class GridPoint(NamedTuple):
         return 0 < self.stable < self.decided
 
     @property
-    def interval(self) -> ShareInterval:
+    def interval(self) -> tuple[float, float]:
         """The 95 % interval of the share of stable runs, among those that decide."""
         return wilson_interval(self.stable, self.decided)
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Returns every place of a sweep, in the order of the cells."""
-    counted: dict[int, Counter[str]] = {}
-    laws: dict[int, str] = {}
+    """Returns every grid point of a sweep, in the order of the cells."""
+    counted: dict[tuple[int, str], Counter[str]] = {}
     for row in results.rows:
-        counted.setdefault(row["cell"], Counter())[row["verdict"]] += 1
-        laws[row["cell"]] = row["law"]
+        counted.setdefault((row["cell"], row["law"]), Counter())[row["verdict"]] += 1
     return [
-        GridPoint(
-            number,
-            laws[number],
-            results.plan.cell(number).values,
-            tuple(counts[verdict.value] for verdict in CellClass),
-        )
-        for number, counts in counted.items()
+        GridPoint(cell, law, results.plan.cell(cell).values, tuple(counts[one.value] for one in CellClass))
+        for (cell, law), counts in counted.items()
     ]
 
 
 def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
-    """Returns places as a Parquet file: a row each, its counts, and the share of stable runs with its ends.
+    """Returns grid points as a Parquet file: counts, and the share of stable runs with its interval.
 
     Raises:
         UsageError: polars is not installed.
     """
-    pl = require_polars()
+    shares = [one.stable / one.decided if one.decided else None for one in found]
     intervals = [one.interval for one in found]
-    columns = {
-        "cell": ([one.cell for one in found], pl.Int64),
-        **{
-            axis.key: ([one.values[n] for one in found], pl.Float64 if axis.numeric else pl.String)
-            for n, axis in enumerate(plan.axes)
-        },
-        "law": ([one.law for one in found], pl.String),
-        "runs": ([sum(one.counts) for one in found], pl.Int64),
-        **{
-            verdict.value: ([one.counts[n] for one in found], pl.Int64) for n, verdict in enumerate(CellClass)
-        },
-        "stable_share": ([one.stable / one.decided if one.decided else None for one in found], pl.Float64),
-        "stable_share_low": ([one.low for one in intervals], pl.Float64),
-        "stable_share_high": ([one.high for one in intervals], pl.Float64),
-    }
-    made = io.BytesIO()
-    pl.DataFrame(
-        {name: pl.Series(name, values, dtype=kind) for name, (values, kind) in columns.items()}
-    ).write_parquet(made, compression="zstd")
-    return made.getvalue()
+    columns: dict[str, tuple[list[Any], type]] = {"cell": ([one.cell for one in found], int)}
+    for n, axis in enumerate(plan.axes):
+        columns[axis.key] = [one.values[n] for one in found], float if axis.numeric else str
+    columns["law"] = [one.law for one in found], str
+    columns["runs"] = [sum(one.counts) for one in found], int
+    for n, verdict in enumerate(CellClass):
+        columns[verdict.value] = [one.counts[n] for one in found], int
+    columns["stable_share"] = shares, float
+    columns["stable_share_low"] = [low for low, _ in intervals], float
+    columns["stable_share_high"] = [high for _, high in intervals], float
+    return _encode_parquet(columns)

@@ -37,13 +37,7 @@ _RESUME_HINT = "; what is done is kept: go on with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Duration of a sweep, estimated by a few of its runs, which are done then.
-
-    Attributes:
-        runs: how many there are at most, those that are done left out.
-        seconds: how long they will take on the requested processes.
-        entries: the runs that were made.
-    """
+    """Duration of the runs that a sweep has left at most, estimated by a few of them, which are done then."""
 
     runs: int
     seconds: float
@@ -51,14 +45,7 @@ class DurationEstimate(NamedTuple):
 
 
 class SweepSpeed(NamedTuple):
-    """Speed of a sweep, this time.
-
-    Attributes:
-        runs: how many were made.
-        simulated_s: how much time of the experiment that was.
-        wall_s: how long it took.
-        jobs: by how many processes.
-    """
+    """Speed of a sweep, this time: how many runs and how much time of the experiment were simulated."""
 
     runs: int
     simulated_s: float
@@ -72,13 +59,7 @@ class SweepSpeed(NamedTuple):
 
 
 class FinishedSweep(NamedTuple):
-    """A finished sweep.
-
-    Attributes:
-        results: what came of it.
-        folder: where it is.
-        speed: of what was run this time.
-    """
+    """A finished sweep, and the speed of what was run this time."""
 
     results: SweepResults
     folder: SweepFolder
@@ -105,10 +86,9 @@ def estimate_sweep(
     began_ns = clock.monotonic_ns()
     entries: list[CellRun] = []
     took_s = 0.0
-    for task in probes:
-        if took_s < _PROBING_S:
-            entries.append(run_cell(task))
-            took_s = (clock.monotonic_ns() - began_ns) * 1e-9
+    while len(entries) < len(probes) and took_s < _PROBING_S:
+        entries.append(run_cell(probes[len(entries)]))
+        took_s = (clock.monotonic_ns() - began_ns) * 1e-9
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
     left = max(len(entries), plan.cells * seeds - len(known))
     return DurationEstimate(left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries)
@@ -187,10 +167,6 @@ def _run_cells(plan: SweepPlan, journal: SweepJournal, pool: WorkerPool, progres
     """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = plan.seeds
 
-    def total() -> int:
-        random = sum(entry.random for (_, seed), entry in journal.done.items() if seed == first)
-        return plan.cells + random * len(others)
-
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
         before = len(journal.done)
         tasks = (plan.task(*key) for key in runs if key not in journal.done)
@@ -200,4 +176,4 @@ def _run_cells(plan: SweepPlan, journal: SweepJournal, pool: WorkerPool, progres
 
     make(((number, first) for number in range(plan.cells)), plan.cells)
     again = [number for number in range(plan.cells) if others and journal.done[number, first].random]
-    make(((number, seed) for number in again for seed in others), total())
+    make(((number, seed) for number in again for seed in others), plan.cells + len(again) * len(others))

@@ -5,12 +5,12 @@ the margin, held or not.
 """
 
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 
 import msgspec
 
 from ...scenario import Expect
 from .measure_run import RunMetrics
-from .site_stats import Range
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
@@ -32,117 +32,106 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     margin: float | None = None
 
 
-def evaluate_expectations(expect: Expect, figures: RunMetrics) -> list[ExpectationResult]:
+def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
     """Returns an outcome for everything that is asked of a run, in the order of the keys of `Expect`.
 
     A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
     """
-    missing = f"{figures.missing} missing"
-    gaps = ExpectationResult("no_gaps", figures.missing == 0, missing, "0 missing")
+    limits = [
+        _compare_with_limit(key, read(metrics), getattr(expect, key), unit)
+        for key, (read, unit) in _READINGS.items()
+        if getattr(expect, key) is not None
+    ]
+    missing = f"{metrics.missing} missing"
+    gaps = ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
     return [
-        *_stability(expect, figures),
-        *_limits(expect, figures),
-        *_poses(expect, figures),
+        *_evaluate_stability(expect, metrics),
+        *limits,
+        *_evaluate_poses(expect, metrics),
         *([gaps] if expect.no_gaps else []),
-        *_windows(expect, figures),
+        *_evaluate_windows(expect, metrics),
     ]
 
 
-def _stability(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
+def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     wanted = expect.stable is not False
-    diverged = figures.diverged_at_s is not None
+    diverged = metrics.diverged_at_s is not None
     if expect.stable is None and not diverged:
         return
+    grows, rate = metrics.trend.grows, metrics.rate_per_s
+    text = metrics.trend.value + ("" if rate is None or grows is None else f", {rate:+.3g}/s")
     if diverged:
-        found: bool | None = False
-        text = f"diverged at {figures.diverged_at_s:.4g} s"
-    else:
-        found = None if figures.trend.grows is None else not figures.trend.grows
-        rate = figures.rate_per_s
-        text = figures.trend.value + ("" if rate is None or found is None else f", {rate:+.3g}/s")
-    yield ExpectationResult("stable", found is wanted, text, "true" if wanted else "false")
+        grows, text = True, f"diverged at {metrics.diverged_at_s:.4g} s"
+    yield ExpectationResult("stable", grows is not wanted and grows is not None, text, str(wanted).lower())
 
 
 _UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}
 """Per ending of a key its unit, for people."""
 
-_Reading = Callable[[RunMetrics], float | None]
 
-_READINGS: dict[str, tuple[_Reading, str]] = {
-    "synchronised_by_s": (lambda f: f.synchronised_at_s, "s"),
-    "peak_error_max_rad": (lambda f: f.peak_error_rad, "rad"),
-    "peak_error_min_rad": (lambda f: f.peak_error_rad, "rad"),
-    "rms_error_max_rad": (lambda f: f.rms_error_rad, "rad"),
-    "end_error_max_rad": (lambda f: f.end_error_rad, "rad"),
-    "end_error_min_rad": (lambda f: f.end_error_rad, "rad"),
-    "end_spread_max_rad": (lambda f: f.end_spread_rad, "rad"),
-    "peak_torque_max_nm": (lambda f: f.peak_torque_nm, "N m"),
-    "peak_speed_max_rad_s": (lambda f: f.peak_speed_rad_s, "rad/s"),
-    "age_max_ms": (lambda f: _over_links([age.max_ms for age in f.ages.values()], max), "ms"),
-    "mean_age_max_ms": (lambda f: _over_links([age.mean_ms for age in f.ages.values()], max), "ms"),
-    "mean_age_min_ms": (lambda f: _over_links([age.mean_ms for age in f.ages.values()], min), "ms"),
-    "late_samples_max": (lambda f: float(f.late_samples), ""),
+def _read_ages(name: str, choose: Callable[[list[float]], float]) -> Callable[[RunMetrics], float | None]:
+    """Returns the largest or smallest of the links; None where a link never had a sample."""
+
+    def read(metrics: RunMetrics) -> float | None:
+        known = [value for age in metrics.ages.values() if (value := getattr(age, name)) is not None]
+        return choose(known) if known and len(known) == len(metrics.ages) else None
+
+    return read
+
+
+_READINGS: dict[str, tuple[Callable[[RunMetrics], float | None], str]] = {
+    "synchronised_by_s": (attrgetter("synchronised_at_s"), "s"),
+    "peak_error_max_rad": (attrgetter("peak_error_rad"), "rad"),
+    "peak_error_min_rad": (attrgetter("peak_error_rad"), "rad"),
+    "rms_error_max_rad": (attrgetter("rms_error_rad"), "rad"),
+    "end_error_max_rad": (attrgetter("end_error_rad"), "rad"),
+    "end_error_min_rad": (attrgetter("end_error_rad"), "rad"),
+    "end_spread_max_rad": (attrgetter("end_spread_rad"), "rad"),
+    "peak_torque_max_nm": (attrgetter("peak_torque_nm"), "N m"),
+    "peak_speed_max_rad_s": (attrgetter("peak_speed_rad_s"), "rad/s"),
+    "age_max_ms": (_read_ages("max_ms", max), "ms"),
+    "mean_age_max_ms": (_read_ages("mean_ms", max), "ms"),
+    "mean_age_min_ms": (_read_ages("mean_ms", min), "ms"),
+    "late_samples_max": (attrgetter("late_samples"), ""),
 }
 
 
-def _over_links(values: list[float | None], choice: Callable[[list[float]], float]) -> float | None:
-    """Returns the largest or smallest of the links; None where a link never had a sample."""
-    known = [value for value in values if value is not None]
-    return choice(known) if known and len(known) == len(values) else None
-
-
-def _limits(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
-    for key, (reading, unit) in _READINGS.items():
-        limit = getattr(expect, key)
-        if limit is not None:
-            yield _against(key, reading(figures), limit, unit)
-
-
-def _against(key: str, measured: float | None, limit: float, unit: str) -> ExpectationResult:
+def _compare_with_limit(key: str, measured: float | None, limit: float, unit: str) -> ExpectationResult:
     least = "_min_" in key
-    sign = "≥" if least else "≤"
-    wanted = f"{sign} {limit:g} {unit}".rstrip()
+    wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(key, False, "never", wanted)
     spare = measured - limit if least else limit - measured
-    return ExpectationResult(
-        key, spare >= 0.0, f"{measured:.4g} {unit}".rstrip(), wanted, spare / limit if limit else None
-    )
+    text = f"{measured:.4g} {unit}".rstrip()
+    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None)
 
 
-def _poses(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
+def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     within = expect.end_pose_within_rad
     for site, wanted in expect.end_pose_rad.items():
-        text = f"({', '.join(f'{angle:g}' for angle in wanted)}) ± {within:g} rad"
-        reached = figures.end_pose_rad.get(site)
+        key = f"end_pose_rad.{site}"
+        limit = f"({', '.join(f'{angle:g}' for angle in wanted)}) ± {within:g} rad"
+        reached = metrics.end_pose_rad.get(site)
         if reached is None:
-            yield ExpectationResult(f"end_pose_rad.{site}", False, "never", text)
+            yield ExpectationResult(key, False, "never", limit)
             continue
         off = max(abs(a - b) for a, b in zip(reached, wanted, strict=True))
-        yield ExpectationResult(
-            f"end_pose_rad.{site}",
-            off <= within,
-            f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad",
-            text,
-            (within - off) / within,
-        )
+        text = f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad"
+        yield ExpectationResult(key, off <= within, text, limit, (within - off) / within)
 
 
-def _windows(expect: Expect, figures: RunMetrics) -> Iterator[ExpectationResult]:
-    for window, spans in zip(expect.windows, figures.windows, strict=True):
+def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    for window, ranges in zip(expect.windows, metrics.windows, strict=True):
         for key, (least, most) in window.asked:
             site = f" {window.site}" if window.site else ""
             name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
             unit = next((word for ending, word in _UNITS.items() if key.endswith(ending)), "")
-            yield _within(name, spans.get(key), least, most, unit)
-
-
-def _within(key: str, span: Range | None, least: float, most: float, unit: str) -> ExpectationResult:
-    wanted = f"{least:g} to {most:g} {unit}".rstrip()
-    if span is None:
-        return ExpectationResult(key, False, "never", wanted)
-    text = f"{span.least:.4g}" if span.least == span.most else f"{span.least:.4g} to {span.most:.4g}"
-    spare, half = min(span.least - least, most - span.most), 0.5 * (most - least)
-    return ExpectationResult(
-        key, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, spare / half if half else None
-    )
+            wanted = f"{least:g} to {most:g} {unit}".rstrip()
+            found = ranges.get(key)
+            if found is None:
+                yield ExpectationResult(name, False, "never", wanted)
+                continue
+            text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
+            spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
+            margin = spare / half if half else None
+            yield ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin)

@@ -4,24 +4,20 @@ Invariant: every metric has one definition, and both sources feed the same stati
 a metric that a run cannot give is None, never a guess.
 """
 
-from array import array
 from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
 
-from ... import process
 from ...analysis.run_end import EnvelopeFit, EnvelopeTrend, fit_envelope
-from ...core.site_step import Site
-from ...core.ticks import NS_PER_S, Mode, TickRecord
-from ...core.two_link_arm import JOINTS
+from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
-from ...execution import virtual
 from ...execution.virtual_comparison import find_late_samples
 from ...log.log_reader import Log
 from ...scenario import Expect, Scenario
 from ...scenario.expect import ALL_SITES_QUANTITIES
-from .site_stats import BUCKET_NS, Range, RecordBatch, SiteStats, WindowStats
+from ..record_batches import RecordBatch, run_in_batches
+from .site_stats import BUCKET_NS, Range, SiteStats, WindowStats
 
 
 class LinkAge(msgspec.Struct, frozen=True):
@@ -84,39 +80,35 @@ def compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Returns the figures of a run.
-
-    Args:
-        scenario: the experiment.
-        tallies: what was kept of every site, in scenario order.
-        diverged_at_s: when the first site left its limits, s.
-        late_samples: how many samples were late.
-        missing: how many records are missing.
-    """
+    """Returns the metrics of a run from the statistics of its sites, in scenario order."""
     ran = {name: tally for name, tally in tallies.items() if tally.records}
     whole = len(ran) == len(tallies)
     end_ns = max((tally.last_ns for tally in ran.values()), default=0)
     trend = _envelope(ran)
+    span_s = [tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz for name, tally in ran.items()]
+    apart_ns = [tally.apart_ns for tally in ran.values()]
+    synchronised = whole and not any(tally.apart_ns == tally.last_ns for tally in ran.values())
+    ends = {name: tally.end(end_ns) for name, tally in ran.items()}
+
+    def largest(name: str) -> float | None:
+        return max((getattr(tally, name) for tally in ran.values()), default=None)
+
     return RunMetrics(
-        simulated_s=max((_span_s(scenario, name, tally) for name, tally in ran.items()), default=0.0),
+        simulated_s=max(span_s, default=0.0),  # to the end of the period that follows the last tick
         diverged_at_s=diverged_at_s,
         trend=trend.trend,
         rate_per_s=None if np.isnan(trend.rate_per_s) else trend.rate_per_s,
-        synchronised_at_s=_synchronised_at_s(ran) if whole else None,
-        peak_error_rad=_largest([tally.peak_error_rad for tally in ran.values()]),
-        rms_error_rad=_largest([tally.rms_error_rad for tally in ran.values()]),
-        end_error_rad=_largest([_end_error_rad(tally, end_ns) for tally in ran.values()]),
-        end_spread_rad=_end_spread_rad(list(ran.values()), end_ns) if whole else None,
+        synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
+        peak_error_rad=largest("peak_error_rad"),
+        rms_error_rad=largest("rms_error_rad"),
+        end_error_rad=max(
+            (float(np.abs(end.q - end.q_des).max(initial=0.0)) for end in ends.values()), default=None
+        ),
+        end_spread_rad=_end_spread_rad(list(ends.values())) if whole else None,
         end_pose_rad={name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()},
-        peak_torque_nm=_largest([tally.peak_torque_nm for tally in ran.values()]),
-        peak_speed_rad_s=_largest([tally.peak_speed_rad_s for tally in ran.values()]),
-        ages={
-            f"{peer}->{name}": LinkAge(mean_ms, None if mean_ms is None else float(max_ms))
-            for name, tally in tallies.items()
-            for peer, mean_ms, max_ms in zip(
-                scenario.peers(name), tally.mean_age_ms, tally.age_max_ms, strict=True
-            )
-        },
+        peak_torque_nm=largest("peak_torque_nm"),
+        peak_speed_rad_s=largest("peak_speed_rad_s"),
+        ages=_link_ages(scenario, tallies),
         late_samples=late_samples,
         missing=missing,
         windows=tuple(
@@ -124,6 +116,16 @@ def compute_run_metrics(
             for n in range(len(scenario.expect.windows))
         ),
     )
+
+
+def _link_ages(scenario: Scenario, tallies: Mapping[str, SiteStats]) -> dict[str, LinkAge]:
+    return {
+        f"{peer}->{name}": LinkAge(mean_ms, None if mean_ms is None else float(max_ms))
+        for name, tally in tallies.items()
+        for peer, mean_ms, max_ms in zip(
+            scenario.peers(name), tally.mean_age_ms, tally.age_max_ms, strict=True
+        )
+    }
 
 
 def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
@@ -139,15 +141,6 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
     }
 
 
-def _largest(values: list[float]) -> float | None:
-    return max(values, default=None)
-
-
-def _span_s(scenario: Scenario, name: str, tally: SiteStats) -> float:
-    """Returns how long a site ran: to the end of the period that follows its last tick."""
-    return tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz
-
-
 def _envelope(ran: Mapping[str, SiteStats]) -> EnvelopeFit:
     """Returns the trend of the largest |e| of all sites; a site's last, unfinished bucket is left out."""
     parts = [tally.peaks() for tally in ran.values()]
@@ -158,20 +151,8 @@ def _envelope(ran: Mapping[str, SiteStats]) -> EnvelopeFit:
     return fit_envelope(t_s, largest[kept].astype(np.float64))
 
 
-def _synchronised_at_s(ran: Mapping[str, SiteStats]) -> float | None:
-    if any(tally.apart_ns == tally.last_ns for tally in ran.values()):
-        return None
-    return max(0, *(tally.apart_ns for tally in ran.values())) / NS_PER_S
-
-
-def _end_error_rad(tally: SiteStats, end_ns: int) -> float:
-    end = tally.end(end_ns)
-    return float(np.abs(end.q - end.q_des).max(initial=0.0))
-
-
-def _end_spread_rad(tallies: list[SiteStats], end_ns: int) -> float | None:
-    """Compares every site's latest angles at the ticks of the first one."""
-    ends = [tally.end(end_ns) for tally in tallies]
+def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
+    """Compares every site's latest angles at the ticks of the first one, in their last second."""
     if not all(len(end.t_ns) for end in ends):  # a site's part ends long before the others'
         return None
     at_ns = ends[0].t_ns[ends[0].t_ns >= max(end.t_ns[0] for end in ends)]
@@ -179,36 +160,22 @@ def _end_spread_rad(tallies: list[SiteStats], end_ns: int) -> float | None:
     return float((poses.max(axis=0) - poses.min(axis=0)).max(initial=0.0))
 
 
-BATCH_RECORDS = 1000
-"""Records of a site that are collected before its statistics take them in."""
-
-
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
-    """Runs a scenario in virtual time and returns its figures."""
-    held: dict[str, _PendingRecords] = {}
-    diverged_at_s: float | None = None
-    with process.pause_gc():
-        for site, _, output in virtual.execute_virtual(scenario):
-            if output.tick == 0:
-                held[site.name] = _PendingRecords(site, _site_stats(scenario, site.name))
-            held[site.name].take(output)
-            if output.mode is Mode.DIVERGED and diverged_at_s is None:
-                diverged_at_s = output.t_ns / NS_PER_S
-    for part in held.values():
-        part.flush()
-    tallies = {name: part.tally for name, part in held.items()}
+    """Runs a scenario in virtual time and returns its metrics."""
+    tallies = {name: _site_stats(scenario, name) for name in scenario.names}
+    run = run_in_batches(scenario, {name: tally.add for name, tally in tallies.items()})
     made = sum(tally.records for tally in tallies.values())
     return compute_run_metrics(
         scenario,
         tallies,
-        diverged_at_s=diverged_at_s,
-        late_samples=sum(count.late for part in held.values() for count in part.site.counts()),
-        missing=0 if diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
+        diverged_at_s=run.diverged_at_s,
+        late_samples=run.late_samples,
+        missing=0 if run.diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
     )
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Returns the figures of a log.
+    """Returns the metrics of a log.
 
     Raises:
         LogError: a record cannot be read.
@@ -241,34 +208,3 @@ def _site_stats(scenario: Scenario, site: str) -> SiteStats:
         for window in scenario.expect.windows
     ]
     return SiteStats(peer_rates, scenario.expect.synchronised_rad, stretches)
-
-
-class _PendingRecords:
-    """One site's records that its statistics have not taken in yet."""
-
-    def __init__(self, site: Site, tally: SiteStats) -> None:
-        self.site, self.tally = site, tally
-        self._t_ns, self._used = array("q"), array("q")
-        self._floats = array("d")
-
-    def take(self, output: TickRecord) -> None:
-        """Takes one record."""
-        self._t_ns.append(output.t_ns)
-        self._used.extend(output.used)
-        floats = self._floats
-        floats.extend(output.q)
-        floats.extend(output.qd)
-        floats.extend(output.q_des)
-        floats.extend(output.tau)
-        floats.extend(output.tau_x)
-        if len(self._t_ns) >= BATCH_RECORDS:
-            self.flush()
-
-    def flush(self) -> None:
-        """Passes the pending records on."""
-        t_ns = np.array(self._t_ns, dtype=np.int64)
-        used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), len(self.site.peers))
-        q, qd, q_des, tau, tau_x = np.array(self._floats).reshape(len(t_ns), 5, JOINTS).transpose(1, 0, 2)
-        self.tally.add(RecordBatch(t_ns, q, qd, q_des, tau, tau_x, used))
-        for held in (self._t_ns, self._used, self._floats):
-            del held[:]

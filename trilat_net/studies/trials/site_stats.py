@@ -10,94 +10,28 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...analysis.arm_rows import compute_end_effector
 from ...analysis.torque_sources import wall_force
 from ...core.ticks import NS_PER_S
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
+from ...log.record_columns import Ints
 from ...scenario import SiteSpec
 from ...scenario.expect import END_WINDOW_S, ExpectWindow
 from ...scenario.operators import Wall
-
-Ints = NDArray[np.int64]
-
-
-class RecordBatch(NamedTuple):
-    """Some records of one site, one after the other.
-
-    Attributes:
-        t_ns: nominal time, shape (K,), ns.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-        q_des: reference, Eq. (6), shape (K, 2), rad.
-        tau: control torque, shape (K, 2), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
-        used: tick of the sample in use, -1 before the first, shape (K, P).
-    """
-
-    t_ns: Ints
-    q: Array
-    qd: Array
-    q_des: Array
-    tau: Array
-    tau_x: Array
-    used: Ints
-
-    def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records that are later than a time."""
-        return self._part(slice(int(np.searchsorted(self.t_ns, t_ns, side="right")), None))
-
-    def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records from one time to another, which is no longer of them."""
-        first, last = np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist()
-        return self._part(slice(first, last))
-
-    def _part(self, part: slice) -> "RecordBatch":
-        return RecordBatch(
-            self.t_ns[part],
-            self.q[part],
-            self.qd[part],
-            self.q_des[part],
-            self.tau[part],
-            self.tau_x[part],
-            self.used[part],
-        )
-
-
-def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
-    """Returns blocks that follow each other as one."""
-    return RecordBatch(
-        np.concatenate([rows.t_ns for rows in blocks]),
-        np.concatenate([rows.q for rows in blocks]),
-        np.concatenate([rows.qd for rows in blocks]),
-        np.concatenate([rows.q_des for rows in blocks]),
-        np.concatenate([rows.tau for rows in blocks]),
-        np.concatenate([rows.tau_x for rows in blocks]),
-        np.concatenate([rows.used for rows in blocks]),
-    )
+from ..record_batches import RecordBatch, join_batches
 
 
 class Range(NamedTuple):
-    """Smallest and largest value that a quantity had; twice the same where it has one value.
-
-    Attributes:
-        least: the smallest.
-        most: the largest.
-    """
+    """Smallest and largest value that a quantity had; twice the same where it has one value."""
 
     least: float
     most: float
 
 
 class WindowStats:
-    """One site's figures within a window, so far.
-
-    Args:
-        window: from when to when.
-        spec: the site, for its walls and its period.
-    """
+    """Statistics of one site within a window, so far."""
 
     def __init__(self, window: ExpectWindow, spec: SiteSpec) -> None:
         self._from_ns, self._to_ns = (round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s))

@@ -5,8 +5,7 @@ from its log by the same code; in addition its session must end in order and its
 bit for bit.
 """
 
-import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,26 +18,18 @@ from ...execution.verify import verify
 from ...log.log_reader import open_log
 from ...net.clock import SystemClock
 from ...scenario import Scenario, load_scenario
+from ..commands import format_command, set_options
 from .expectations import ExpectationResult, evaluate_expectations
 from .measure_run import RunMetrics, measure_log, measure_virtual_run
 
 
 class TrialResult(NamedTuple):
-    """Result of a trial.
-
-    Attributes:
-        trial: what was run.
-        outcomes: what was expected of it, and whether it held.
-        simulated_s: how much time of the experiment ran.
-        wall_s: how long that took.
-        error: why it did not come to an end, or "".
-        log: the log of a live trial.
-    """
+    """Result of a trial: an outcome per expectation, or why it came to no end; a live one has a log."""
 
     trial: "Trial"
-    outcomes: list[ExpectationResult]
-    simulated_s: float
-    wall_s: float
+    outcomes: Sequence[ExpectationResult] = ()
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
     error: str = ""
     log: Path | None = None
 
@@ -59,14 +50,7 @@ class TrialResult(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """One scenario with one seed.
-
-    Attributes:
-        scenario: the experiment, with that seed.
-        source: what a command calls the scenario: a shipped name or a path.
-        overrides: what was changed of it, as texts KEY=VALUE.
-        live: whether it runs over a network.
-    """
+    """One scenario with one seed; a command calls it by its source and overrides KEY=VALUE."""
 
     scenario: Scenario
     source: str
@@ -80,33 +64,30 @@ class Trial(NamedTuple):
     def again(self) -> str:
         """The command that repeats the trial."""
         live = ["--live"] if self.live else []
-        return self._command("test", self.source, *live, "--seeds", str(self.scenario.seed))
+        seeds = ["--seeds", str(self.scenario.seed)]
+        return format_command("test", self.source, *live, *seeds, *set_options(self.overrides))
 
     @property
     def look(self) -> str:
         """The command that makes a log of the same run, to look at."""
-        file = f"{self}.mcap"
-        return self._command("sim", self.source, "--seed", str(self.scenario.seed), "-o", file)
+        words = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
+        return format_command("sim", self.source, *words, *set_options(self.overrides))
 
-    def _command(self, *words: str) -> str:
-        sets = [word for text in self.overrides for word in ("--set", text)]
-        return shlex.join(["trilat", *words, *sets])
-
-    def evaluate(self, figures: RunMetrics, wall_s: float) -> TrialResult:
-        """Returns the result that figures of this trial mean."""
-        return TrialResult(
-            self, evaluate_expectations(self.scenario.expect, figures), figures.simulated_s, wall_s
-        )
+    def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
+        """Returns the result that metrics of this trial mean."""
+        outcomes = evaluate_expectations(self.scenario.expect, metrics)
+        return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:
         """Runs the trial in virtual time, in this process."""
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         try:
-            figures = measure_virtual_run(self.scenario)
+            metrics = measure_virtual_run(self.scenario)
         except LawFailed as failed:
-            return TrialResult(self, [], 0.0, (clock.monotonic_ns() - start_ns) * 1e-9, str(failed))
-        return self.evaluate(figures, (clock.monotonic_ns() - start_ns) * 1e-9)
+            wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
+            return TrialResult(self, wall_s=wall_s, error=str(failed))
+        return self.evaluate(metrics, (clock.monotonic_ns() - start_ns) * 1e-9)
 
     def check(self) -> TrialResult:
         """Runs the trial in virtual time.
@@ -152,45 +133,36 @@ def trials(
             raise ScenarioError(f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=called)
     if not scenario.random and not live:
         del chosen[1:]
-    texts = tuple(_texts(set))
-    return [Trial(msgspec.structs.replace(scenario, seed=seed), called, texts, live=live) for seed in chosen]
+    texts = tuple(_assignments(set) if isinstance(set, Mapping) else set)
+    return [Trial(msgspec.structs.replace(scenario, seed=seed), called, texts, live) for seed in chosen]
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
     """Refuses a scenario that expects nothing, or something of a time that it does not reach."""
-    if not scenario.expect.asks:
+    expect, end_s = scenario.expect, scenario.duration_s
+    if not expect.asks:
         raise ScenarioError(
             "nothing is expected of it: add a table [expect] with keys such as stable = true or "
             "synchronised_by_s = 12.0; the template of `trilat scenario new` lists them all",
             source=source,
         )
-    by_s = scenario.expect.synchronised_by_s
-    if by_s is not None and by_s >= scenario.duration_s:
-        raise ScenarioError(
-            f"must be before the end of the run at {scenario.duration_s:g} s, is {by_s:g}",
-            path="expect.synchronised_by_s",
-            source=source,
-        )
-    for n, window in enumerate(scenario.expect.windows):
-        if window.to_s > scenario.duration_s:
-            raise ScenarioError(
-                f"must not be after the end of the run at {scenario.duration_s:g} s, is {window.to_s:g}",
-                path=f"expect.windows[{n}].to_s",
-                source=source,
-            )
+    by_s = expect.synchronised_by_s
+    if by_s is not None and by_s >= end_s:
+        problem = f"must be before the end of the run at {end_s:g} s, is {by_s:g}"
+        raise ScenarioError(problem, path="expect.synchronised_by_s", source=source)
+    for n, window in enumerate(expect.windows):
+        if window.to_s > end_s:
+            problem = f"must not be after the end of the run at {end_s:g} s, is {window.to_s:g}"
+            raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
 
 
-def _texts(overrides: Mapping[str, Any] | Sequence[str]) -> list[str]:
-    """Returns overrides as the command line takes them."""
-    if not isinstance(overrides, Mapping):
-        return list(overrides)
-    return [text for key, value in overrides.items() for text in _assignments(key, value)]
-
-
-def _assignments(key: str, value: Any) -> list[str]:
-    if isinstance(value, Mapping):
-        return [text for inner, entry in value.items() for text in _assignments(f"{key}.{inner}", entry)]
-    return [f"{key}={_one_line(value)}"]
+def _assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yields overrides as the command line takes them."""
+    for key, value in overrides.items():
+        if isinstance(value, Mapping):
+            yield from _assignments(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}={_one_line(value)}"
 
 
 def _one_line(value: Any) -> str:
@@ -210,7 +182,7 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
         result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
         verdict = verify(log)
     except LogError as error:
-        return TrialResult(trial, [], 0.0, wall_s, "; ".join([*problems, str(error)]), kept)
+        return TrialResult(trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept)
     outcomes = [
         *result.outcomes,
         ExpectationResult("session", not problems, "; ".join(problems) or "ended in order", "ends in order"),

@@ -22,15 +22,7 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of one scenario, over all its runs.
-
-    Attributes:
-        scenario: which.
-        key: what was expected.
-        worst: the outcome with the least margin; a failed one where there is one.
-        held: in how many runs it held.
-        runs: of how many.
-    """
+    """One expectation of one scenario: its worst outcome, and in how many of its runs it held."""
 
     scenario: str
     key: str
@@ -39,27 +31,15 @@ class ExpectationRow(NamedTuple):
     runs: int
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the row's texts, under `COLUMNS`."""
+        """Returns the row's texts, under `TRIAL_COLUMNS`."""
         mark = "ok" if self.held == self.runs else "FAIL"
-        worst = self.worst
-        return (
-            mark,
-            self.scenario,
-            self.key,
-            worst.limit,
-            worst.measured,
-            format_margin(worst.margin),
-            f"{self.held}/{self.runs}",
-        )
+        worst, margin = self.worst, format_margin(self.worst.margin)
+        held = f"{self.held}/{self.runs}"
+        return mark, self.scenario, self.key, worst.limit, worst.measured, margin, held
 
 
 class TrialReport(NamedTuple):
-    """All results, in the order of scenarios and seeds.
-
-    Attributes:
-        results: one per run.
-        wall_s: how long all of them took.
-    """
+    """All results, in the order of scenarios and seeds, and how long all of them took, s."""
 
     results: list[TrialResult]
     wall_s: float
@@ -145,12 +125,16 @@ def _failure_lines(results: Sequence[TrialResult]) -> list[str]:
     for result in failed[:MAX_FAILURES_SHOWN]:
         trial = result.trial
         lines.append(f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}")
-        lines.append(f"  again: {trial.again}")
-        lines.append(f"  look:  trilat report {result.log}" if result.log else f"  look:  {trial.look}")
-    if len(failed) > MAX_FAILURES_SHOWN:
-        seeds = ", ".join(str(result.trial.scenario.seed) for result in failed[MAX_FAILURES_SHOWN:])
-        lines.append(f"  and {len(failed) - MAX_FAILURES_SHOWN} more, seeds {seeds}")
+        lines += [f"  {line}" for line in _repeat_lines(result)]
+    if more := failed[MAX_FAILURES_SHOWN:]:
+        seeds = ", ".join(str(result.trial.scenario.seed) for result in more)
+        lines.append(f"  and {len(more)} more, seeds {seeds}")
     return lines
+
+
+def _repeat_lines(result: TrialResult) -> list[str]:
+    look = f"trilat report {result.log}" if result.log else result.trial.look
+    return [f"again: {result.trial.again}", f"look:  {look}"]
 
 
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -212,19 +196,10 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
         classname=f"trilat.{trial.scenario.name}",
         time=f"{result.wall_s:.3f}",
     )
-    again = [
-        f"again: {trial.again}",
-        f"look:  trilat report {result.log}" if result.log else f"look:  {trial.look}",
-    ]
     if not result.held:
-        kind = "error" if result.error else "failure"
-        found = Xml.SubElement(
-            case,
-            kind,
-            type="error" if result.error else "expectation",
-            message=_clean("; ".join(result.failures)),
-        )
-        found.text = _clean("\n".join([*result.failures, *again]))
+        kind, why = ("error", "error") if result.error else ("failure", "expectation")
+        found = Xml.SubElement(case, kind, type=why, message=_clean("; ".join(result.failures)))
+        found.text = _clean("\n".join([*result.failures, *_repeat_lines(result)]))
     lines = [
         f"{'ok' if o.held else 'FAIL'} {o.key}: {o.measured}, asked {o.limit}"
         + (f" ({format_margin(o.margin)})" if o.margin is not None else "")

@@ -6,46 +6,29 @@ again and again costs itself and no other.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import msgspec
+from typing import Any
 
 from ...core.jit import is_core_cached
 from ...errors import TrilatError
 from ...execution import virtual
 from ...net.clock import SystemClock
-from ...scenario import Scenario, parse_scenario
+from ...scenario import Scenario
 from ...scenario.laws import ImportedLaw
 from ..executor import MAX_LOSSES, Workers, open_worker_pool
-from .measure_run import RunMetrics, measure_virtual_run
 from .trial import Trial, TrialResult, trials
 from .trial_report import TrialReport
 
 
-class _TrialItem(NamedTuple):
-    name: str
-    text: str
-
-    def __str__(self) -> str:
-        return self.name
-
-
-class _TrialReply(msgspec.Struct):
-    """Metrics of a trial, or why there are none."""
-
-    metrics: RunMetrics | None = None
-    wall_s: float = 0.0
-    error: str = ""
-
-
-def _run_item(item: _TrialItem) -> _TrialReply:
-    clock = SystemClock()
-    start_ns = clock.monotonic_ns()
+def _run_trial(trial: Trial) -> TrialResult:
+    """Runs a trial in whatever process; an error that no other trial would have is its result."""
     try:
-        metrics = measure_virtual_run(parse_scenario(item.text))
+        return trial.run()
     except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
-        return _TrialReply(error=f"{type(error).__name__}: {error}")
-    return _TrialReply(metrics, (clock.monotonic_ns() - start_ns) * 1e-9)
+        return TrialResult(trial, error=f"{type(error).__name__}: {error}")
+
+
+def _lost_result(trial: Trial) -> TrialResult:
+    return TrialResult(trial, error=f"its worker process ended, {MAX_LOSSES} times")
 
 
 def run_trials(
@@ -71,32 +54,22 @@ def run_trials(
         if isinstance(site.control, ImportedLaw)
     ]
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
-    items = [_TrialItem(str(batch[n]), batch[n].scenario.text) for n in longest_first]
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
         if pool.is_local:
-            replies = ((n, batch[n].run()) for n in range(len(batch)))
+            replies = ((n, trial.run()) for n, trial in enumerate(batch))
         else:
             if not is_core_cached():
                 next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
+            queue = [batch[n] for n in longest_first]
             replies = (
-                (longest_first[place], _result(batch[longest_first[place]], reply))
-                for place, reply in pool.each(_run_item, items, _lost_reply, len(items))
+                (longest_first[place], result)
+                for place, result in pool.each(_run_trial, queue, _lost_result, len(queue))
             )
         for n, result in replies:
-            results[n] = result
-            done(result)
+            results[n] = result._replace(trial=batch[n])
+            done(results[n])
     return TrialReport([results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9)
-
-
-def _lost_reply(_item: _TrialItem) -> _TrialReply:
-    return _TrialReply(error=f"its worker process ended, {MAX_LOSSES} times")
-
-
-def _result(trial: Trial, reply: _TrialReply) -> TrialResult:
-    if reply.metrics is None:
-        return TrialResult(trial, [], 0.0, reply.wall_s, reply.error)
-    return trial.evaluate(reply.metrics, reply.wall_s)
 
 
 def check(

@@ -4,9 +4,7 @@ Invariant: a candidate's scenario is loaded through the same settings that its c
 score is a function of the scenario alone: None for the errors of a run that does not reach its end.
 """
 
-import shlex
-from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,18 +12,17 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ... import process
 from ...analysis.run_end import EnvelopeTrend, fit_envelope
 from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...core.ticks import NS_PER_S, Mode, TickRecord
-from ...core.two_link_arm import JOINTS
+from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
-from ...execution import virtual
 from ...log.record_columns import Ints
 from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
+from ..commands import format_command, set_options
+from ..record_batches import RecordBatch, run_in_batches
 from .consensus_pose import build_twin, compute_consensus_pose
 from .final_posture import CandidateClass, CandidateEnd, classify_candidate
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
@@ -82,44 +79,28 @@ class _Run(NamedTuple):
     diverged_s: float | None
 
 
-class _Record:
-    """One site's run: time, ns, and q, q_des, tau of every tick."""
+class _Record(NamedTuple):
+    """One site's run: time, shape (K,), ns; q, q_des and tau, shape (K, n)."""
 
-    def __init__(self, site: SiteSpec) -> None:
-        self.site = site
-        self._t_ns, self._floats = array("q"), array("d")
-
-    def take(self, output: TickRecord) -> None:
-        """Takes one record."""
-        self._t_ns.append(output.t_ns)
-        self._floats.extend(output.q)
-        self._floats.extend(output.q_des)
-        self._floats.extend(output.tau)
-
-    @property
-    def t_ns(self) -> Ints:
-        """Nominal times, shape (K,), ns."""
-        return np.array(self._t_ns, dtype=np.int64)
-
-    @property
-    def rows(self) -> Array:
-        """q, q_des and tau, shape (3, K, n)."""
-        return np.array(self._floats).reshape(-1, 3, JOINTS).transpose(1, 0, 2)
+    t_ns: Ints
+    q: Array
+    q_des: Array
+    tau: Array
 
 
 def _run(scenario: Scenario) -> _Run:
-    records = {name: _Record(spec) for name, spec in scenario.sites.items()}
-    diverged_s: float | None = None
-    with process.pause_gc():
-        for site, _, output in virtual.execute_virtual(scenario):
-            records[site.name].take(output)
-            if output.mode is Mode.DIVERGED and diverged_s is None:
-                diverged_s = output.t_ns / NS_PER_S
-    t_s, q, e = _aligned(list(records.values()))
+    kept: dict[str, list[_Record]] = {name: [] for name in scenario.names}
+
+    def keep(name: str) -> Callable[[RecordBatch], None]:
+        return lambda rows: kept[name].append(_Record(rows.t_ns, rows.q, rows.q_des, rows.tau))
+
+    diverged_s = run_in_batches(scenario, {name: keep(name) for name in kept}).diverged_at_s
+    records = [_Record(*map(np.concatenate, zip(*rows, strict=True))) for rows in kept.values()]
+    t_s, q, e = _aligned(records)
     mean = q.mean(axis=0)
     apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
     largest = np.abs(e).max(axis=(0, 2))
-    efforts, saturated = zip(*map(_effort, records.values()), strict=True)
+    efforts, saturated = zip(*map(_effort, records, scenario.sites.values()), strict=True)
     return _Run(
         trend=fit_envelope(t_s, largest).trend,
         ending=_ending(t_s, apart, off, e),
@@ -134,26 +115,22 @@ def _run(scenario: Scenario) -> _Run:
 
 def _aligned(records: list[_Record]) -> tuple[Array, Array, Array]:
     """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape (N, K, n)."""
-    times = [record.t_ns for record in records]
-    end_ns = min(t_ns[-1] for t_ns in times)
-    slowest = min(times, key=len)
+    end_ns = min(record.t_ns[-1] for record in records)
+    slowest = min((record.t_ns for record in records), key=len)
     at_ns = slowest[slowest <= end_ns]
-    latest = [
-        record.rows[:2, np.searchsorted(t_ns, at_ns, side="right") - 1]
-        for record, t_ns in zip(records, times, strict=True)
-    ]
-    q, q_des = np.array(latest).transpose(1, 0, 2, 3)
+    latest = [np.searchsorted(record.t_ns, at_ns, side="right") - 1 for record in records]
+    q = np.array([record.q[rows] for record, rows in zip(records, latest, strict=True)])
+    q_des = np.array([record.q_des[rows] for record, rows in zip(records, latest, strict=True)])
     return at_ns / NS_PER_S, q, q - q_des
 
 
-def _effort(record: _Record) -> tuple[float, float]:
+def _effort(record: _Record, site: SiteSpec) -> tuple[float, float]:
     """Returns the mean square of tau - G(q), (N m)^2, and the share of torques at the clamp."""
-    q, _, tau = record.rows
-    arm = record.site.arm
-    inner, outer = arm.g_m_s2 * arm.theta[3:, np.newaxis] * np.cos(np.cumsum(q, axis=1).T)
+    arm = site.arm
+    inner, outer = arm.g_m_s2 * arm.theta[3:, np.newaxis] * np.cos(np.cumsum(record.q, axis=1).T)
     gravity = np.array([inner + outer, outer]).T
-    clamped = np.abs(tau) >= record.site.limits.tau_limit_nm
-    return float(np.mean((tau - gravity) ** 2)), float(np.mean(clamped))
+    clamped = np.abs(record.tau) >= site.limits.tau_limit_nm
+    return float(np.mean((record.tau - gravity) ** 2)), float(np.mean(clamped))
 
 
 def _rms(values: Array) -> float:
@@ -198,13 +175,7 @@ def measure_candidate_task(task: CandidateTask) -> CandidateScore:
 
 
 class TuningScenario(NamedTuple):
-    """The experiment in which laws are compared.
-
-    Attributes:
-        source: what a command calls it: a shipped name or a path.
-        overrides: what was changed of it, as texts KEY=VALUE.
-        scenario: it, with those.
-    """
+    """The experiment in which laws are compared; a command calls it by source and overrides KEY=VALUE."""
 
     source: str
     overrides: tuple[str, ...]
@@ -239,8 +210,7 @@ class TuningScenario(NamedTuple):
     @property
     def command(self) -> str:
         """The command that makes a log of it."""
-        words = [word for text in self.overrides for word in ("--set", text)]
-        return shlex.join(["trilat", "sim", self.source, *words])
+        return format_command("sim", self.source, *set_options(self.overrides))
 
 
 def load_tuning_scenario(source: str | Path, overrides: Sequence[str] = ()) -> TuningScenario:

@@ -41,11 +41,14 @@ def check_comparable(scenario: Scenario) -> None:
                 path=f"sites.{name}.plant",
                 source=scenario.name,
             )
-    for name, link in scenario.links.items():
-        if link.measured:
-            raise _measured_link_error(scenario, f"links.{name}")
     if scenario.measured:
-        raise _measured_link_error(scenario, "timeline")
+        links = (f"links.{name}" for name, link in scenario.links.items() if link.measured)
+        raise ScenarioError(
+            "is measured: the network would decide, differently for every law; give it a model, as in "
+            "--set link.model=constant --set link.delay_ms=200",
+            path=next(links, "timeline"),
+            source=scenario.name,
+        )
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
         words = " and ".join(", ".join(scenario.names[site] for site in group) for group in groups)
@@ -55,15 +58,6 @@ def check_comparable(scenario: Scenario) -> None:
             source=scenario.name,
         )
     _refuse_conflict(scenario)
-
-
-def _measured_link_error(scenario: Scenario, path: str) -> ScenarioError:
-    return ScenarioError(
-        "is measured: the network would decide, differently for every law; give it a model, as in "
-        "--set link.model=constant --set link.delay_ms=200",
-        path=path,
-        source=scenario.name,
-    )
 
 
 def _refuse_conflict(scenario: Scenario) -> None:

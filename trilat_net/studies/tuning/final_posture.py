@@ -9,7 +9,6 @@ could explain it.
 """
 
 import math
-from collections.abc import Iterable
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -105,32 +104,23 @@ def check_final_posture(log: Log) -> list[str]:
     diverged = [s for s in log.sites if len(log[s]) and log[s].record(-1).mode == "diverged"]
     if diverged:
         return [f"{', '.join(diverged)} diverged: its figures end there"]
-    ends = {site: _end_rad(log, site) for site in log.sites if len(log[site])}
-    return [*_warn_truncated(log, ends), *_warn_hanging(log, ends)]
-
-
-def _warn_truncated(log: Log, sites: Iterable[str]) -> list[str]:
-    """Says so where a log is shorter than its experiment."""
-    last_s = min((float(log[site].t_s[-1]) for site in sites), default=0.0)
+    parts = {site: log[site] for site in log.sites if len(log[site])}
+    ends = {site: part.q[part.t_s > part.t_s[-1] - END_WINDOW_S].mean(axis=0) for site, part in parts.items()}
+    warnings = []
+    last_s = min((float(part.t_s[-1]) for part in parts.values()), default=0.0)
     wanted_s = log.scenario.duration_s
-    if last_s > wanted_s - _SHORT_S:
-        return []
-    return [f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run"]
-
-
-def _warn_hanging(log: Log, ends: dict[str, Array]) -> list[str]:
-    """Warns if arms hang, or are where no operator can have pushed them."""
-    hanging = [site for site, q in ends.items() if _down(q) and not _down(log[site].q[0])]
-    if hanging:
-        return [
-            f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'} at the end: small errors and "
-            "torques of arms that hang say nothing of a law"
-        ]
-    return _warn_fallen(log, ends)
+    if last_s <= wanted_s - _SHORT_S:
+        warnings.append(f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run")
+    hanging = [site for site, q in ends.items() if _points_down(q) and not _points_down(log[site].q[0])]
+    if not hanging:
+        return [*warnings, *_warn_fallen(log, ends)]
+    verb = "hangs" if len(hanging) == 1 else "hang"
+    why = "small errors and torques of arms that hang say nothing of a law"
+    return [*warnings, f"{', '.join(hanging)} {verb} at the end: {why}"]
 
 
 def _warn_fallen(log: Log, ends: dict[str, Array]) -> list[str]:
-    """Says so where the mean pose left the consensus, and no hand or wall can be the cause."""
+    """Warns if the mean pose left the consensus, and no operator or environment can be the cause."""
     scenario = log.scenario
     try:
         check_comparable(scenario)
@@ -149,13 +139,5 @@ def _warn_fallen(log: Log, ends: dict[str, Array]) -> list[str]:
     ]
 
 
-def _end_rad(log: Log, site: str) -> Array:
-    """Returns a site's mean angles of the last second, shape (n,), rad."""
-    part = log[site]
-    mean: Array = part.q[part.t_s > part.t_s[-1] - END_WINDOW_S].mean(axis=0)
-    return mean
-
-
-def _down(q: Array) -> bool:
-    """True where both links point straight down."""
+def _points_down(q: Array) -> bool:
     return all(abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q))

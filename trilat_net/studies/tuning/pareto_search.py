@@ -90,17 +90,10 @@ CandidateGains = dict[str, float]
 class CandidateSearch:
     """One law's search.
 
-    Args:
-        space: where.
-        budget: how many candidates in all, at least 1.
-        seed: what chance is a function of.
-        objective: what is weighed against effort.
-
     Attributes:
-        space: where.
-        tried: what was tried, in order.
-        scores: what came of it, in the same order.
-        rounds: how many candidates each round has.
+        tried: the gains that were tried, in order.
+        scores: what came of them, in the same order.
+        rounds: how many candidates each round has; the budget in all.
     """
 
     def __init__(self, space: SearchSpace, budget: int, seed: int, objective: Objective) -> None:
@@ -116,8 +109,15 @@ class CandidateSearch:
 
     def ask(self, number: int) -> list[CandidateGains]:
         """Returns the candidates of a round; `tell` has taken all earlier ones."""
-        count = self.rounds[number]
-        places = self._hypercube(count) if number == 0 else self._refined(count, REFINEMENT_STEPS[number - 1])
+        shape = self.rounds[number], len(self.space.knobs)
+        if number == 0:
+            from scipy.stats import qmc  # takes half a second, which most commands can do without
+
+            places = qmc.LatinHypercube(shape[1], rng=self._rng).random(shape[0])
+        else:
+            parents = self._parents(shape[0])
+            moved = parents + REFINEMENT_STEPS[number - 1] * self._rng.standard_normal(shape)
+            places = np.clip(moved, 0.0, 1.0)
         return [self._gains(place) for place in places]
 
     def tell(self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]) -> None:
@@ -125,20 +125,8 @@ class CandidateSearch:
         self.tried += gains
         self.scores += scores
 
-    def _hypercube(self, count: int) -> Array:
-        from scipy.stats import qmc  # takes half a second, which most commands can do without
-
-        points: Array = qmc.LatinHypercube(len(self.space.knobs), rng=self._rng).random(count)
-        return points
-
-    def _refined(self, count: int, step: float) -> Array:
-        """Returns points near the parents, shape (count, knobs), within the ranges."""
-        parents = self._parents(count).reshape(count, len(self.space.knobs))
-        moved: Array = np.clip(parents + step * self._rng.standard_normal(parents.shape), 0.0, 1.0)
-        return moved
-
     def _parents(self, count: int) -> Array:
-        """Returns what to refine: every other time the best, else the loneliest points of the front.
+        """Returns places to refine: every other time the best, else the loneliest points of the front.
 
         Where nothing settled yet, those that erred least without diverging; where all diverged, anything.
         """
@@ -153,7 +141,9 @@ class CandidateSearch:
             by_space = sorted(range(len(errors)), key=errors.__getitem__)
             by_space, best = by_space[: max(1, count // 4)], by_space[0]
         chosen = [best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)]
-        parents: Array = np.array([self._place(self.tried[n]) for n in chosen])
+        tried = [[self.tried[n][knob.name] for knob in self.space.knobs] for n in chosen]
+        logs = np.log(np.reshape(tried, (count, len(self.space.knobs))))
+        parents: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
         return parents
 
     def _gains(self, place: Array) -> CandidateGains:
@@ -162,8 +152,3 @@ class CandidateSearch:
             knob.name: min(max(float(f"{np.exp(log):.{GAIN_DIGITS}g}"), knob.low), knob.high)
             for knob, log in zip(self.space.knobs, logs, strict=True)
         }
-
-    def _place(self, gains: CandidateGains) -> Array:
-        logs = np.log([gains[knob.name] for knob in self.space.knobs])
-        place: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
-        return place

@@ -22,11 +22,7 @@ MIN_BOX = 0.1
 
 
 class ModelInformation(NamedTuple):
-    """Model information that every law gets.
-
-    Attributes:
-        gravity: the given gravity parameters as a share of the true ones; 1: exactly.
-    """
+    """Model information that every law gets: gravity parameters as a share of the true ones."""
 
     gravity: float = 1.0
 
@@ -41,19 +37,16 @@ class ModelInformation(NamedTuple):
         theta[: GRAVITY_PARAMETERS.start] = 0.0
         return [float(f"{value:.12g}") for value in theta]
 
-    def low(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the lower sides of the box, shape (5,)."""
-        return self._side(scenario, site, -1.0)
-
-    def high(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the upper sides of the box, shape (5,)."""
-        return self._side(scenario, site, 1.0)
-
-    def _side(self, scenario: Scenario, site: str, sign: float) -> list[float]:
+    def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
+        """Returns the lower and the upper sides of the box, shape (5,) each."""
+        unknown = GRAVITY_PARAMETERS.start
         gravity = self.prior(scenario, site)[GRAVITY_PARAMETERS]
-        return [sign * MAX_QUANTITY] * GRAVITY_PARAMETERS.start + [
-            float(f"{value * (1.0 + sign * self.box):.12g}") for value in gravity
-        ]
+        low, high = (
+            [sign * MAX_QUANTITY] * unknown
+            + [float(f"{value * (1.0 + sign * self.box):.12g}") for value in gravity]
+            for sign in (-1.0, 1.0)
+        )
+        return low, high
 
     @property
     def text(self) -> str:
@@ -79,15 +72,7 @@ SiteControls = dict[str, dict[str, Any]]
 
 
 class GainRange(NamedTuple):
-    """One gain that is searched.
-
-    Attributes:
-        name: what it is called.
-        unit: its unit, or "".
-        low: the least that is tried.
-        high: the most.
-        where: which sites have it; "" for all.
-    """
+    """One gain that is searched, from low to high; `where`: which sites have it, "" for all."""
 
     name: str
     unit: str
@@ -100,7 +85,6 @@ class SearchSpace(NamedTuple):
     """A law and where it is searched.
 
     Attributes:
-        law: what the law is called here.
         knobs: its gains.
         told: what it uses of the common model information, in words.
         controls: writes a choice of gains out as the control of every site.
@@ -120,26 +104,18 @@ def _adaptive(scenario: Scenario, knowledge: ModelInformation, gains: GainValues
 
 
 def _adaptive_box(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    return {
-        name: {
-            "law": "adaptive_box",
-            **gains,
-            "theta_hat0": knowledge.prior(scenario, name),
-            "theta_low": knowledge.low(scenario, name),
-            "theta_high": knowledge.high(scenario, name),
-        }
-        for name in scenario.names
-    }
+    controls = _adaptive(scenario, knowledge, gains)
+    for name, table in controls.items():
+        table["law"] = "adaptive_box"
+        table["theta_low"], table["theta_high"] = knowledge.box_sides(scenario, name)
+    return controls
 
 
 def _known(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    controls = {}
-    for name in scenario.names:
-        theta = knowledge.prior(scenario, name)
-        theta[: GRAVITY_PARAMETERS.start] = [
-            float(value) for value in scenario.sites[name].arm.theta[: GRAVITY_PARAMETERS.start]
-        ]
-        controls[name] = {"law": "adaptive", **gains, "Gamma": 0.0, "theta_hat0": theta}
+    inertia = slice(0, GRAVITY_PARAMETERS.start)
+    controls = _adaptive(scenario, knowledge, {**gains, "Gamma": 0.0})
+    for name, table in controls.items():
+        table["theta_hat0"][inertia] = scenario.sites[name].arm.theta[inertia].tolist()
     return controls
 
 
@@ -209,16 +185,13 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
         ScenarioError: the scenario has not the sites that it needs.
     """
     names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
+    tuned = f"; tuned are {', '.join(SEARCH_SPACES)}"
     for name in names:
         if ":" in name or name == "own":
-            raise UsageError(
-                f"--law {name}: a law of your own has no search ranges; tuned are {', '.join(SEARCH_SPACES)}"
-            )
+            raise UsageError(f"--law {name}: a law of your own has no search ranges{tuned}")
         if name not in SEARCH_SPACES:
-            raise UsageError(
-                f"--law: there is no law {name!r} to tune{suggest_nearest(name, list(SEARCH_SPACES))}; "
-                f"tuned are {', '.join(SEARCH_SPACES)}"
-            )
+            hint = suggest_nearest(name, list(SEARCH_SPACES))
+            raise UsageError(f"--law: there is no law {name!r} to tune{hint}{tuned}")
     roles = sorted(spec.role for spec in scenario.sites.values())
     if "p_f" in names and roles != ["master", "slave"]:
         raise ScenarioError(

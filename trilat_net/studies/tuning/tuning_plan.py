@@ -20,6 +20,7 @@ from .final_posture import CandidateClass
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
 from .search_space import (
     PAPER_GAINS,
+    SEARCH_SPACES,
     ModelInformation,
     SearchSpace,
     build_model_information,
@@ -34,13 +35,7 @@ MAX_TICKS = 10_000_000
 
 
 class PaperGainsResult(NamedTuple):
-    """The gains that the paper prints, measured.
-
-    Attributes:
-        name: what they are called.
-        candidate: the experiment with them.
-        score: what came of it.
-    """
+    """The gains that the paper prints, measured."""
 
     name: str
     candidate: TuningScenario
@@ -51,7 +46,6 @@ class SearchResult(NamedTuple):
     """What the search of one law found.
 
     Attributes:
-        space: the law, and where it was searched.
         tried: every candidate's gains, in order.
         scores: what came of them.
         front: places of the candidates that none of the same law dominates, by rising effort.
@@ -69,16 +63,7 @@ class SearchResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison that was asked for and can be run.
-
-    Attributes:
-        base: the experiment.
-        spaces: the laws.
-        budget: candidates per law.
-        seed: of the search.
-        objective: what is weighed against effort.
-        knowledge: the model information that every law gets.
-    """
+    """A comparison that can be run: `budget` candidates per law, `seed` of the search."""
 
     base: TuningScenario
     spaces: list[SearchSpace]
@@ -104,15 +89,10 @@ class TuningPlan(NamedTuple):
 
     def printed(self) -> dict[str, TuningScenario]:
         """Returns the gains that the paper prints, by name, with the common information and without."""
-        names = self.base.scenario.names
-        table = {"law": "adaptive", **PAPER_GAINS}
-        prior = {name: self.knowledge.prior(self.base.scenario, name) for name in names}
-        return {
-            "as printed": self.base.with_controls({n: {**table, "theta_hat0": prior[n]} for n in names}),
-            "as printed, told nothing": self.base.with_controls(
-                {n: {**table, "theta_hat0": 0.0} for n in names}
-            ),
-        }
+        told = SEARCH_SPACES["adaptive"].controls(self.base.scenario, self.knowledge, PAPER_GAINS)
+        untold = {name: {**table, "theta_hat0": 0.0} for name, table in told.items()}
+        controls = {"as printed": told, "as printed, told nothing": untold}
+        return {name: self.base.with_controls(tables) for name, tables in controls.items()}
 
     def estimate_s(self, jobs: int | None = None) -> float:
         """Returns about how long the search will take, s: by a short run of the experiment."""
@@ -127,13 +107,8 @@ class TuningPlan(NamedTuple):
         began_ns = clock.monotonic_ns()
         made = 1 + sum(1 for _ in zip(range(few), steps, strict=False))
         per_tick_s = (clock.monotonic_ns() - began_ns) * 1e-9 / made
-        return (
-            _MEASURING_FACTOR
-            * per_tick_s
-            * ticks
-            * self.runs
-            / min(jobs or count_cores(), len(self.spaces) * self.budget)
-        )
+        processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
+        return _MEASURING_FACTOR * per_tick_s * ticks * self.runs / processes
 
     def run(
         self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
@@ -168,15 +143,12 @@ class TuningPlan(NamedTuple):
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores
-        return TuningResult(
-            self,
-            [self._found(search) for search in searches],
-            [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)],
-        )
-
-    def _found(self, search: CandidateSearch) -> SearchResult:
-        points = [self.objective.point(score) for score in search.scores]
-        return SearchResult(search.space, search.tried, search.scores, find_pareto_front(points))
+        found = []
+        for search in searches:
+            front = find_pareto_front([self.objective.point(score) for score in search.scores])
+            found.append(SearchResult(search.space, search.tried, search.scores, front))
+        paper = [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)]
+        return TuningResult(self, found, paper)
 
 
 _EDGE = 1.02
@@ -187,13 +159,7 @@ _MEASURING_FACTOR = 1.3
 
 
 class TuningResult(NamedTuple):
-    """A comparison that was run.
-
-    Attributes:
-        plan: what was asked.
-        found: per law what was found, in the order in which they were asked for.
-        printed: the gains that the paper prints.
-    """
+    """A comparison that was run; laws in the order in which they were asked for."""
 
     plan: TuningPlan
     found: list[SearchResult]
@@ -262,11 +228,9 @@ def plan_tuning(
     spaces = select_search_spaces(laws, scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
-        raise ScenarioError(
-            f"a candidate would take {ticks} ticks, at most {MAX_TICKS} are given: shorten it with "
-            "--duration",
-            path="duration_s",
-            source=str(source),
+        problem = (
+            f"a candidate would take {ticks} ticks, at most {MAX_TICKS} are given: shorten it with --duration"
         )
+        raise ScenarioError(problem, path="duration_s", source=str(source))
     check_comparable(scenario)
     return TuningPlan(found, spaces, budget, seed, Objective(objective), knowledge)

@@ -1,25 +1,37 @@
-"""A comparison as tables, as a Markdown page and as plain values for JSON.
+"""A comparison as tables, as a Markdown page, as JSON, and as a figure of error against effort.
 
-Invariant: a function of the result alone, without a clock: equal plans give equal bytes. Heads carry the
-unit, and every run is counted in some column.
+Files: front.json, front.md, front.png, front.pdf.
+
+Invariant: a function of the result alone, without a clock: equal plans give equal bytes; the JSON is the
+result, the others are views of it. Heads carry the unit, and every run is counted in some column. Every
+settled run is drawn, on a front or not; the gains that the paper prints are stars and stand on no front.
 """
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from ...files import write_whole
+from ...reporting import style
 from ...reporting.text_table import TextTable
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
-from .pareto_search import REFINEMENT_STEPS, Objective
+from .pareto_search import REFINEMENT_STEPS, Objective, ObjectivePoint
+from .search_space import SEARCH_SPACES
 from .tuning_plan import MAX_BUDGET, SearchResult, TuningPlan, TuningResult
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
     """Returns a row per law: what became of its candidates, and the two ends of its front."""
-    value = _head(tuned.plan.objective)
+    value = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
     heads = ("law", "tried", *(outcome.value for outcome in reversed(CandidateClass)), "front", "of all")
     return TextTable(
         (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}"),
@@ -87,14 +99,7 @@ def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     return TextTable(("law", "outcome", *_SCORE_HEADS), rows, align="llr")
 
 
-_SCORE_HEADS = (
-    "error rad",
-    "spread rad",
-    "pose rad",
-    "effort N m",
-    "settled s",
-    "clamped %",
-)
+_SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s", "clamped %")
 
 
 def _score_cells(score: CandidateScore) -> tuple[str, ...]:
@@ -142,25 +147,16 @@ def build_tuning_page(tuned: TuningResult) -> str:
         "A * marks what no candidate of any law dominates.",
     ]
     for found in tuned.found:
-        parts += [f"### {found.space.law}", *_front_parts(tuned, found)]
+        commands = [tuned.candidate(found, place).command for place in found.front]
+        front = [tabulate_front(tuned, found).markdown(), _block(commands)]
+        parts += [f"### {found.space.law}", *(front if found.front else ["None of its candidates settled."])]
     parts += ["## As printed", tabulate_paper_gains(tuned).markdown()]
     parts += [_block([one.candidate.command for one in tuned.printed])]
     return "\n\n".join(parts) + "\n"
 
 
-def _front_parts(tuned: TuningResult, found: SearchResult) -> list[str]:
-    if not found.front:
-        return ["None of its candidates settled."]
-    commands = [tuned.candidate(found, place).command for place in found.front]
-    return [tabulate_front(tuned, found).markdown(), _block(commands)]
-
-
 def _block(lines: Sequence[str]) -> str:
     return "\n".join(["```", *lines, "```"])
-
-
-def _head(objective: Objective) -> str:
-    return "error rad" if objective is Objective.ERROR else "settling s"
 
 
 def _number(value: float | None) -> str:
@@ -200,7 +196,8 @@ def tuning_to_json(tuned: TuningResult) -> TuningJson:
         },
         "laws": {found.space.law: _law(tuned, found) for found in tuned.found},
         "as_printed": [
-            {"name": one.name, **_score(one.score), "command": one.candidate.command} for one in tuned.printed
+            {"name": one.name, **msgspec.to_builtins(one.score), "command": one.candidate.command}
+            for one in tuned.printed
         ],
     }
 
@@ -215,17 +212,94 @@ def _law(tuned: TuningResult, found: SearchResult) -> TuningJson:
             {
                 "candidate": place,
                 "gains": found.tried[place],
-                **_score(found.scores[place]),
+                **msgspec.to_builtins(found.scores[place]),
                 "on_the_front_of_all": place in shared,
                 "command": tuned.candidate(found, place).command,
             }
             for place in found.front
         ],
         "candidates": [
-            {"gains": gains, **_score(score)} for gains, score in zip(found.tried, found.scores, strict=True)
+            {"gains": gains, **msgspec.to_builtins(score)}
+            for gains, score in zip(found.tried, found.scores, strict=True)
         ],
     }
 
 
-def _score(score: CandidateScore) -> TuningJson:
-    return dict(msgspec.to_builtins(score))
+FRONT_WIDTH_IN = 3.5
+"""One column of a page of two."""
+_HEIGHT_IN = 3.1
+_SIZE_PT = 8.0
+_MARKS = ("o", "s", "^", "D", "v", "P")
+_LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s)"}
+
+
+def draw_front(tuned: TuningResult) -> Figure:
+    """Returns the fronts of all laws in one panel, both axes logarithmic."""
+    with style.figure_style():
+        figure = style.new_figure(_HEIGHT_IN, FRONT_WIDTH_IN)
+        axes = figure.add_subplot()
+        drawn = [_draw_law(axes, tuned, found) for found in tuned.found]
+        stars = _draw_printed(axes, tuned)
+        axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
+        axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
+        axes.tick_params(labelsize=_SIZE_PT)
+        shown = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
+        if not shown:
+            style.annotate_empty_panel(axes, "no candidate settled")
+        elif min(shown) > 0.0:
+            axes.set(xscale="log", yscale="log")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
+                axis.set_minor_locator(NullLocator())
+        look: dict[str, Any] = {"labelspacing": 0.3, "columnspacing": 0.8, "handlelength": 1.2}
+        handles = [*drawn, *stars]
+        figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look)
+    return figure
+
+
+def _draw_law(axes: Axes, tuned: TuningResult, found: SearchResult) -> Line2D:
+    """Draws a law's settled runs faintly and its front on top; returns its entry of the legend."""
+    place = list(SEARCH_SPACES).index(found.space.law)
+    colour, mark = style.SITE_COLOURS[place % len(style.SITE_COLOURS)], _MARKS[place % len(_MARKS)]
+    settled = _points(tuned, found, range(len(found.scores)))
+    front = _points(tuned, found, found.front)
+    faint: dict[str, Any] = {"linestyle": "", "markersize": 2.0, "alpha": 0.3, "markeredgewidth": 0.0}
+    plain: dict[str, Any] = {"marker": mark, "markersize": 3.5, "linewidth": 1.1, "color": colour}
+    axes.plot([x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint)
+    axes.step([x for _, x in front], [y for y, _ in front], where="post", **plain)
+    count = found.outcomes[CandidateClass.SETTLED]
+    return Line2D([], [], label=f"{found.space.law} ({count}/{len(found.scores)})", **plain)
+
+
+def _points(tuned: TuningResult, found: SearchResult, places: Sequence[int]) -> list[ObjectivePoint]:
+    points = [tuned.plan.objective.point(found.scores[place]) for place in places]
+    return [point for point in points if point is not None]
+
+
+def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
+    """Draws the gains of the paper as stars; returns their entries of the legend."""
+    entries = []
+    for one, fill in zip(tuned.printed, ("full", "none"), strict=True):
+        point = tuned.plan.objective.point(one.score)
+        look: dict[str, Any] = {"linestyle": "", "marker": "*", "markersize": 7.0, "fillstyle": fill}
+        look["color"] = style.REFERENCE
+        if point is not None:
+            axes.plot([point[1]], [point[0]], **look)
+        outcome = one.score.outcome
+        reason = "never" if outcome is CandidateClass.SETTLED else outcome.value
+        label = one.name if point is not None else f"{one.name} ({reason})"
+        entries.append(Line2D([], [], label=label, **look))
+    return entries
+
+
+def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
+    """Writes a comparison into a folder that exists, and returns the paths."""
+    data, text = folder / "front.json", folder / "front.md"
+    write_whole(data, json.dumps(tuning_to_json(tuned), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_whole(text, build_tuning_page(tuned))
+    figure = draw_front(tuned)
+    pictures = [folder / "front.png", folder / "front.pdf"]
+    for path in pictures:
+        figure.savefig(path, dpi=style.REPORT_DPI)
+    return [data, text, *pictures]

@@ -1,0 +1,116 @@
+"""A run in virtual time as batches of records, site by site.
+
+Invariant: batches of a site follow each other without a gap, however long the run is; what takes them keeps
+what it needs, so that the memory of a run is its taker's.
+"""
+
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .. import process
+from ..core.site_step import Site
+from ..core.ticks import NS_PER_S, Mode, TickRecord
+from ..core.two_link_arm import JOINTS
+from ..core.vectors import Array
+from ..execution import virtual
+from ..log.record_columns import Ints
+from ..scenario import Scenario
+
+BATCH_RECORDS = 1000
+"""Records of a site that are collected before they are passed on."""
+
+
+class RecordBatch(NamedTuple):
+    """Some records of one site, one after the other.
+
+    Attributes:
+        t_ns: nominal time, shape (K,), ns.
+        q: joint angles, shape (K, 2), rad.
+        qd: joint velocities, shape (K, 2), rad/s.
+        q_des: reference, Eq. (6), shape (K, 2), rad.
+        tau: control torque, shape (K, 2), N m.
+        tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
+        used: tick of the sample in use, -1 before the first, shape (K, P).
+    """
+
+    t_ns: Ints
+    q: Array
+    qd: Array
+    q_des: Array
+    tau: Array
+    tau_x: Array
+    used: Ints
+
+    def since(self, t_ns: int) -> "RecordBatch":
+        """Returns the records that are later than a time."""
+        return self._part(int(np.searchsorted(self.t_ns, t_ns, side="right")), None)
+
+    def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
+        """Returns the records from one time to another, which is no longer of them."""
+        return self._part(*np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist())
+
+    def _part(self, first: int, last: int | None) -> "RecordBatch":
+        return RecordBatch._make(column[first:last] for column in self)
+
+
+def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
+    """Returns blocks that follow each other as one."""
+    return RecordBatch._make(map(np.concatenate, zip(*blocks, strict=True)))
+
+
+class BatchedRun(NamedTuple):
+    """A run that was passed on: when its first site left its limits, s, or None; samples that came late."""
+
+    diverged_at_s: float | None
+    late_samples: int
+
+
+class _PendingRecords:
+    """Records of one site that were not passed on yet."""
+
+    def __init__(self, take: Callable[[RecordBatch], None]) -> None:
+        self._take = take
+        self._t_ns, self._used, self._floats = array("q"), array("q"), array("d")
+
+    def add(self, output: TickRecord) -> None:
+        """Takes one record."""
+        self._t_ns.append(output.t_ns)
+        self._used.extend(output.used)
+        floats = self._floats
+        floats.extend(output.q)
+        floats.extend(output.qd)
+        floats.extend(output.q_des)
+        floats.extend(output.tau)
+        floats.extend(output.tau_x)
+        if len(self._t_ns) >= BATCH_RECORDS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Passes the pending records on."""
+        if not self._t_ns:
+            return
+        t_ns = np.array(self._t_ns, dtype=np.int64)
+        used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), -1)
+        vectors = np.array(self._floats).reshape(len(t_ns), 5, JOINTS).transpose(1, 0, 2)
+        self._take(RecordBatch._make((t_ns, *vectors, used)))
+        for column in (self._t_ns, self._used, self._floats):
+            del column[:]
+
+
+def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]) -> BatchedRun:
+    """Runs a scenario in virtual time and passes every site's records on, batch by batch."""
+    pending = {name: _PendingRecords(taker) for name, taker in take.items()}
+    sites: dict[str, Site] = {}
+    diverged_at_s: float | None = None
+    with process.pause_gc():
+        for site, _, output in virtual.execute_virtual(scenario):
+            sites[site.name] = site
+            pending[site.name].add(output)
+            if output.mode is Mode.DIVERGED and diverged_at_s is None:
+                diverged_at_s = output.t_ns / NS_PER_S
+    for records in pending.values():
+        records.flush()
+    return BatchedRun(diverged_at_s, sum(count.late for site in sites.values() for count in site.counts()))
