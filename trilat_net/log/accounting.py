@@ -66,10 +66,6 @@ class RangeSet:
             return None
         return max(number, self._firsts[place]), self._lasts[place]
 
-    def longest(self) -> int:
-        """Returns how many numbers the longest range has."""
-        return max((last - first + 1 for first, last in self), default=0)
-
     def _drop_lowest(self) -> None:
         if len(self._firsts) > self._most:
             del self._firsts[0], self._lasts[0]
@@ -92,19 +88,6 @@ class Account:
         last: largest number that is known to exist, -1 before the first.
         silence_ns: the longest time between two that came, ns; 0 if they are not stamped.
     """
-
-    __slots__ = (
-        "_came_ns",
-        "_gaps",
-        "_lost_below",
-        "_newest",
-        "duplicate",
-        "last",
-        "received",
-        "refilled",
-        "reordered",
-        "silence_ns",
-    )
 
     def __init__(self) -> None:
         self.received = self.duplicate = self.reordered = self.refilled = 0
@@ -164,7 +147,7 @@ class Account:
     @property
     def missing(self) -> int:
         """Number of missing messages."""
-        return self.last + 1 - self.received
+        return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
@@ -174,7 +157,7 @@ class Account:
     @property
     def largest_gap(self) -> int:
         """Number of messages that the largest gap has."""
-        return self._gaps.longest()
+        return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def as_text(self) -> str:
         """Returns the account in one line, for the file and for people."""

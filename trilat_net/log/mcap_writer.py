@@ -9,6 +9,7 @@ channels, and takes three times as long. The tests read this writer's files with
 
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
@@ -23,6 +24,11 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<BQQQI")
 _STATISTICS = struct.Struct("<QHIIIIQQ")
+_SUMMARY = (
+    *(Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS),
+    *(Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX),
+)
+"""Records of the end of a file, in their order."""
 _COMPRESSION = "zstd"
 _OWED_ALWAYS = 512  # statistics without its counts, offsets of six groups, data end, footer, end mark
 
@@ -88,11 +94,8 @@ class McapWriter:
         self._closed = 0  # messages in chunks that are closed
         self._counts: dict[int, int] = {}
         self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
-        self._schemas, self._channels = bytearray(), bytearray()
-        self._schema_count = 0
-        self._chunk_index, self._chunk_count = bytearray(), 0
-        self._attachment_index, self._attachment_count = bytearray(), 0
-        self._metadata_index, self._metadata_count = bytearray(), 0
+        self._summary = {opcode: bytearray() for opcode in _SUMMARY}
+        self._records: Counter[Opcode] = Counter()  # in the summary, by kind
         self._put(MAGIC + pack_record(Opcode.HEADER, pack_text(profile) + pack_text(library)))
 
     def _put(self, data: bytes) -> int:
@@ -102,12 +105,17 @@ class McapWriter:
         self.position += len(data)
         return offset
 
+    def _add_to_summary(self, opcode: Opcode, body: bytes) -> bytes:
+        """Keeps a record for the end of the file, and returns it."""
+        record = pack_record(opcode, body)
+        self._summary[opcode] += record
+        self._records[opcode] += 1
+        return record
+
     @property
     def owed(self) -> int:
         """Most bytes that `finish` will write besides the open chunk."""
-        indexes = self._chunk_index, self._attachment_index, self._metadata_index
-        definitions = len(self._schemas) + len(self._channels)
-        return definitions + sum(map(len, indexes)) + 10 * len(self._counts) + _OWED_ALWAYS
+        return sum(map(len, self._summary.values())) + 10 * len(self._counts) + _OWED_ALWAYS
 
     @property
     def pending(self) -> int:
@@ -125,12 +133,10 @@ class McapWriter:
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Writes a schema and returns its number."""
-        self._schema_count += 1
-        body = struct.pack("<H", self._schema_count) + pack_text(name) + pack_text(encoding)
-        record = pack_record(Opcode.SCHEMA, body + struct.pack("<I", len(data)) + data)
-        self._schemas += record
-        self._put(record)
-        return self._schema_count
+        number = self._records[Opcode.SCHEMA] + 1
+        body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
+        self._put(self._add_to_summary(Opcode.SCHEMA, body + struct.pack("<I", len(data)) + data))
+        return number
 
     def register_channel(
         self, topic: str, message_encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
@@ -138,9 +144,7 @@ class McapWriter:
         """Writes a channel and returns its number; it precedes the open chunk. Schema 0 stands for none."""
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id) + pack_text(topic) + pack_text(message_encoding)
-        record = pack_record(Opcode.CHANNEL, body + pack_text_map(metadata or {}))
-        self._channels += record
-        self._put(record)
+        self._put(self._add_to_summary(Opcode.CHANNEL, body + pack_text_map(metadata or {})))
         self._counts[number] = 0
         self._entries[number] = []
         return number
@@ -162,8 +166,7 @@ class McapWriter:
         """Writes a metadata record, before the open chunk."""
         record = pack_record(Opcode.METADATA, pack_text(name) + pack_text_map(data))
         index = struct.pack("<QQ", self._put(record), len(record)) + pack_text(name)
-        self._metadata_index += pack_record(Opcode.METADATA_INDEX, index)
-        self._metadata_count += 1
+        self._add_to_summary(Opcode.METADATA_INDEX, index)
 
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
@@ -175,8 +178,7 @@ class McapWriter:
         record = pack_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
         place = struct.pack("<QQ", self._put(record), len(record))
         index = place + times + struct.pack("<Q", len(data)) + names
-        self._attachment_index += pack_record(Opcode.ATTACHMENT_INDEX, index)
-        self._attachment_count += 1
+        self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
 
     def flush(self) -> None:
         """Closes the open chunk, if it has messages, and flushes the stream."""
@@ -205,45 +207,27 @@ class McapWriter:
         sizes = struct.pack("<QQ", len(data), raw)
         index = times + struct.pack("<I", len(places)) + places
         index += struct.pack("<Q", self.position - begin) + pack_text(_COMPRESSION) + sizes
-        self._chunk_index += pack_record(Opcode.CHUNK_INDEX, index)
-        self._chunk_count += 1
+        self._add_to_summary(Opcode.CHUNK_INDEX, index)
         first_ns, last_ns = self._span_ns or (start_ns, end_ns)
         self._span_ns = min(first_ns, start_ns), max(last_ns, end_ns)
         self._closed = self.messages
         self._open.clear()
-
-    def _statistics(self) -> bytes:
-        head = _STATISTICS.pack(
-            self.messages,
-            self._schema_count,
-            len(self._counts),
-            self._attachment_count,
-            self._metadata_count,
-            self._chunk_count,
-            *(self._span_ns or (0, 0)),
-        )
-        counts = b"".join(struct.pack("<HQ", n, count) for n, count in self._counts.items() if count)
-        return pack_record(Opcode.STATISTICS, head + struct.pack("<I", len(counts)) + counts)
 
     def finish(self) -> None:
         """Closes the open chunk, writes the index and the end mark, and flushes the stream."""
         if self._open:
             self._close_chunk()
         self._put(pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
-        summary = {
-            Opcode.SCHEMA: self._schemas,
-            Opcode.CHANNEL: self._channels,
-            Opcode.STATISTICS: self._statistics(),
-            Opcode.CHUNK_INDEX: self._chunk_index,
-            Opcode.ATTACHMENT_INDEX: self._attachment_index,
-            Opcode.METADATA_INDEX: self._metadata_index,
-        }
+        kinds = (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX, Opcode.CHUNK_INDEX)
+        numbers = len(self._counts), *(self._records[kind] for kind in kinds), *(self._span_ns or (0, 0))
+        head = _STATISTICS.pack(self.messages, self._records[Opcode.SCHEMA], *numbers)
+        counts = b"".join(struct.pack("<HQ", n, count) for n, count in self._counts.items() if count)
+        self._add_to_summary(Opcode.STATISTICS, head + struct.pack("<I", len(counts)) + counts)
         begin, offsets, crc = self.position, b"", 0
-        for opcode, group in summary.items():
+        for opcode, group in self._summary.items():
             if group:
-                data = bytes(group)
-                place = self._put(data)
-                crc = zlib.crc32(data, crc)
+                place = self._put(bytes(group))
+                crc = zlib.crc32(group, crc)
                 offsets += pack_record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, place, len(group)))
         where = self._put(offsets)
         footer = _FOOTER.pack(Opcode.FOOTER, 20, begin, where, 0)[:-4]
