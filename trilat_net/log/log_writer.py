@@ -40,6 +40,9 @@ from .mcap_writer import McapWriter, Sink
 from .ros2 import cdr
 from .ros2.viz_channels import TakeMessage, VizChannels
 
+Decoded = State | TickRecord | LinkStats | Event | None
+"""A message as the channels for viewers take it; None where there are none."""
+
 
 class LogWriter:
     """One log, from its header to its last account.
@@ -74,9 +77,9 @@ class LogWriter:
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self._ended = ""  # why nothing more can be added
-        self._views = (
-            VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view) if views_hz else None
-        )
+        self._views = None
+        if views_hz:
+            self._views = VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view)
         self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
         self._standard: dict[str, int] = {}  # standard schemas and channels in the file
@@ -91,10 +94,9 @@ class LogWriter:
             "sites": " ".join(scenario.names),
             "epoch_unix_ns": str(epoch_unix_ns),
         }
+        about |= {**collect_provenance(), **choice.facts(), **(facts or {})}
         with self._refusing():
-            self._file.add_metadata(
-                SESSION, {**about, **collect_provenance(), **choice.facts(), **(facts or {})}
-            )
+            self._file.add_metadata(SESSION, about)
             if part:
                 self._file.add_metadata(PART, part)
             self._file.add_attachment(0, 0, SCENARIO, "application/toml", scenario.text.encode())
@@ -112,13 +114,13 @@ class LogWriter:
         channels: dict[str, int | None] = {}
         for member in (*scenario.names, topics.RECORDER):
             for name in SITE_CHANNELS if member != topics.RECORDER else RECORDER_CHANNELS:
-                key = topics.key(session, member, name)
-                rate = {"rate_hz": str(scenario.sites[member].rate_hz)} if name == topics.STATE else {}
-                channels[key] = None
-                if choice.takes(key):
-                    channels[key] = self._file.register_channel(
-                        f"/{key}", "msgpack", schemas[name], {"member": member, **rate}
-                    )
+                key, about = topics.key(session, member, name), {"member": member}
+                if name == topics.STATE:
+                    about["rate_hz"] = str(scenario.sites[member].rate_hz)
+                taken = choice.takes(key)
+                channels[key] = (
+                    self._file.register_channel(f"/{key}", "msgpack", schemas[name], about) if taken else None
+                )
         return channels
 
     @property
@@ -154,7 +156,7 @@ class LogWriter:
         t_ns: int,
         log_time_ns: int,
         number: int,
-        message: State | TickRecord | LinkStats | Event | None = None,
+        message: Decoded = None,
     ) -> None:
         """Writes one message, if the log takes its channel.
 
@@ -164,7 +166,7 @@ class LogWriter:
             t_ns: when it was sent, ns since the epoch.
             log_time_ns: when it arrived, Unix ns.
             number: its sequence number.
-            message: the decoded message, for the channels for viewers.
+            message: the same, decoded, for the channels for viewers.
 
         Raises:
             LogRefused: the disk refused, now (then this message is the last one) or before.
@@ -175,12 +177,9 @@ class LogWriter:
         if channel is None:
             return
         self._last_log_ns = log_time_ns
-        sent_ns = self._epoch_unix_ns + t_ns
-        with_number = number & 0xFFFFFFFF if number >= 0 else 0
+        sent_ns = min(max(0, self._epoch_unix_ns + t_ns), MAX_TIME_NS)
         try:
-            self._file.add_message(
-                channel, log_time_ns, payload, min(max(0, sent_ns), MAX_TIME_NS), with_number
-            )
+            self._file.add_message(channel, log_time_ns, payload, sent_ns, max(0, number) & 0xFFFFFFFF)
             if message is not None and (take := self._takers.get(key)) is not None:
                 take(message, log_time_ns)
         except OSError as error:
@@ -222,14 +221,13 @@ class LogWriter:
             return
         whole, self._ended = not self._ended, _FINISHED
         left_out = {f"/{key}" for key, channel in self._channels.items() if channel is None}
+        taken = {name: text for name, text in accounts.items() if name not in left_out}
         with self._refusing():
             try:
                 if self._views is not None and whole:
                     self._views.finish(self._last_log_ns)
             finally:
-                self._file.add_metadata(
-                    ACCOUNTS, {name: text for name, text in accounts.items() if name not in left_out}
-                )
+                self._file.add_metadata(ACCOUNTS, taken)
                 self._file.finish()
 
     @contextmanager
@@ -294,10 +292,8 @@ class LogStorage:
             return last + 1, there[last].name.removesuffix(ACTIVE_SUFFIX)
         refuse_existing(self.path, force=self.force, unfinished=active_path(self.path))
         if self.splits and there and not self.force:
-            raise UsageError(
-                f"{there[max(there)]}: exists; choose another name, carry on behind it with --continue, or "
-                "replace it with --force"
-            )
+            ways = "choose another name, carry on behind it with --continue, or replace it with --force"
+            raise UsageError(f"{there[max(there)]}: exists; {ways}")
         return int(self.splits), ""
 
 
@@ -376,16 +372,12 @@ class LogParts:
     def _full(self, payload: bytes, log_time_ns: int) -> bool:
         """True where a message belongs into the next part."""
         limit, writer = self._storage, self._writer
-        if limit.split_ns is not None:
-            if self._since_ns is None:
-                self._since_ns = log_time_ns
-            elif log_time_ns - self._since_ns >= limit.split_ns:
-                return True
-        return (
-            limit.split_bytes is not None
-            and writer.messages > 0
-            and writer.most_bytes + len(payload) + ACCOUNTS_BYTES > limit.split_bytes
-        )
+        if self._since_ns is None:
+            self._since_ns = log_time_ns
+        if limit.split_ns is not None and log_time_ns - self._since_ns >= limit.split_ns:
+            return True
+        size = writer.most_bytes + len(payload) + ACCOUNTS_BYTES
+        return limit.split_bytes is not None and writer.messages > 0 and size > limit.split_bytes
 
     @property
     def path(self) -> Path:
@@ -409,7 +401,7 @@ class LogParts:
         t_ns: int,
         log_time_ns: int,
         number: int,
-        message: State | TickRecord | LinkStats | Event | None = None,
+        message: Decoded = None,
     ) -> None:
         """Writes one message; see `LogWriter.add`."""
         if self._storage.splits and not self._writer.ended and self._full(payload, log_time_ns):

@@ -61,16 +61,7 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """A channel as its file describes it.
-
-    Attributes:
-        topic: its name.
-        encoding: of its messages.
-        schema: name of their schema, "" if they have none.
-        schema_encoding: how that is written.
-        metadata: further entries.
-        schema_data: the schema itself.
-    """
+    """A channel as its file describes it; `schema` is the name of its messages' schema, "" for none."""
 
     topic: str
     encoding: str
@@ -113,8 +104,8 @@ class McapReader:
         channels: channels seen so far, by topic; the first definition of one holds.
         library: what wrote the file, as its header states.
         chunks: chunks read so far, by compression ("" for none).
-        packed_bytes: what they take in the file.
-        unpacked_bytes: what they take unpacked.
+        packed_bytes, unpacked_bytes: what they take in the file, and unpacked.
+        size: bytes of the file.
         offset: first byte of the record of the file that is being read.
         complete: True once all was read, to the end mark's last byte: the file was finished.
     """
@@ -131,17 +122,13 @@ class McapReader:
         self.offset = 0
         self.complete = False
         self._scanner = RecordScanner(stream)
+        self.size = self._scanner.size
         self._source = name
         self._progress = progress
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._ours: set[int] = set()
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return self._scanner.size
 
     @property
     def damaged(self) -> list[Damage]:
@@ -275,11 +262,9 @@ class ChannelMessages:
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Returns when the messages came and when they were sent, shape (K,) each, Unix ns below 2^63."""
-        return _to_signed(self.log_ns), _to_signed(self.publish_ns)
-
-
-def _to_signed(times: "array[int]") -> NDArray[np.int64]:
-    return np.minimum(np.array(times, dtype=np.uint64), _LAST_SIGNED_NS).astype(np.int64)
+        stored = (np.array(times, dtype=np.uint64) for times in (self.log_ns, self.publish_ns))
+        log_ns, publish_ns = (np.minimum(times, _LAST_SIGNED_NS).astype(np.int64) for times in stored)
+        return log_ns, publish_ns
 
 
 @dataclass
@@ -331,10 +316,9 @@ def read_contents(stream: BinaryIO, name: str, progress: Progress | None = None)
     session = reader.metadata.get(SESSION, {})
     lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
     if lacking:
-        why = (
-            f"; damaged: {reader.damaged[0]}" if reader.damaged else f"; {reader.torn}" if reader.torn else ""
-        )
-        raise LogError(f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}{why}")
+        why = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
+        text = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}"
+        raise LogError(f"{text}; {why}" if why else text)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
     text = reader.attachments[SCENARIO]
