@@ -317,8 +317,8 @@ def read_contents(stream: BinaryIO, name: str, progress: Progress | None = None)
     lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
     if lacking:
         why = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
-        text = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}"
-        raise LogError(f"{text}; {why}" if why else text)
+        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}"
+        raise LogError(f"{problem}; {why}" if why else problem)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
     text = reader.attachments[SCENARIO]

@@ -1,26 +1,37 @@
 """Check of a log: bytes of its files, completeness of its session, agreement with scenario and accounts.
 
 Invariant: one finding per check, with the places where it fails; missing messages are named range by
-range. Any MCAP file is checked for its bytes, only a trilat-net log for its content. Nothing is
-executed: that is the task of `verify`.
+range. Any MCAP file is checked for its bytes, only a trilat-net log for its content: a message against
+its own content, its scenario and the messages before it. Nothing is executed: that is the task of `verify`.
 """
 
 import hashlib
+import json
 import re
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from ..core.ticks import NS_PER_S
-from ..errors import LogError, ScenarioError
+from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
+from ..net.messages import READABLE, VERSION, Event, LinkStats, RecorderStats, State, json_schema
+from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
-from .channel_check import ChannelCheck, ChannelProblems
-from .log_layout import ACCOUNTS, CHANNEL_TYPES, PART, SCENARIO, SESSION, VIZ_ROOT
+from .accounting import Account, count_messages, number_message
+from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
-from .mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
+from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
 from .ros2 import cdr
 
+ProblemLists = Mapping[str, ProblemList]
+MAX_AHEAD_NS = 10 * NS_PER_S
+"""No message is sent more than this after it came, whatever the clocks."""
+MAX_BOOTS = 64
+"""Starts of a member that are distinguished."""
+_SENT_SINCE = 2
+"""First version whose records state when they were sent."""
 _CDR_HEAD = b"\x00\x01"
 _RATE_TOLERANCE = 0.02
 _RATE_SPAN_NS = 2 * NS_PER_S
@@ -69,6 +80,173 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     return LogCheckResult([*files.findings(), *(session.findings() if session.ours else ())], session.ours)
 
 
+class MessageIdentity(NamedTuple):
+    """What a message says that it is.
+
+    Attributes:
+        member: its sender.
+        boot: which start of it.
+        number: its number in its channel, -1 for none.
+        sequence: the number that the file should state.
+        sent_ns: when it was sent, ns since the epoch; None if it does not state that.
+    """
+
+    member: str
+    boot: int
+    number: int
+    sequence: int
+    sent_ns: int | None
+
+
+class ChannelCheck:
+    """Check of one channel, message by message: numbering, schema and time stamps.
+
+    Args:
+        member: its sender.
+        kind: "state", "link", "event" or "stats".
+        rate_hz: tick rate of the member; 0 of the recorder.
+        epoch_ns: Unix time of tick 0.
+        version: schema version of the session.
+        problems: receives the problems, by check.
+
+    Attributes:
+        accounts: received and missing messages, by the member's boot.
+        first, last: number and publish time of the messages with the lowest and the highest number.
+        ticks: how many ticks the member made, once it has stated that.
+    """
+
+    def __init__(
+        self, member: str, kind: str, rate_hz: int, epoch_ns: int, version: int, problems: ProblemLists
+    ) -> None:
+        self.member, self.kind, self.rate_hz = member, kind, rate_hz
+        self.accounts: dict[int, Account] = defaultdict(Account)
+        self.first: tuple[int, int] | None = None
+        self.last: tuple[int, int] | None = None
+        self.ticks: int | None = None
+        self._epoch_ns, self._version, self._problems = epoch_ns, version, problems
+        self._in_file: dict[int, Account] = self.accounts
+        self._file, self._log_ns = "", 0
+
+    @property
+    def name(self) -> str:
+        """Its short name, as in "m1/state"."""
+        return f"{self.member}/{self.kind}"
+
+    @property
+    def received(self) -> int:
+        """Number of messages, each number once."""
+        return sum(account.received for account in self.accounts.values())
+
+    @property
+    def missing(self) -> int:
+        """Number of missing messages."""
+        return sum(account.missing for account in self.accounts.values())
+
+    def gaps(self, *, whole: bool) -> list[tuple[int, int]]:
+        """Returns missing numbers, as (first, last); those before the first one only if `whole`."""
+        begins = 0 if whole or self.first is None else self.first[0]
+        all_gaps = (gap for account in self.accounts.values() for gap in account.gaps)
+        return [(max(first, begins), last) for first, last in all_gaps if last >= begins]
+
+    def expect(self, ticks: int) -> None:
+        """Counts as missing what the member sent in so many ticks and is not there."""
+        for account in self.accounts.values():
+            account.expect(count_messages(self.kind, ticks, self.rate_hz))
+
+    def begin(self, file: str, channel: ChannelInfo) -> None:
+        """Begins with another file, and checks how it describes the channel."""
+        self._in_file = defaultdict(Account) if self._file else self.accounts
+        self._file, self._log_ns = file, 0
+        if fault := self._find_schema_fault(channel):
+            self._add("schema", None, fault)
+
+    def _find_schema_fault(self, channel: ChannelInfo) -> str:
+        kind = CHANNEL_TYPES[self.kind]
+        rate = channel.metadata.get("rate_hz", str(self.rate_hz))
+        if not channel.schema:
+            return "has no schema"
+        if (channel.encoding, channel.schema_encoding) != ("msgpack", "jsonschema"):
+            return f"is {channel.encoding} with {channel.schema_encoding}, not msgpack with jsonschema"
+        if channel.schema != (name := f"trilat.{kind.__name__}.v{self._version}"):
+            return f"has the schema {channel.schema}, not {name}"
+        if self._version == VERSION and channel.schema_data != json.dumps(json_schema(kind)).encode():
+            return f"the schema {channel.schema} is not what it was released as"
+        if self.kind == topics.STATE and rate != str(self.rate_hz):
+            return f"says {rate} Hz, the scenario {self.rate_hz}"
+        return ""
+
+    def take(self, stored: McapMessage, offset: int) -> None:
+        """Checks a message; `offset` is its place, or that of its chunk."""
+        kind: Any = CHANNEL_TYPES[self.kind]
+        try:
+            message = decode(stored.payload, kind, READABLE)
+        except WireError as error:
+            self._add("schema", offset, str(error))
+            return
+        identity = self._identify(message)
+        if message.v != self._version:
+            text = f"a message of version {message.v} in a log of version {self._version}"
+            self._add("schema", offset, text)
+        if identity.member != self.member:
+            self._add("schema", offset, f"a message says that it is of {identity.member[:40]!r}")
+        if identity.number >= 0:  # events have numbers from version 3 on
+            self._check_number(stored, identity, offset)
+        self._check_times(stored, identity, offset)
+
+    def _add(self, check: str, offset: int | None, text: str) -> None:
+        self._problems[check].add(self._file, offset, f"{self.name}: {text}")
+
+    def _identify(self, message: State | LinkStats | Event | RecorderStats) -> MessageIdentity:
+        match message:
+            case State():
+                sent_ns = message.sent_ns if message.v >= _SENT_SINCE else message.t_ns
+                return MessageIdentity(message.site, message.boot, message.tick, message.tick, sent_ns)
+            case LinkStats():
+                number = number_message(self.kind, message.tick, self.rate_hz)
+                return MessageIdentity(message.site, message.boot, number, message.tick, message.t_ns)
+            case Event():
+                if message.kind == "end":
+                    self.ticks = message.ticks
+                # a recorder's own events are stamped as it hears them; before the epoch there is no time
+                stamped = message.t_ns >= 0 and message.member != topics.RECORDER
+                event_ns = message.t_ns if stamped else None
+                return MessageIdentity(message.member, message.boot, message.n, max(0, message.n), event_ns)
+        account = self.accounts.get(message.boot)
+        number = 0 if account is None else account.expected
+        return MessageIdentity(topics.RECORDER, message.boot, number, number, None)
+
+    def _check_number(self, stored: McapMessage, identity: MessageIdentity, offset: int) -> None:
+        number, boot = identity.number, identity.boot
+        if stored.sequence != identity.sequence & 0xFFFFFFFF:
+            self._add("sequence", offset, f"number {identity.sequence} is stored as {stored.sequence}")
+        if boot not in self.accounts and len(self.accounts) >= MAX_BOOTS:
+            self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
+            return
+        new = self.accounts[boot].take(number)
+        if self._in_file is not self.accounts:  # parts may repeat a message, a file may not
+            new = self._in_file[boot].take(number)
+        if not new:
+            self._add("sequence", offset, f"number {number} is there twice")
+        place = (number, stored.publish_time_ns)
+        self.first = place if self.first is None else min(self.first, place)
+        self.last = place if self.last is None else max(self.last, place)
+
+    def _check_times(self, stored: McapMessage, identity: MessageIdentity, offset: int) -> None:
+        number, log_ns, publish_ns = identity.number, stored.log_time_ns, stored.publish_time_ns
+        if log_ns < self._log_ns:
+            text = f"log_time goes back by {self._log_ns - log_ns} ns at number {number}"
+            self._add("times", offset, text)
+        self._log_ns = log_ns
+        sent_ns = publish_ns
+        if identity.sent_ns is not None:
+            sent_ns = min(max(0, self._epoch_ns + identity.sent_ns), MAX_TIME_NS)
+        if publish_ns != sent_ns:
+            self._add("times", offset, f"number {number} was sent at {sent_ns} ns, not {publish_ns}")
+        elif publish_ns > log_ns + MAX_AHEAD_NS:
+            ahead_s = (publish_ns - log_ns) / NS_PER_S
+            self._add("times", offset, f"number {number} came {ahead_s:.1f} s before it was sent")
+
+
 class SessionCheck:
     """Check of the messages of one session, in one file or in its parts.
 
@@ -80,12 +258,11 @@ class SessionCheck:
     def __init__(self) -> None:
         self.ours = False
         self.channels: dict[str, ChannelCheck] = {}
-        self._problems = ChannelProblems(ProblemList(), ProblemList(), ProblemList())
-        self._scenario_problems = ProblemList()
+        self._problems: ProblemLists = defaultdict(ProblemList)
         self._scenario: Scenario | None = None
         self._about: dict[str, str] = {}
-        self._parts: list[dict[str, str]] = []
         self._accounts: dict[str, str] = {}  # of the last file
+        self._first_part = False  # the files begin with the session
         self._views = 0
         self._file = ""
 
@@ -114,7 +291,7 @@ class SessionCheck:
             elif topic.startswith(VIZ_ROOT):
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
-                    self._problems.schema.add(file, reader.offset, f"{topic[:80]}: a message is no CDR")
+                    self._problems["schema"].add(file, reader.offset, f"{topic[:80]}: a message is no CDR")
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
@@ -129,11 +306,11 @@ class SessionCheck:
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
             raise LogError(f"{self._file}: is of another session; look at it alone")
         self.ours, self._about = True, about
-        self._parts.append(reader.metadata.get(PART, {}))
+        self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
         self._check_scenario(reader.attachments[SCENARIO])
 
     def _check_scenario(self, text: bytes) -> None:
-        problems, about = self._scenario_problems, self._about
+        problems, about = self._problems["scenario"], self._about
         digest, stated = hashlib.sha256(text).hexdigest(), about.get("scenario_sha256", "")
         if digest != stated:
             problems.add(self._file, None, f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}")
@@ -154,7 +331,7 @@ class SessionCheck:
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
         """Returns the check of a channel in this file; None if it is none of the session's own."""
-        topic, problems = channel.topic, self._problems.schema
+        topic, problems = channel.topic, self._problems["schema"]
         key = topics.parse_key(topic.removeprefix("/"))
         if topic.startswith(VIZ_ROOT):
             is_cdr = (channel.encoding, channel.schema_encoding) == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
@@ -162,12 +339,8 @@ class SessionCheck:
                 schema = channel.schema[:80] or "no schema"
                 problems.add(self._file, None, f"{topic[:80]}: {schema} is none of the standard ones")
             return None
-        if (
-            key is None
-            or key.channel not in CHANNEL_TYPES
-            or key.session != self._about["session"]
-            or key.boot
-        ):
+        session = self._about["session"]
+        if key is None or key.channel not in CHANNEL_TYPES or key.session != session or key.boot:
             if not channel.schema:
                 problems.add(self._file, None, f"{topic[:80]}: has no schema")
             return None
@@ -181,7 +354,7 @@ class SessionCheck:
         sites = self._scenario.sites if self._scenario else {}
         if self._scenario and key.member not in (*sites, topics.RECORDER):
             text = f"{topic[:80]}: the scenario has no such member"
-            self._problems.schema.add(self._file, None, text)
+            self._problems["schema"].add(self._file, None, text)
         rate_hz = sites[key.member].rate_hz if key.member in sites else 0
         epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
         return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, self._problems)
@@ -193,14 +366,13 @@ class SessionCheck:
         yield self._check_accounts()
         kinds = f"every message is one of version {self._session_number('schema_version')}"
         views = f", and {self._views} views" if self._views else ""
-        yield self._problems.schema.finding("schema", kinds + views)
+        yield self._problems["schema"].finding("schema", kinds + views)
         times = "log times never go back, publish times are the senders'"
-        yield self._problems.times.finding("times", times)
+        yield self._problems["times"].finding("times", times)
         yield self._check_rates()
         scenario = self._scenario.name if self._scenario else ""
-        digest = self._about.get("scenario_sha256", "")[:16]
-        text = f"{scenario}, SHA-256 {digest}, as the session names it"
-        yield self._scenario_problems.finding("scenario", text)
+        text = f"{scenario}, SHA-256 {self._about.get('scenario_sha256', '')[:16]}, as the session names it"
+        yield self._problems["scenario"].finding("scenario", text)
 
     def _expect_all(self) -> None:
         """Counts as missing what members that stated their number of ticks published and is not there."""
@@ -210,13 +382,8 @@ class SessionCheck:
                 most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
                 check.expect(min(ticks[check.member], most))
 
-    @property
-    def _first_part(self) -> bool:
-        """True if the files begin with the session."""
-        return not self._parts or any(part.get("index", "") in ("", "1") for part in self._parts)
-
     def _check_sequence(self) -> CheckFinding:
-        problems, missing, reordered = self._problems.sequence, 0, 0
+        problems, missing, reordered = self._problems["sequence"], 0, 0
         gaps = []
         for check in self.channels.values():
             for first, last in check.gaps(whole=self._first_part):
@@ -241,15 +408,9 @@ class SessionCheck:
         problems = ProblemList()
         if not self._accounts:
             return problems.finding("accounts", "there are none: the file was not finished")
-        recorders = {
-            boot
-            for check in self.channels.values()
-            if check.member == topics.RECORDER
-            for boot in check.accounts
-        }
-        if not self._first_part or len(recorders) > 1:
-            text = "tell of parts that are not here, and were not compared"
-            return problems.finding("accounts", text)
+        own = (check for check in self.channels.values() if check.member == topics.RECORDER)
+        if not self._first_part or len({boot for check in own for boot in check.accounts}) > 1:
+            return problems.finding("accounts", "tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
             account = self._accounts.get(topic, "")
             stated = {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
@@ -273,8 +434,6 @@ class SessionCheck:
             rate_hz = (check.last[0] - check.first[0]) * NS_PER_S / span_ns
             texts.append(f"{check.member} {rate_hz:.1f} Hz")
             if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
-                text = (
-                    f"{check.member} sent {rate_hz:.1f} records a second, the scenario says {check.rate_hz}"
-                )
-                problems.add("", None, text)
+                sent = f"{check.member} sent {rate_hz:.1f} records a second"
+                problems.add("", None, f"{sent}, the scenario says {check.rate_hz}")
         return problems.finding("rates", ", ".join(texts) or "too short to tell")
