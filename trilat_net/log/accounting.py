@@ -101,9 +101,7 @@ class Account:
     def take(self, number: int, came_ns: int | None = None) -> bool:
         """Counts one message; returns False if its number is there already.
 
-        Args:
-            number: its number, 0 or more.
-            came_ns: when it came, on a clock that never steps.
+        It came at `came_ns`, on a clock that never steps.
         """
         if came_ns is not None:
             if self._came_ns is not None and came_ns - self._came_ns > self.silence_ns:
@@ -176,7 +174,6 @@ class Account:
         return [f"{base + first}-{base + last}" for (first, last), _ in pairs]
 
     def _add(self, number: int) -> bool:
-        """Adds a number to those that are there; returns False if it is one of them."""
         if number > self.last:
             self.expect(number)
             self.last = number
@@ -260,12 +257,11 @@ class SessionAccounts:
 
     def texts(self) -> dict[str, str]:
         """Returns the accounts by topic, as a file holds them."""
-        texts = {}
-        for topic, account in self._accounts.items():
-            if account.expected or topic.split("/")[-2] in self._rates_hz:
-                base = self._bases.get(topic, 0)
-                texts[topic] = account.as_text() if not base else f"from {base} on: {account.as_text()}"
-        return texts
+        return {
+            topic: (f"from {base} on: " if (base := self._bases.get(topic, 0)) else "") + account.as_text()
+            for topic, account in self._accounts.items()
+            if account.expected or topic.split("/")[-2] in self._rates_hz
+        }
 
     def records(self) -> dict[str, int]:
         """Returns the number of records per site."""

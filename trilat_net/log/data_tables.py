@@ -31,17 +31,12 @@ if TYPE_CHECKING:
     import polars
 
 UNIT_SUFFIXES = {
-    "rad": "rad",
+    **{unit: unit for unit in ("rad", "s", "ms", "us", "ns", "tick")},
     "rad/s": "rad_s",
     "N m": "nm",
     "kg m^2": "kg_m2",
     "kg m": "kg_m",
-    "s": "s",
-    "ms": "ms",
-    "us": "us",
-    "ns": "ns",
     "ns/s": "ppb",
-    "tick": "tick",
     "byte": "bytes",
 }
 """Units as the endings of names."""
@@ -60,8 +55,7 @@ class Column(NamedTuple):
     Attributes:
         name: its name, with the unit at its end.
         values: its values, shape (K,): numbers, or texts as objects.
-        unit: their unit; "" for texts and counts.
-        meaning: what they are.
+        unit, meaning: their unit ("" for texts and counts), and what they are.
         source: the field of the message that they are from.
         known: True for rows that have a value, shape (K,); None if all have.
     """
@@ -118,10 +112,10 @@ class Table:
         Raises:
             KeyError: there is none of that name.
         """
-        for column in self.columns:
-            if column.name == name:
-                return column
-        raise KeyError(f"no column {name!r}; there are {', '.join(column.name for column in self.columns)}")
+        columns = {column.name: column for column in self.columns}
+        if name not in columns:
+            raise KeyError(f"no column {name!r}; there are {', '.join(columns)}")
+        return columns[name]
 
     @property
     def label(self) -> str:
@@ -260,7 +254,9 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
             continue
         values = [getattr(s, field) for s in stats]
         if kind == "object":
-            names = site.peers if field != "dropped" else _list_reasons(values)
+            names: Iterable[str] = site.peers
+            if field == "dropped":  # by reason, one per column name
+                names = {_to_word(reason): reason for value in values for reason in sorted(value)}.values()
             columns += [_make_entry_column(source, field, name, values) for name in names]
         elif kind == "integer":
             columns.append(Column(field, to_int_array(values, source, field), unit, text, field))
@@ -268,11 +264,6 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
             columns.append(Column(field, np.array(values, dtype=np.object_), unit, text, field))
     about = f"statistics of {site.name}'s loop and links, ten times a second"
     return Table(site.name, "link", about, tuple(columns))
-
-
-def _list_reasons(values: Iterable[Mapping[str, int]]) -> list[str]:
-    """Returns the reasons for dropped messages, one per column name."""
-    return list({_to_word(reason): reason for value in values for reason in sorted(value)}.values())
 
 
 def _to_word(text: str) -> str:
@@ -329,10 +320,10 @@ def to_data_frame(table: Table) -> "polars.DataFrame":
     pl = import_extra("polars", "frames", "data frames")
     series = []
     for column in table.columns:
-        if column.is_text:
-            one = pl.Series(column.name, column.values.tolist(), dtype=pl.String)
-        else:
-            one = pl.Series(column.name, column.values)
+        text = column.is_text
+        one = pl.Series(
+            column.name, column.values.tolist() if text else column.values, pl.String if text else None
+        )
         if column.known is not None:
             one = one.zip_with(pl.Series(column.known), pl.Series([None], dtype=one.dtype))
         series.append(one)

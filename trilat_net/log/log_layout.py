@@ -25,6 +25,8 @@ from ..net.messages import Event, LinkStats, RecorderStats, State
 ACTIVE_SUFFIX = ".active"
 """Ending of a file's name until it is complete."""
 _NUMBER = re.compile(r"(.+)-(\d{3,})")
+_CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
+"""A part of a key expression, between slashes."""
 
 
 def active_path(path: Path) -> Path:
@@ -68,9 +70,11 @@ class ChannelFilter:
 
     def takes(self, key: str) -> bool:
         """True if the filter takes a channel."""
-        if any(matches_key(expression, key) for expression in self.exclude):
-            return False
-        return not self.include or any(matches_key(expression, key) for expression in self.include)
+        included, excluded = (
+            any(matches_key(expression, key) for expression in expressions)
+            for expressions in (self.include, self.exclude)
+        )
+        return not excluded and (included or not self.include)
 
     def facts(self) -> Mapping[str, str]:
         """Returns the filter as metadata of the session; {} if it takes all."""
@@ -89,19 +93,12 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
     """
     for option, texts in (("--include", include), ("--exclude", exclude)):
         for text in texts:
-            if not all(_is_chunk(chunk) for chunk in text.strip("/").split("/")):
+            if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
                 raise UsageError(
                     f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, * for one of "
                     f"them, ** for any number, $* for a part of one; not {text!r}"
                 )
-    return ChannelFilter(
-        tuple(text.strip("/") for text in include), tuple(text.strip("/") for text in exclude)
-    )
-
-
-def _is_chunk(chunk: str) -> bool:
-    rest = chunk.replace("$*", "")
-    return chunk in ("*", "**") or bool(chunk and not set(rest) & set("*$#?"))
+    return ChannelFilter(*(tuple(text.strip("/") for text in texts) for texts in (include, exclude)))
 
 
 _PACKAGES = ("trilat-net", "numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
@@ -112,13 +109,11 @@ def _git(*arguments: str) -> str | None:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
+    command = ["git", "-C", str(root), *arguments]
     try:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10
-        )
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
 
 
 @cache

@@ -63,8 +63,7 @@ class Log:
         sources: the names of its files, in order.
         session: metadata of the session: driver, seed, epoch, versions, commit, fingerprint.
         scenario: the scenario that ran.
-        scenario_text: its text, as it is in the file.
-        scenario_sha256: the hash of that.
+        scenario_text, scenario_sha256: its text, as it is in the file, and the hash of that.
         events: the events, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
 
@@ -73,16 +72,14 @@ class Log:
     """
 
     def __init__(self, contents: LogContents) -> None:
-        self.sources = contents.sources
-        self.source = contents.source
-        self.session = contents.session
+        self.source, self.sources = contents.source, contents.sources
+        self.session, self.damaged = contents.session, contents.damaged
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
             self.scenario_text = contents.scenario.decode()
             self.scenario: Scenario = parse_embedded(self.scenario_text, f"{self.source}: scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
-        self.damaged = contents.damaged
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
         self.events = [event for topic in self._event_topics() for event in self._read_events(topic)]
@@ -155,15 +152,15 @@ class Log:
         accounts = SessionAccounts(self.session["session"], rates_hz)
         for name in self.sites:
             sequences = {
-                topics.STATE: self[name].tick.tolist(),
-                topics.LINK: [stats.tick for stats in self.link_stats(name)],
-                topics.EVENT: [event.n for event in self.events if event.member == name and event.n >= 0],
+                self._topic(name, topics.STATE): self[name].tick.tolist(),
+                self._topic(name, topics.LINK): [stats.tick for stats in self.link_stats(name)],
+                self._topic(name, topics.EVENT): [e.n for e in self.events if e.member == name and e.n >= 0],
             }
-            for channel in sequences:
-                accounts.open(self._topic(name, channel))
-            for channel, numbers in sequences.items():
+            for topic in sequences:
+                accounts.open(topic)
+            for topic, numbers in sequences.items():
                 for number in numbers:
-                    accounts.take(self._topic(name, channel), number)
+                    accounts.take(topic, number)
         for name, ticks in self._stated_ticks().items():
             accounts.expect(name, ticks)
         return {**accounts.texts(), **written}
@@ -217,10 +214,10 @@ class Log:
         Raises:
             LogError: the log names a change that is none.
         """
+        named = self.changes(site).items()
         try:
             return {
-                tick: [parse_core_change(self.scenario, site, text) for text in texts]
-                for tick, texts in self.changes(site).items()
+                tick: [parse_core_change(self.scenario, site, one) for one in texts] for tick, texts in named
             }
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
@@ -306,23 +303,21 @@ def open_log(
         LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of different
             sessions, or disagree on a message.
     """
+    files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
-        files = [_open(one, stack) for one in (source, *more)]
+        for one in (source, *more):
+            if isinstance(one, str | Path):
+                with _reading(str(one)):
+                    files.append((stack.enter_context(Path(one).open("rb")), str(one)))
+            else:
+                files.append((one, "log"))
         sizes = [_measure(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
             with _reading(name):
                 shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
     return Log(merge_parts(parts))
-
-
-def _open(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
-    """Returns a file and its name; one that is opened here is closed with the stack."""
-    if not isinstance(source, str | Path):
-        return source, "log"
-    with _reading(str(source)):
-        return stack.enter_context(Path(source).open("rb")), str(source)
 
 
 @contextmanager
@@ -372,11 +367,8 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Delay
     """Returns the rows of every link of a log; a scenario asks for one after the other."""
     try:
         log = open_log(path)
-        return {
-            f"{peer}->{site}": list(_iterate_delays(log, site, index, peer))
-            for site in log.sites
-            for index, peer in enumerate(log.scenario.peers(site))
-        }
+        links = ((site, *link) for site in log.sites for link in enumerate(log.scenario.peers(site)))
+        return {f"{peer}->{site}": list(_iterate_delays(log, site, n, peer)) for site, n, peer in links}
     except LogError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
 

@@ -36,13 +36,7 @@ _INDEX_HEAD_BYTES = 6  # of a message index: channel, length of its entries
 
 
 class ProblemPlace(NamedTuple):
-    """A problem and its place.
-
-    Attributes:
-        file: in which file.
-        offset: at which byte, or in the chunk that begins there; None if the whole file is meant.
-        text: the problem.
-    """
+    """A problem of a file, at a byte or in the chunk that begins there; None if the whole file is meant."""
 
     file: str
     offset: int | None

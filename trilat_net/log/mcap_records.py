@@ -62,15 +62,9 @@ class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk.
+    """Head of a chunk: first and last log time; of its records, unpacked, size and CRC-32 (0 for none).
 
-    Attributes:
-        start_ns: earliest log time in it.
-        end_ns: latest one.
-        size: bytes of its records, unpacked.
-        crc: CRC-32 of those bytes; 0 for none.
-        compression: how they are packed.
-        data_offset: where they begin, in the chunk's content.
+    They are packed by `compression`, and begin at `data_offset` in the chunk's content.
     """
 
     start_ns: int
@@ -108,9 +102,8 @@ def unpack_chunk(content: bytes) -> bytes:
     head = parse_chunk_head(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
-        raise UnreadableRecord(
-            f"a chunk says that it unpacks to {head.size} bytes, at most {limit} are taken"
-        )
+        text = f"a chunk says that it unpacks to {head.size} bytes, at most {limit} are taken"
+        raise UnreadableRecord(text)
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
         raise UnreadableRecord(f"a chunk of {head.size} bytes unpacks to {len(data)}")
@@ -171,7 +164,7 @@ class RecordFrame(NamedTuple):
     @property
     def end(self) -> int:
         """The first byte after it."""
-        return self.offset + RECORD_HEAD_BYTES + self.length
+        return self.offset + self.size
 
 
 class Damage(NamedTuple):
@@ -266,9 +259,8 @@ class RecordScanner:
         if not opcode:
             raise UnreadableRecord("there is no record")
         if length > self.size - offset - RECORD_HEAD_BYTES:
-            raise UnreadableRecord(
-                f"a record ({_opcode_name(opcode)}) of {length} bytes reaches beyond the end of the file"
-            )
+            name = _opcode_name(opcode)
+            raise UnreadableRecord(f"a record ({name}) of {length} bytes reaches beyond the end of the file")
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:
@@ -311,12 +303,8 @@ class RecordScanner:
 
     def footer(self) -> records.Footer | None:
         """Returns the footer of a finished file; None for another."""
-        if not self.ends:
-            return None
-        footer: records.Footer = parse_record(
-            Opcode.FOOTER, self.read(self.size - FOOTER_BYTES + RECORD_HEAD_BYTES, 20)
-        )
-        return footer
+        content = self.read(self.size - FOOTER_BYTES + RECORD_HEAD_BYTES, 20)
+        return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
         """True if the summary has the checksum that the footer states."""
@@ -341,9 +329,8 @@ def parse_record(opcode: int, content: bytes) -> Any:
     try:
         return _KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
-        raise UnreadableRecord(
-            f"a record ({_opcode_name(opcode)}) cannot be read: {error or type(error).__name__}"
-        ) from None
+        why = str(error) or type(error).__name__
+        raise UnreadableRecord(f"a record ({_opcode_name(opcode)}) cannot be read: {why}") from None
 
 
 class _Content(ReadDataStream):
@@ -362,16 +349,6 @@ def _opcode_name(opcode: int) -> str:
 
 _OPCODES = frozenset(Opcode)
 _KINDS: dict[int, Any] = {
-    Opcode.HEADER: records.Header,
-    Opcode.FOOTER: records.Footer,
-    Opcode.SCHEMA: records.Schema,
-    Opcode.CHANNEL: records.Channel,
-    Opcode.ATTACHMENT: records.Attachment,
-    Opcode.METADATA: records.Metadata,
-    Opcode.DATA_END: records.DataEnd,
-    Opcode.STATISTICS: records.Statistics,
-    Opcode.CHUNK_INDEX: records.ChunkIndex,
-    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex,
-    Opcode.METADATA_INDEX: records.MetadataIndex,
-    Opcode.SUMMARY_OFFSET: records.SummaryOffset,
+    kind: getattr(records, kind.name.title().replace("_", ""))
+    for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }

@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
+from itertools import chain
 from typing import Any
 
 from ..errors import LogError, WireError
@@ -68,10 +69,9 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
         _recorder_boot(part) or part.source: part.metadata.get(ACCOUNTS, {}) for part in parts
     }
     sums: Counter[str] = Counter()
-    for counts in last.values():
-        sums.update(
-            {name: int(n) for name, n in counts.items() if not name.startswith("/") and n.isdecimal()}
-        )
+    for name, n in chain.from_iterable(counts.items() for counts in last.values()):
+        if not name.startswith("/") and n.isdecimal():
+            sums[name] += int(n)
     return {name: str(count) for name, count in sums.items()}
 
 

@@ -175,7 +175,6 @@ JOINT_ROW = slice(0, 4 * JOINTS)
 """Of a row the joints: q, q_des, qd, tau."""
 ERROR_ROW = slice(4 * JOINTS, 5 * JOINTS)
 """The error e = q - q_des, Eq. (9)."""
-FAST_ROW = slice(0, 5 * JOINTS)
 SLOW_ROW = slice(5 * JOINTS, None)
 """The rest: tau_x, theta_hat, mode."""
 

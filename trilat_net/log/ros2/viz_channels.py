@@ -21,7 +21,6 @@ from ..log_layout import VIZ_ROOT
 from .cdr import JointStatePacker
 from .ros2_messages import (
     ERROR_ROW,
-    FAST_ROW,
     JOINT_ROW,
     SESSION_CHANNELS,
     SLOW_ROW,
@@ -90,9 +89,7 @@ class _SiteVizWriter:
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{root}joint_states", JointStatePacker(names)
         self._error_topic, self._error = f"{root}error", shapes.arrays["error"].pack
-        self._none = [math.nan] * len(
-            shapes.joints
-        )  # velocity and effort of a reference are left out: size is dear
+        self._none = [math.nan] * len(shapes.joints)  # velocity, effort of a reference: size is dear
         self._topics = {name: f"{root}{name}" for name in shapes.arrays}
         self.channels: dict[str, Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
@@ -134,11 +131,18 @@ class _SiteBuckets:
     def record(self, message: Record, log_ns: int) -> None:
         """Takes the record of one tick."""
         tick = message.tick
-        if tick < self._first:
-            self._take_late(message, log_ns)
+        if tick < self._first:  # its bucket is closed: with others of that bucket it waits for the next close
+            length = 2 * self._half
+            if self._late and self._late[0].tick // length != tick // length:
+                self._flush_late(log_ns)
+            self._late.append(message)
             return
         if tick >= self._half_end:
-            self._advance(tick // self._half, log_ns)
+            half = tick // self._half
+            self._fast.flush(log_ns)
+            if half // 2 != self._bucket:
+                self._close(half // 2, log_ns)
+            self._half_end = (half + 1) * self._half
         self._open.append(message)
 
     def statistics(self, stats: LinkStats, log_ns: int) -> None:
@@ -151,19 +155,12 @@ class _SiteBuckets:
         self._fast.flush(log_ns)
         self._slow.flush(log_ns)
 
-    def _advance(self, half: int, log_ns: int) -> None:
-        """Begins another half of a bucket."""
-        self._fast.flush(log_ns)
-        if half // 2 != self._bucket:
-            self._close(half // 2, log_ns)
-        self._half_end = (half + 1) * self._half
-
     def _close(self, bucket: int, log_ns: int) -> None:
         """Closes the open bucket, and begins another."""
         self._flush_late(log_ns)
         if self._open:
             rows = self._decimate(self._open)
-            self._fast.add([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in rows], log_ns)
+            self._fast.add(rows, log_ns)
             self._slow_open += [(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows]
             self._open = []
         half, was = 2 * bucket // self._ratio, 2 * self._bucket // self._ratio
@@ -175,17 +172,10 @@ class _SiteBuckets:
             self._slow_open = []
         self._bucket, self._first = bucket, 2 * self._half * bucket
 
-    def _take_late(self, message: Record, log_ns: int) -> None:
-        """Takes a record whose bucket is closed; with others of that bucket it waits for the next close."""
-        length = 2 * self._half
-        if self._late and self._late[0].tick // length != message.tick // length:
-            self._flush_late(log_ns)
-        self._late.append(message)
-
     def _flush_late(self, log_ns: int) -> None:
         if self._late:
             rows = self._decimate(self._late)
-            self._fast.add_late([(stamp_ns, row[FAST_ROW]) for stamp_ns, row in rows], log_ns)
+            self._fast.add_late(rows, log_ns)
             self._slow.add_late([(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows], log_ns)
             self._late = []
 
@@ -240,22 +230,19 @@ class VizChannels:
         self, scenario: Scenario, session: str, epoch_unix_ns: int, views_hz: float, put: PutMessage
     ) -> None:
         self._epoch_unix_ns, self._put = epoch_unix_ns, put
-        self.channels: dict[str, Ros2Channel] = {
-            f"{VIZ_ROOT}{name}": channel for name, channel in SESSION_CHANNELS.items()
-        }
+        self.channels = {f"{VIZ_ROOT}{name}": channel for name, channel in SESSION_CHANNELS.items()}
         self.takers: dict[str, TakeMessage] = {
-            topics.key(session, topics.RECORDER, topics.EVENT): self._event
+            topics.key(session, member, topics.EVENT): self._event
+            for member in (*scenario.names, topics.RECORDER)
         }
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
-            rate_hz = scenario.sites[site].rate_hz
             writer = _SiteVizWriter(site, scenario.peers(site), put)
-            buckets = _SiteBuckets(writer, rate_hz, views_hz, epoch_unix_ns)
+            buckets = _SiteBuckets(writer, scenario.sites[site].rate_hz, views_hz, epoch_unix_ns)
             self._buckets.append(buckets)
             self.channels |= writer.channels
             self.takers[topics.key(session, site, topics.STATE)] = buckets.record
             self.takers[topics.key(session, site, topics.LINK)] = buckets.statistics
-            self.takers[topics.key(session, site, topics.EVENT)] = self._event
 
     def _event(self, event: Event, log_ns: int) -> None:
         """Writes an event with its time of arrival: events sent at once may arrive in another order."""
@@ -284,10 +271,7 @@ def decimate_min_max(columns: Iterable[SignalRow]) -> tuple[list[float], list[fl
         ordered = sorted(column)  # smooth curves are nearly in order: a third of what min and max take
         low, high = ordered[0], ordered[-1]
         start = column[0]
-        if start == low or (start != high and column.index(low) < column.index(high)):
-            first.append(low)
-            second.append(high)
-        else:
-            first.append(high)
-            second.append(low)
+        rises = start == low or (start != high and column.index(low) < column.index(high))
+        first.append(low if rises else high)
+        second.append(high if rises else low)
     return first, second
