@@ -7,20 +7,18 @@ latest together with the next one of its channel. Messages of one instant keep t
 A minute of 9000 messages/s takes some 100 MiB in this form, a third of the size as Python objects.
 """
 
-import struct
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
-Bytes = bytes | bytearray | memoryview
 
-_COLUMNS = 5
-"""Numbers of a message: time in ns since the epoch, channel, number in the channel, bounds of its payload."""
-_HEAD = struct.Struct("<Q")
+PIECE_BYTES = 65_536
+"""Payload of a piece: small enough that preparing or receiving one does not delay the player."""
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
@@ -49,10 +47,15 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Messages: a row of numbers each (see `_COLUMNS`), shape (K, 5), over the bytes of their payloads."""
+    """Messages: a row of numbers each, over the bytes of their payloads.
+
+    Attributes:
+        rows: time in ns since the epoch, channel, number in the channel, bounds of the payload; shape (K, 5).
+        data: the payloads.
+    """
 
     rows: Ints
-    data: Bytes
+    data: bytes | bytearray
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -72,19 +75,10 @@ class MessageBatch:
         """Number of each in its channel, shape (K,)."""
         return self.rows[:, 2]
 
-    @property
-    def sizes(self) -> Ints:
-        """Bytes of each payload, shape (K,)."""
-        return self.rows[:, 4] - self.rows[:, 3]
-
     def payload(self, index: int) -> bytes:
         """Returns a payload."""
-        start, end = self.rows[index, 3:]
+        start, end = self.rows[index, 3:].tolist()
         return bytes(self.data[start:end])
-
-    def payloads(self) -> bytes:
-        """Returns all payloads, one behind the other."""
-        return b"".join(map(self.payload, range(len(self))))
 
     def messages(self) -> Iterator[tuple[int, int, int, bytes]]:
         """Yields (time in ns, channel, number, payload) of every message."""
@@ -92,57 +86,43 @@ class MessageBatch:
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
 
-    def part(self, places: slice | Ints | NDArray[np.bool_]) -> "MessageBatch":
+    def part(self, places: slice | Ints) -> "MessageBatch":
         """Returns some of the messages, over the same bytes."""
         return MessageBatch(self.rows[places], self.data)
 
-    def pieces(self, count: int) -> Iterator["MessageBatch"]:
-        """Yields the messages in pieces of at most `count`, over the same bytes."""
-        for first in range(0, len(self), count):
-            yield self.part(slice(first, first + count))
+    def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
+        """Yields the messages in pieces of some bytes, one message at least, over the same bytes."""
+        filled = np.cumsum(self.rows[:, 4] - self.rows[:, 3]) // size
+        edges = [0, *(np.flatnonzero(np.diff(filled)) + 1).tolist(), len(self)]
+        for begin, end in pairwise(edges):
+            if end > begin:
+                yield self.part(slice(begin, end))
 
-    def once(self) -> "MessageBatch":
-        """Returns the messages without repetitions of number and payload, as in two parts of one session."""
-        order = np.lexsort((self.numbers, self.channels))
-        keys = self.rows[order, 1:3]
-        repeated = np.flatnonzero((keys[1:] == keys[:-1]).all(axis=1)) + 1
-        kept = np.ones(len(self), dtype=np.bool_)
-        payloads: set[bytes] = set()
-        before = -1
-        for n in repeated.tolist():
-            if n != before + 1:  # another run of messages that have one number
-                payloads = {self.payload(order[n - 1])}
-            payload, before = self.payload(order[n]), n
-            kept[order[n]] = payload not in payloads
-            payloads.add(payload)
-        return self.part(kept) if len(repeated) else self
-
-    def packed(self) -> bytes:
-        """Returns the messages as bytes for another process, see `unpack_batch`."""
+    def compact(self) -> "MessageBatch":
+        """Returns the messages over bytes of their own, one payload behind the other."""
         rows = self.rows.copy()
-        rows[:, 4] = np.cumsum(self.sizes)
-        rows[:, 3] = rows[:, 4] - self.sizes
-        return _HEAD.pack(len(self)) + rows.tobytes() + self.payloads()
-
-
-def unpack_batch(packed: Bytes) -> MessageBatch:
-    """Returns the messages that `MessageBatch.packed` encoded."""
-    (count,) = _HEAD.unpack_from(packed)
-    end = _HEAD.size + 8 * _COLUMNS * count
-    view = memoryview(packed)
-    rows = np.frombuffer(view[_HEAD.size : end], dtype=np.int64)
-    return MessageBatch(rows.reshape(-1, _COLUMNS), view[end:])
+        rows[:, 4] = np.cumsum(self.rows[:, 4] - self.rows[:, 3])
+        rows[1:, 3], rows[:1, 3] = rows[:-1, 4], 0
+        view = memoryview(self.data)
+        return MessageBatch(rows, b"".join(view[start:end] for start, end in self.rows[:, 3:].tolist()))
 
 
 class BatchBuilder:
-    """Messages as they are read from a file, until they are put in order."""
+    """Messages as they are read from a file, until they are put in order.
 
-    def __init__(self) -> None:
+    Args:
+        kept: messages that were put in order before; they come first.
+    """
+
+    def __init__(self, kept: MessageBatch | None = None) -> None:
         self._payloads = bytearray()
         self._rows = array("q")
-
-    def __len__(self) -> int:
-        return len(self._rows) // _COLUMNS
+        if kept is not None:
+            kept = kept.part(
+                np.argsort(kept.rows[:, 3], kind="stable")
+            ).compact()  # in the order of their file
+            self._payloads += kept.data
+            self._rows.frombytes(kept.rows.tobytes())
 
     @property
     def memory(self) -> int:
@@ -155,20 +135,26 @@ class BatchBuilder:
         self._payloads += payload
         self._rows.extend((t_ns, channel, number, start, len(self._payloads)))
 
-    def keep(self, batch: MessageBatch) -> None:
-        """Adds messages that were put in order before, in the order of their file."""
-        kept = batch.part(np.argsort(batch.rows[:, 3], kind="stable"))
-        rows = kept.rows.copy()
-        rows[:, 4] = len(self._payloads) + np.cumsum(kept.sizes)
-        rows[:, 3] = rows[:, 4] - kept.sizes
-        self._payloads += kept.payloads()
-        self._rows.frombytes(rows.tobytes())
-
     def ordered(self) -> MessageBatch:
         """Returns the messages in play order, each once; the payloads stay in place."""
-        rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
-        once = MessageBatch(rows, self._payloads).once()
-        order, due_ns = order_for_play(once.times_ns, once.channels, once.numbers)
-        ordered = once.rows[order]
-        ordered[:, 0] = due_ns
-        return MessageBatch(ordered, self._payloads)
+        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 5)
+        if repeats := self._find_repeats(rows):
+            rows = np.delete(rows, repeats, axis=0)
+        order, due_ns = order_for_play(rows[:, 0], rows[:, 1], rows[:, 2])
+        rows = rows[order]
+        rows[:, 0] = due_ns
+        return MessageBatch(rows, self._payloads)
+
+    def _find_repeats(self, rows: Ints) -> list[int]:
+        """Returns the places of messages that are there before already, as in two parts of one session."""
+        order = np.lexsort((rows[:, 2], rows[:, 1]))
+        same = (np.diff(rows[order, 1:3], axis=0) == 0).all(axis=1)
+        seen: set[tuple[int, int, bytes]] = set()
+        repeats = []
+        for place in np.union1d(order[1:][same], order[:-1][same]).tolist():
+            _, channel, number, start, end = rows[place].tolist()
+            message = channel, number, bytes(self._payloads[start:end])
+            if message in seen:
+                repeats.append(place)
+            seen.add(message)
+        return repeats

@@ -7,6 +7,7 @@ play (L6).
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,14 +37,9 @@ class Pace:
         """Returns the deadline of an instant of the log, on the clock."""
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
-    def position_ns(self, now_ns: int) -> int:
-        """Returns the instant of the log that is due now; the start if everything is due at once."""
-        passed_ns = now_ns - self.origin_ns
-        return self.start_ns + (round(passed_ns * self.rate) if math.isfinite(self.rate) else 0)
-
     def later(self, length_ns: int) -> "Pace":
         """Returns the pace of the next round, which begins after such a length of the log."""
-        return Pace(self.origin_ns + round(length_ns / self.rate), self.start_ns, self.rate)
+        return Pace(self.due_ns(self.start_ns + length_ns), self.start_ns, self.rate)
 
 
 def parse_rate(text: str) -> float:
@@ -86,15 +82,8 @@ LATENESS_LIMIT_US = 100_000
 """Higher values share one bin; the maximum is exact all the same."""
 
 
-@dataclass(frozen=True, slots=True)
-class LatenessSummary:
-    """Lateness of the messages, from their deadline to the call that publishes them, us.
-
-    Attributes:
-        p50_us: median.
-        p99_us: 99th percentile; `max_us` if that is above `LATENESS_LIMIT_US`.
-        max_us: maximum.
-    """
+class LatenessSummary(NamedTuple):
+    """Median, 99th percentile and maximum of the lateness, us; a quantile above the limit is the maximum."""
 
     p50_us: int
     p99_us: int
@@ -102,7 +91,7 @@ class LatenessSummary:
 
 
 class LatenessHistogram:
-    """Counts messages by lateness.
+    """Counts messages by lateness: from their deadline to the call that publishes them.
 
     Attributes:
         max_us: the maximum so far, us.
@@ -124,6 +113,6 @@ class LatenessHistogram:
         sums = np.cumsum(self._counts)
         if not sums[-1]:
             return None
-        p50_us, p99_us = (int(np.argmax(sums * 100 >= percent * sums[-1])) for percent in (50, 99))
-        p50_us, p99_us = (us if us < LATENESS_LIMIT_US else self.max_us for us in (p50_us, p99_us))
+        bins = np.searchsorted(100 * sums, sums[-1] * np.array([50, 99])).tolist()
+        p50_us, p99_us = (us if us < LATENESS_LIMIT_US else self.max_us for us in bins)
         return LatenessSummary(p50_us, p99_us, self.max_us)

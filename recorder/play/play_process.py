@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.core.ticks import NS_PER_S
@@ -19,9 +20,9 @@ from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import open_playback_bus, refuse_running_session
 
 from .batch import MessageBatch
+from .message_source import MessageSource
 from .pace import LatenessSummary, Pace
 from .player import Player, PlayProgress
-from .reader_process import MessageSource, ProcessSource
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
@@ -56,8 +57,7 @@ class PlayOptions:
     needs_recorder: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class PlaybackSummary:
+class PlaybackSummary(NamedTuple):
     """The result of a playback.
 
     Attributes:
@@ -114,7 +114,7 @@ class Playback:
     ) -> None:
         self._bus, self._clock, self._header, self._source = bus, clock, header, source
         self._options, self._stopped, self._say, self._show = options, stopped, say, show
-        history = PlayedHistory(None if source.whole else HORIZON_NS)
+        history = PlayedHistory(kept_ns=None if source.whole else HORIZON_NS)
         self._stand_ins = SiteStandIns(bus, clock, options.session, header, history)
         self._shown_ns = clock.monotonic_ns()
         self._player = Player(
@@ -152,7 +152,7 @@ class Playback:
         return PlaybackSummary(
             counts=dict(zip(self._header.topics, self._player.counts, strict=False)),
             rounds=self._player.rounds,
-            lateness=self._player.lateness if math.isfinite(options.rate) else None,
+            lateness=self._player.lateness.summary() if math.isfinite(options.rate) else None,
             took_s=took_ns / NS_PER_S,
             held_s=self._player.held_ns / NS_PER_S,
             cut=self._player.stalls,
@@ -206,7 +206,7 @@ def play_log(
     """Plays a log over Zenoh; None if it was stopped before it began.
 
     Args:
-        loaded: result of `preload_messages`.
+        loaded: result of `preload_messages` for `paths` and `selection`.
         paths: the files.
         selection: the messages to play.
         options: how to play them.
@@ -232,11 +232,9 @@ def play_log(
             return None
         stack.enter_context(closing(bus))
         refuse_running_session(bus, clock, options.session, stopped)
+        source = stack.enter_context(closing(MessageSource(header, batch)))
         if batch is None:
-            source: MessageSource = ProcessSource(paths, selection, header, loop=options.loop)
-        else:
-            source = MessageSource(batch)
-        stack.enter_context(closing(source))
+            source.read(paths, selection, loop=options.loop)
         playback = Playback(bus, clock, header, source, options, stopped, say, show)
         return playback.play(selection.start_ns)
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 from trilat_net.net.clock import Clock
 
 from .batch import MessageBatch
-from .pace import SPIN_NS, LatenessHistogram, LatenessSummary, Pace, wait_until
-from .reader_process import MessageSource
+from .message_source import MessageSource
+from .pace import SPIN_NS, LatenessHistogram, Pace, wait_until
 from .site_stand_ins import PlayedHistory
 
 MIN_SLACK_NS = 400_000
@@ -20,8 +20,6 @@ SERVICE_EVERY_NS = 10_000_000
 """Longest time without other work."""
 IDLE_NS = 1_000_000
 """Pause while no message is there yet."""
-MESSAGES_PER_SLICE = 256
-"""Messages that are prepared at a time."""
 HELD_NS = 2_000_000
 """A publisher that takes longer waits for others, or for a processor."""
 CUT_NS = 4_900_000_000
@@ -57,6 +55,7 @@ class Player:
         stalls: number of publications that took so long that a receiver lost its connection.
         held_ns: time that publishers waited for others, ns.
         rounds: rounds begun.
+        lateness: of the messages.
     """
 
     def __init__(
@@ -72,29 +71,21 @@ class Player:
     ) -> None:
         self.counts: list[int] = []
         self.stalls = self.rounds = self.held_ns = 0
+        self.lateness = LatenessHistogram()
         self._source, self._history, self._clock, self._publisher = source, history, clock, publisher
         self._attend, self._stopped = attend, stopped
         self._spin_ns = 0 if low_cpu else SPIN_NS
         self._publish: list[Publish] = []
-        self._lateness = LatenessHistogram()
         self._served_ns = self._position_ns = self._published = 0
         self._first: MessageBatch | None = None
 
-    @property
-    def lateness(self) -> LatenessSummary | None:
-        """Lateness of the messages; None without one."""
-        return self._lateness.summary()
-
     def prepare(self) -> int | None:
         """Waits for the first messages; returns the time of the first one, or None if there are none."""
-        while self._first is None and not (self._stopped() or self._source.ended):
-            while self._source.fill():
-                pass
-            self._first = self._source.poll()
-            if self._first is None:
-                self._idle()
-        self._position_ns = int(self._first.times_ns[0]) if self._first is not None else 0
-        return None if self._first is None else self._position_ns
+        self._first = self._next()
+        if self._first is None:
+            return None
+        self._position_ns = int(self._first.times_ns[0])
+        return self._position_ns
 
     def play(self, pace: Pace, *, loop: bool = False) -> None:
         """Plays all messages, round after round if `loop`; returns at the end, or if stopped."""
@@ -103,7 +94,7 @@ class Player:
             for batch in iter(self._next, None):
                 if self.rounds == 1 or not self._source.whole:
                     self._history.add(batch)
-                for piece in batch.pieces(MESSAGES_PER_SLICE):
+                for piece in batch.pieces():
                     self._play(piece, pace)
                     if self._stopped():
                         return
@@ -120,15 +111,12 @@ class Player:
         while batch is None and not (self._source.ended or self._stopped()):
             batch = self._source.poll()
             if batch is None and not self._source.ended and not self._source.fill():
-                self._idle()
+                self._serve()
+                self._clock.sleep_until(self._clock.monotonic_ns() + IDLE_NS)
         return batch
 
-    def _idle(self) -> None:
-        self._serve()
-        self._clock.sleep_until(self._clock.monotonic_ns() + IDLE_NS)
-
     def _play(self, piece: MessageBatch, pace: Pace) -> None:
-        clock, add_lateness, made = self._clock, self._lateness.add, self._history.made
+        clock, add_lateness, made = self._clock, self.lateness.add, self._history.made
         now_ns = clock.monotonic_ns
         for t_ns, channel, number, payload in piece.messages():
             self._position_ns, due_ns, begun_ns = t_ns, pace.due_ns(t_ns), now_ns()
@@ -170,5 +158,5 @@ class Player:
 
     def _serve(self) -> None:
         self._source.fill()
-        self._attend(PlayProgress(self._position_ns, self._published, self._lateness.max_us))
+        self._attend(PlayProgress(self._position_ns, self._published, self.lateness.max_us))
         self._served_ns = self._clock.monotonic_ns()

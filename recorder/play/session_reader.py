@@ -1,11 +1,10 @@
 """Reads the messages to play out of a log: channel and time selection, one pass over the files, preloading.
 
-Invariant: payloads pass through unchanged; only a message's number and its sender's boot are decoded. The
+Invariant: payloads pass through unchanged; only an event's number and a sender's boot are decoded. The
 default selection is what the sites published: neither the recorder's statistics nor the file's views. A
-preloaded log is bounded (L6); a larger one is read by another process during play (`reader_process`).
+preloaded log is bounded (L6); a larger one is read by another process during play (`message_source`).
 """
 
-import hashlib
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +17,17 @@ import msgspec
 from trilat_net import process
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, ScenarioError, UsageError
-from trilat_net.log.log_layout import SCENARIO, SESSION, SITE_CHANNELS
+from trilat_net.log.accounting import number_message
+from trilat_net.log.log_layout import (
+    ALL_CHANNELS,
+    SCENARIO,
+    SESSION,
+    SITE_CHANNELS,
+    ChannelFilter,
+    parse_channel_filter,
+)
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
-from trilat_net.net.bus import matches_key
-from trilat_net.net.loop_stats import ticks_per_stats
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .batch import BatchBuilder, MessageBatch
@@ -36,28 +41,22 @@ class PlaySelection:
     """The messages of a log that are played.
 
     Attributes:
-        include: key expressions of the only channels that are played; none: those that sites published.
-        exclude: key expressions of channels that are not played.
+        channels: the channels that are played; if it includes none by name: those that sites published.
         start_ns: messages before this are not played, ns since the epoch; None: from the first one on.
         stop_ns: messages after this are not played; None: to the last one.
         time: the time that orders messages.
     """
 
-    include: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
+    channels: ChannelFilter = ALL_CHANNELS
     start_ns: int | None = None
     stop_ns: int | None = None
     time: PlayTime = "publish"
 
     def takes(self, topic: str, sites: Collection[str]) -> bool:
         """True if a channel is played, by its topic ("/trilat/paper/m1/state") and the scenario's sites."""
-        key = topic.strip("/")
-        if any(matches_key(expression, key) for expression in self.exclude):
-            return False
-        if self.include:
-            return any(matches_key(expression, key) for expression in self.include)
-        parsed = topics.parse_key(key)
-        return parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
+        parsed = topics.parse_key(topic.strip("/"))
+        published = parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
+        return self.channels.takes(topic.strip("/")) and (published or bool(self.channels.include))
 
     def holds(self, t_ns: int) -> bool:
         """True if an instant is played, ns since the epoch."""
@@ -77,8 +76,8 @@ def parse_selection(
     """Returns the selection that a user's options describe.
 
     Args:
-        include: see `PlaySelection`; a leading slash is allowed.
-        exclude: the same.
+        include: key expressions of the only channels that are played; a leading slash is allowed.
+        exclude: key expressions of channels that are not played.
         start_s: beginning, s since the epoch.
         stop_s: end, s since the epoch.
         duration_s: length in place of `stop_s`, s from `start_s`, or from the epoch.
@@ -98,21 +97,8 @@ def parse_selection(
         stop_s = (start_s or 0.0) + duration_s
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
-    for option, given in (("--include", include), ("--exclude", exclude)):
-        for text in given:  # what is no key expression would match nothing, silently
-            chunks = text.strip("/").split("/")
-            if not all(chunk in ("*", "**") or (chunk and "*" not in chunk) for chunk in chunks):
-                raise UsageError(
-                    f"{option} is a key expression like '**/state' or 'trilat/*/m1/**': chunks are names, "
-                    f"* or **; not {text!r}"
-                )
-    return PlaySelection(
-        tuple(text.strip("/") for text in include),
-        tuple(text.strip("/") for text in exclude),
-        None if start_s is None else round(start_s * NS_PER_S),
-        None if stop_s is None else round(stop_s * NS_PER_S),
-        time,
-    )
+    start_ns, stop_ns = (None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s))
+    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, time)
 
 
 HORIZON_NS = 70 * NS_PER_S
@@ -126,7 +112,6 @@ class _PayloadHeader(msgspec.Struct):
     """The decoded part of a payload, of any schema version."""
 
     boot: int = -1
-    tick: int = -1
     n: int = -1
 
 
@@ -168,11 +153,6 @@ class SessionHeader:
     first_ns: int = 2**62
     last_ns: int = -(2**62)
 
-    @property
-    def scenario_sha256(self) -> str:
-        """Hash of the scenario's text."""
-        return hashlib.sha256(self.scenario_text.encode()).hexdigest()
-
 
 class PlayedMessage(NamedTuple):
     """One message to be played.
@@ -192,46 +172,35 @@ class PlayedMessage(NamedTuple):
 
 
 class _PlayedChannel:
-    """One channel of a file: its number if it is played, and the numbers of its messages."""
+    """One channel of a file: its number if it is played, else -1, and the numbers of its messages."""
 
     def __init__(self, topic: str, header: SessionHeader, selection: PlaySelection) -> None:
         parsed, sites = topics.parse_key(topic.strip("/")), header.scenario.sites
         own = parsed is not None and parsed.member in sites and parsed.session == header.session
         self.site, self.kind = (parsed.member, parsed.channel) if parsed is not None and own else ("", "")
-        self.ticks_per_message = ticks_per_stats(sites[self.site].rate_hz) if self.site else 1
-        self.channel = -1
+        self.rate_hz = sites[self.site].rate_hz if self.site else 0
+        self.place = -1
         if selection.takes(topic, sites):
             if topic not in header.topics:
                 header.topics.append(topic)
-            self.channel = header.topics.index(topic)
+            self.place = header.topics.index(topic)
         self._count = 0
 
     def number(self, item: McapMessage, t_ns: int) -> int:
         """Returns the number of a message, or its time if it has none."""
-        if self.kind == topics.STATE:
-            return item.sequence
-        if self.kind not in (topics.LINK, topics.EVENT):
+        if self.kind in (topics.STATE, topics.LINK):
+            return number_message(self.kind, item.sequence, self.rate_hz)
+        if self.kind != topics.EVENT:
             return t_ns
-        decoded = _decode_header(item.payload)
-        number = decoded.n
-        if self.kind == topics.LINK and decoded.tick >= 0:
-            number = decoded.tick // self.ticks_per_message
-        if self.kind == topics.EVENT and number < 0:  # before version 3 events had no number
-            number = self._count
-        self._count += 1
-        return min(number, _LAST)
+        number = _decode_header(item.payload).n
+        self._count += 1  # before version 3 events had no number
+        return min(number, _LAST) if number >= 0 else self._count - 1
 
 
 class SessionReader:
-    """One pass over the files of a session.
+    """One pass over the files of a session; several are its parts in their order.
 
-    Args:
-        paths: the files; several are the parts of one session in their order.
-        selection: the messages to play.
-        progress: called with the bytes read and their total.
-
-    Attributes:
-        header: the session; None before the first message.
+    `progress` is called with the bytes read and their total. `header` is None before the first message.
     """
 
     def __init__(
@@ -249,9 +218,8 @@ class SessionReader:
         for path in self._paths:
             try:
                 with path.open("rb") as stream:
-                    yield from self._read_file(
-                        path, McapReader(stream, str(path), self._progress, kept=False)
-                    )
+                    reader = McapReader(stream, str(path), self._progress, kept=False)
+                    yield from self._read_file(path, reader)
             except OSError as error:
                 raise LogError(f"{path}: cannot be read: {error.strerror}") from None
 
@@ -268,7 +236,7 @@ class SessionReader:
                 t_ns = item.publish_time_ns  # an impossible stamp: the arrival counts
             t_ns = min(max(t_ns - epoch_ns, -_LAST), _LAST)
             if stop_ns is not None and item.log_time_ns - epoch_ns > stop_ns + HORIZON_NS:
-                return
+                return  # all that follows came later still
             channel = channels.get(item.topic)
             if channel is None:
                 channel = channels[item.topic] = _PlayedChannel(item.topic, header, self._selection)
@@ -277,8 +245,8 @@ class SessionReader:
                 boot = _decode_header(item.payload).boot
                 header.boots.update({channel.site: boot} if boot >= 0 else {})
             number = channel.number(item, t_ns)
-            if channel.channel >= 0 and holds(t_ns):
-                yield PlayedMessage(t_ns, channel.channel, number, item.payload)
+            if channel.place >= 0 and holds(t_ns):
+                yield PlayedMessage(t_ns, channel.place, number, item.payload)
         if epoch_ns is None:
             _, header = self._read_session(path, reader)
         if not reader.complete:
@@ -316,13 +284,7 @@ SEARCH_LIMIT = 100_000
 def preload_messages(
     paths: Sequence[Path], selection: PlaySelection, limit_bytes: int, progress: Progress | None = None
 ) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the session and the messages to play, in order; None in place of more than the limit.
-
-    Args:
-        paths: the files; several are the parts of one session in their order.
-        selection: the messages to play.
-        limit_bytes: most memory.
-        progress: called with the bytes read and their total.
+    """Reads the session and the messages to play, in order; None in place of more than the limit of memory.
 
     Raises:
         LogError: a file is missing, or no log of trilat-net.
@@ -339,7 +301,7 @@ def preload_messages(
         else:
             if reader.header is None:
                 raise LogError(f"{paths[0]}: holds nothing")
-            if not len(waiting):
+            if not waiting.memory:
                 raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
             return reader.header, waiting.ordered()
         assert reader.header is not None  # there was a message

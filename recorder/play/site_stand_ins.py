@@ -5,6 +5,7 @@ identities, nothing is published in a site's name that the log does not hold. Ba
 played: a minute of them when the log is read during play (L6), all of them when it is preloaded.
 """
 
+import hashlib
 import platform
 from bisect import bisect_left
 from collections import deque
@@ -16,7 +17,7 @@ import numpy as np
 
 from trilat_net.errors import WireError
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Query, QueryInbox
+from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import liveliness_token, read_events
 from trilat_net.net.messages import Info
@@ -101,32 +102,6 @@ REFRESH_NS = 500_000_000
 """Longest age of an encoded identity: it holds a whole scenario, which takes long to encode."""
 
 
-class SiteStandIn:
-    """The stand-in for one site; `info` is its identity."""
-
-    def __init__(self, bus: Bus, clock: Clock, session: str, info: Info) -> None:
-        self.info = info
-        self.backfill_queries: QueryInbox = bus.questions(topics.key(session, info.member, topics.PAST))
-        self._clock = clock
-        self._identity_queries = bus.questions(topics.key(session, info.member, topics.INFO))
-        self._answer, self._encoded_ns = b"", -REFRESH_NS
-        answer_pings(bus, clock, session, info)
-        bus.announce(liveliness_token(session, info.member, info.boot))
-
-    def update(self, info: Info) -> None:
-        """Takes another identity."""
-        self.info, self._answer = info, b""
-
-    def answer_identity(self, ticks: int) -> None:
-        """Answers queries for the identity."""
-        while (query := self._identity_queries.poll()) is not None:
-            now_ns = self._clock.monotonic_ns()
-            if not self._answer or now_ns - self._encoded_ns >= REFRESH_NS:
-                self.info = msgspec.structs.replace(self.info, ticks=ticks)
-                self._answer, self._encoded_ns = encode(self.info), now_ns
-            query.answer(self._answer)
-
-
 class SiteStandIns:
     """The stand-ins for all sites of a session, and the recorders that listen.
 
@@ -153,38 +128,37 @@ class SiteStandIns:
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         self._recorder_query = RepeatedQuery(bus, clock, topics.key(session, topics.RECORDER, topics.INFO))
-        self._sites = {
-            site: SiteStandIn(
-                bus,
-                clock,
-                session,
-                Info(
-                    member=site,
-                    boot=boot,
-                    scenario_sha256=header.scenario_sha256,
-                    scenario=header.scenario_text,
-                    host=platform.node(),
-                    clock=clock.identity(),
-                    fingerprint=header.fingerprint,
-                ),
+        self._infos = {
+            site: Info(
+                member=site,
+                boot=boot,
+                scenario_sha256=hashlib.sha256(header.scenario_text.encode()).hexdigest(),
+                scenario=header.scenario_text,
+                host=platform.node(),
+                clock=clock.identity(),
+                fingerprint=header.fingerprint,
             )
             for site, boot in header.boots.items()
         }
+        self._encoded: dict[str, tuple[int, bytes]] = {}  # per site its identity, and since when
+        self._queries = {}
+        for site, info in self._infos.items():
+            keys = topics.key(session, site, topics.INFO), topics.key(session, site, topics.PAST)
+            self._queries[site] = bus.questions(keys[0]), bus.questions(keys[1])
+            answer_pings(bus, clock, session, info)
+            bus.announce(liveliness_token(session, site, info.boot))
 
     def begin(self, pace: Pace) -> None:
         """Shows the session as running, with tick 0 at the instant that the pace gives it."""
         epoch_mono_ns = pace.due_ns(0)
-        epoch_unix_ns = self._clock.unix_ns() + epoch_mono_ns - self._clock.monotonic_ns()
-        for stand_in in self._sites.values():
-            stand_in.update(
-                msgspec.structs.replace(
-                    stand_in.info,
-                    running=True,
-                    epoch_mono_ns=epoch_mono_ns,
-                    epoch_unix_ns=epoch_unix_ns,
-                    boots=dict(self._header.boots),
-                )
-            )
+        running = {
+            "running": True,
+            "epoch_mono_ns": epoch_mono_ns,
+            "epoch_unix_ns": self._clock.unix_ns() + epoch_mono_ns - self._clock.monotonic_ns(),
+            "boots": dict(self._header.boots),
+        }
+        self._infos = {site: msgspec.structs.replace(info, **running) for site, info in self._infos.items()}
+        self._encoded.clear()
 
     def attend(self) -> bool:
         """Answers identity queries, notes presence and events of recorders, and answers one backfill query.
@@ -192,8 +166,9 @@ class SiteStandIns:
         Returns:
             True if there was a backfill query.
         """
-        for site, stand_in in self._sites.items():
-            stand_in.answer_identity(self._history.made.get(self._find_channel(site, topics.STATE), 0))
+        for site, (identity_queries, _) in self._queries.items():
+            while (query := identity_queries.poll()) is not None:
+                query.answer(self._identity(site))
         while (change := self._presence.poll()) is not None:
             parsed = topics.parse_key(change[0])
             if parsed is not None:
@@ -201,12 +176,22 @@ class SiteStandIns:
         for event in read_events(self._recorder_events):
             if event.kind == "stored":
                 self._stored.setdefault(str(event.boot), set()).add(event.about)
-        for site, stand_in in self._sites.items():
-            query = stand_in.backfill_queries.poll()
+        for site, (_, backfill_queries) in self._queries.items():
+            query = backfill_queries.poll()
             if query is not None:
                 self._answer_backfill(site, query)
                 return True
         return False
+
+    def _identity(self, site: str) -> bytes:
+        """Returns a site's identity, encoded a little while ago at most."""
+        encoded_ns, answer = self._encoded.get(site, (0, b""))
+        now_ns = self._clock.monotonic_ns()
+        if not answer or now_ns - encoded_ns >= REFRESH_NS:
+            ticks = self._history.made.get(self._find_channel(site, topics.STATE), 0)
+            answer = encode(msgspec.structs.replace(self._infos[site], ticks=ticks))
+            self._encoded[site] = now_ns, answer
+        return answer
 
     def recorders_listen(self) -> bool:
         """Asks the present recorders for their identities; True once all have answered."""
@@ -221,7 +206,7 @@ class SiteStandIns:
 
     def stored(self, recorders: Collection[str]) -> bool:
         """True if all of these recorders have reported that they stored everything of every site."""
-        return all(self._stored.get(boot, set()) >= self._sites.keys() for boot in recorders)
+        return all(self._stored.get(boot, set()) >= self._infos.keys() for boot in recorders)
 
     def _find_channel(self, site: str, channel: str) -> int:
         topic = "/" + topics.key(self._header.session, site, channel)
@@ -234,13 +219,17 @@ class SiteStandIns:
             return  # a stranger's: it gets no answer
         channel = self._find_channel(site, wanted.channel)
         first, payloads = self._history.chunk(channel, wanted.first, wanted.last)
-        backfill = Backfill(
-            member=site,
-            boot=self._header.boots[site],
-            channel=wanted.channel,
-            first=first,
-            payloads=payloads,
-            made=self._history.made.get(channel, 0),
+        made = self._history.made.get(channel, 0)
+        query.answer(
+            encode(
+                Backfill(
+                    member=site,
+                    boot=self._infos[site].boot,
+                    channel=wanted.channel,
+                    first=first,
+                    payloads=payloads,
+                    made=made,
+                )
+            )
         )
-        query.answer(encode(backfill))
         self.refilled += len(payloads)

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder, unpack_batch
+from recorder.play.batch import BatchBuilder, MessageBatch
 
 messages = st.lists(
     st.tuples(
@@ -17,8 +17,8 @@ messages = st.lists(
 Messages = list[tuple[int, int, int, bytes]]
 
 
-def gathered(given: Messages) -> BatchBuilder:
-    gathering = BatchBuilder()
+def gathered(given: Messages, kept: MessageBatch | None = None) -> BatchBuilder:
+    gathering = BatchBuilder(kept)
     for message in given:
         gathering.add(*message)
     return gathering
@@ -33,21 +33,18 @@ def test_every_payload_stays_with_its_channel_and_number(given: Messages) -> Non
 
 
 @given(messages, st.integers(1, 7))
-def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, count: int) -> None:
+def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, size: int) -> None:
     block = gathered(given).ordered()
     whole = list(block.messages())
-    pieces = list(block.pieces(count))
-    assert all(1 <= len(piece) <= count for piece in pieces)
+    pieces = list(block.pieces(size))
+    assert all(len(piece) and len(piece.compact().data) <= size + 9 for piece in pieces)
     assert [message for piece in pieces for message in piece.messages()] == whole
-    assert [message for piece in pieces for message in unpack_batch(piece.packed()).messages()] == whole
+    assert [message for piece in pieces for message in piece.compact().messages()] == whole
 
 
 @given(messages, messages)
 def test_what_was_put_in_order_may_be_put_in_order_again_with_more(one: Messages, two: Messages) -> None:
     """For messages whose numbers ascend in the file, as they come of a log that misses nothing."""
     rising = [(t_ns, channel, n, payload + b".") for n, (t_ns, channel, _, payload) in enumerate(one + two)]
-    again = gathered([])
-    again.keep(gathered(rising[: len(one)]).ordered())
-    for message in rising[len(one) :]:
-        again.add(*message)
+    again = gathered(rising[len(one) :], gathered(rising[: len(one)]).ordered())
     assert list(again.ordered().messages()) == list(gathered(rising).ordered().messages())

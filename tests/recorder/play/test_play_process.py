@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from recorder.play.message_source import MessageSource
 from recorder.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions, map_key_to_session
 from recorder.play.player import PlayProgress
-from recorder.play.reader_process import MessageSource
 from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.net.waiting import drained
 from trilat_net.errors import SessionError
 from trilat_net.execution.virtual import virtual_boot
+from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
 from trilat_net.net.discovery import refuse_running_session
@@ -73,7 +74,7 @@ class Hall:
             bus,
             self.clock,
             facts,
-            MessageSource(block),
+            MessageSource(facts, block),
             self.options,
             lambda: self.count >= self.stop_at,
             lambda _: None,
@@ -222,7 +223,7 @@ def test_it_stays_until_the_recorder_has_everything_or_for_a_while(
 
 
 def test_it_is_played_in_its_own_name_with_nothing_of_the_recorder(log_file: Path) -> None:
-    hall = Hall(log_file, PlayOptions("other"), PlaySelection(exclude=("**/link",)))
+    hall = Hall(log_file, PlayOptions("other"), PlaySelection(ChannelFilter(exclude=("**/link",))))
     hall.play()
     wanted = {key: found for key, found in session_payloads(log_file).items() if not key.endswith("link")}
     assert hall.heard == wanted

@@ -70,7 +70,7 @@ def test_windows_that_cannot_be_meant(
         parse_selection((), (), start_s, stop_s, duration_s, "publish")
 
 
-@pytest.mark.parametrize("text", ["", "/", "a//b", "m*", "**x/state", "a/*b"])
+@pytest.mark.parametrize("text", ["", "a//b", "m*", "a/*b"])
 def test_what_is_no_key_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="--exclude is a key expression like"):
         parse_selection((), (text,), None, None, None, "publish")

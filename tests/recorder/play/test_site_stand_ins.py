@@ -18,7 +18,7 @@ def remembered(numbers: list[int], played: int, size: int = 1, kept_ns: int | No
     for place, number in enumerate(numbers):
         gathering.add(place, CHANNEL, number, number.to_bytes(2, "big") * size)
         gathering.add(place, OTHER, number, b"other")
-    for piece in gathering.ordered().pieces(7):
+    for piece in gathering.ordered().pieces(40):
         memory.add(piece)
     if played:
         memory.made[CHANNEL] = numbers[played - 1] + 1

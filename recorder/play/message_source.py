@@ -1,0 +1,209 @@
+"""The source of a player's messages: a preloaded batch, or a process that reads ahead and sorts.
+
+Invariant: polling the source never waits. The reader process is bounded (L6) by `HORIZON_NS` of the log, the
+farthest that a message may stand from its turn, and by `LIMIT_BYTES`; it blocks on the pipe when the player
+does not read, and the two share nothing else.
+"""
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from trilat_net import process
+from trilat_net.errors import LogError, RuntimeFault
+
+from .batch import BatchBuilder, MessageBatch
+from .session_reader import HORIZON_NS, PlayedMessage, PlaySelection, SessionHeader, SessionReader
+
+AHEAD_BYTES = 16 * 1024 * 1024
+STEP_NS = 10_000_000_000
+"""Length of log that is put in order at a time."""
+LIMIT_BYTES = 512 * 1024 * 1024
+NICENESS = -5
+"""Priority over others if permitted, because the player waits for it; below the player's."""
+
+
+class RoundEnd(NamedTuple):
+    """The end of a round: messages that stood too far from their turn, and damaged files with the reason."""
+
+    strays: int
+    torn: dict[Path, str]
+
+
+class ReadPiece(NamedTuple):
+    """What the reader process sends: messages, and the topics of all channels so far."""
+
+    topics: list[str]
+    batch: MessageBatch
+
+
+class MessageSource:
+    """Messages in play order, round after round.
+
+    Args:
+        header: content of the files; gets the topics and damages that a reader process finds.
+        batch: all messages; None: `read` starts a process that reads them.
+
+    Attributes:
+        ended: True once all messages of this round were given.
+        whole: True if one batch is the whole round.
+        strays: messages that stood so far from their turn in the file that they are not played in it.
+    """
+
+    def __init__(self, header: SessionHeader, batch: MessageBatch | None) -> None:
+        self.whole = batch is not None
+        self.ended = False
+        self.strays = 0
+        self._header, self._batch = header, batch
+        self._ahead: deque[ReadPiece | RoundEnd | LogError] = deque()
+        self._ahead_bytes = 0
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self.restart()
+
+    def read(self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool) -> None:
+        """Starts the reader process; `loop`: it reads round after round."""
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=feed_player, args=(theirs, paths, selection, loop), daemon=True
+        )
+        with process.hold_sigint():  # Ctrl-C is the player's, which ends this process
+            self._process.start()
+        theirs.close()
+
+    def poll(self) -> MessageBatch | None:
+        """Returns the next messages, or None if there are none, or none yet; never waits.
+
+        Raises:
+            LogError: a file cannot be read any more.
+        """
+        if self.ended or not self._ahead:
+            return None
+        item = self._ahead.popleft()
+        if isinstance(item, LogError):
+            raise item
+        if isinstance(item, ReadPiece):
+            self._header.topics[:] = item.topics
+            self._ahead_bytes -= len(item.batch.data)
+            return item.batch
+        self.strays += item.strays
+        self._header.torn.update(item.torn)
+        self.ended = True
+        return None
+
+    def fill(self) -> bool:
+        """Reads a little ahead; False if there is nothing to read now.
+
+        Raises:
+            RuntimeFault: the process failed.
+        """
+        if self._process is None or self._ahead_bytes > AHEAD_BYTES or not self._pipe.poll():
+            return False
+        try:
+            item = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            if self._process.exitcode:
+                raise RuntimeFault(
+                    f"the process that reads the log ended with {self._process.exitcode}"
+                ) from None
+            return False
+        self._ahead.append(item)
+        self._ahead_bytes += len(item.batch.data) if isinstance(item, ReadPiece) else 0
+        return True
+
+    def restart(self) -> None:
+        """Begins another round."""
+        self.ended = False
+        if self._batch is not None:
+            self._ahead.extend((ReadPiece(self._header.topics, self._batch), RoundEnd(0, {})))
+
+    def close(self) -> None:
+        """Ends the source; safe to call again."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.join()
+            self._pipe.close()
+
+
+class MessageSorter:
+    """Puts messages in order that stand in the file at most a horizon from their turn.
+
+    Args:
+        messages: the messages in file order.
+        horizon_ns: that horizon.
+        step_ns: length of log that is put in order at a time.
+        limit_bytes: most memory; a longer horizon is shortened.
+
+    Attributes:
+        strays: messages that stood further from their turn.
+    """
+
+    def __init__(
+        self,
+        messages: Iterable[PlayedMessage],
+        horizon_ns: int = HORIZON_NS,
+        step_ns: int = STEP_NS,
+        limit_bytes: int = LIMIT_BYTES,
+    ) -> None:
+        self.strays = 0
+        self._messages, self._horizon_ns, self._step_ns = messages, horizon_ns, step_ns
+        self._limit_bytes = limit_bytes
+        self._waiting = BatchBuilder()
+        self._given: dict[int, int] = {}  # per channel the last number
+
+    def batches(self) -> Iterator[MessageBatch]:
+        """Yields the messages in play order."""
+        newest_ns, next_ns = -(2**62), None
+        for message in self._messages:
+            self._waiting.add(*message)
+            self.strays += message.number < self._given.get(message.channel, -1)
+            newest_ns = max(newest_ns, message.t_ns)
+            if next_ns is None:
+                next_ns = message.t_ns + self._horizon_ns + self._step_ns
+            if newest_ns >= next_ns:
+                yield self._release(newest_ns - self._horizon_ns)
+                next_ns = newest_ns + self._step_ns
+            elif self._waiting.memory > self._limit_bytes:
+                yield self._release(None)
+        yield self._release(1 << 62)
+
+    def _release(self, until_ns: int | None) -> MessageBatch:
+        """Returns the messages that are due until then, or half of all, and keeps the rest."""
+        ordered = self._waiting.ordered()
+        count = (len(ordered) + 1) // 2
+        if until_ns is not None:
+            count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
+        self._waiting = BatchBuilder(ordered.part(slice(count, None)))
+        released = ordered.part(slice(count))
+        for channel in np.unique(released.channels).tolist():
+            last = int(released.numbers[released.channels == channel].max())
+            self._given[channel] = max(last, self._given.get(channel, -1))
+        return released
+
+
+def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool) -> None:
+    """Sends rounds of messages, until everything is read or the player has ended."""
+    with suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    with suppress(BrokenPipeError, ConnectionResetError), process.pause_gc():
+        try:
+            while True:
+                reader = SessionReader(paths, selection)
+                sorter = MessageSorter(reader.messages())
+                for batch in sorter.batches():
+                    for piece in batch.pieces():
+                        assert reader.header is not None  # there was a message
+                        pipe.send(ReadPiece(reader.header.topics, piece.compact()))
+                pipe.send(RoundEnd(sorter.strays, reader.header.torn if reader.header else {}))
+                if not loop:
+                    return
+        except LogError as error:
+            pipe.send(LogError(str(error)))

@@ -1,0 +1,143 @@
+"""A log that is read while it plays is the same log."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from multiprocessing import Pipe, get_context
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.play.batch import BatchBuilder, MessageBatch
+from recorder.play.message_source import MessageSorter, MessageSource, feed_player
+from recorder.play.session_reader import PlayedMessage, PlaySelection, SessionHeader, preload_messages
+from tests.net.waiting import until
+from trilat_net.errors import LogError, RuntimeFault
+
+from .logs import write
+
+LARGE = 1 << 28
+Message = tuple[int, int, int, bytes]
+
+
+def whole(messages: list[PlayedMessage]) -> list[Message]:
+    gathering = BatchBuilder()
+    for message in messages:
+        gathering.add(*message)
+    return list(gathering.ordered().messages())
+
+
+def joined(blocks: list[MessageBatch]) -> list[Message]:
+    return [message for block in blocks for message in block.messages()]
+
+
+@given(
+    steps=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 2), st.integers(0, 30)), max_size=60),
+    step_ns=st.integers(1, 20),
+)
+def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
+    steps: list[tuple[int, int, int]], step_ns: int
+) -> None:
+    """Messages come up to 30 ns late in the file; a channel's times go with its numbers."""
+    t_ns, made = 0, [0, 0, 0]
+    sent = []
+    for step, channel, delay in steps:
+        t_ns += step
+        sent.append((t_ns + delay, PlayedMessage(t_ns, channel, made[channel], bytes([len(sent)]))))
+        made[channel] += 1
+    messages = [message for _, message in sorted(sent, key=lambda entry: entry[0])]
+    sorting = MessageSorter(messages, 30, step_ns)
+    assert joined(list(sorting.batches())) == whole(messages)
+    assert sorting.strays == 0
+
+
+def test_what_stands_further_away_is_played_all_the_same_and_counted() -> None:
+    rising = [PlayedMessage(t, 0, t, b"") for t in range(1, 100)]
+    sorting = MessageSorter([*rising, PlayedMessage(0, 0, 0, b"stray")], 30, 10)
+    assert len(joined(list(sorting.batches()))) == 100
+    assert sorting.strays == 1
+
+
+def test_what_would_be_too_much_to_hold_is_given_before_its_time() -> None:
+    """A file that says that everything was sent at once."""
+    sorting = MessageSorter([PlayedMessage(0, 0, n, bytes(100)) for n in range(1000)], limit_bytes=20_000)
+    blocks = list(sorting.batches())
+    assert [n for _, _, n, _ in joined(blocks)] == list(range(1000))
+    assert max(map(len, blocks)) <= 20_000 // 100
+    assert sorting.strays == 0
+
+
+@contextmanager
+def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
+    """A source whose process reads a log, and its header."""
+    header, _ = preload_messages([path], PlaySelection(), 0)
+    with closing(MessageSource(header, None)) as source:
+        source.read([path], PlaySelection(), loop=loop)
+        yield source, header
+    source.close()  # again
+
+
+def taken(source: MessageSource) -> list[MessageBatch]:
+    """A round of a source, whose process writes while this one reads."""
+    blocks = []
+
+    def over() -> bool:
+        source.fill()
+        while (block := source.poll()) is not None:
+            blocks.append(block)
+        return source.ended
+
+    until(over, 30.0)
+    return blocks
+
+
+def rounds(source: MessageSource, count: int) -> Iterator[list[Message]]:
+    for _ in range(count):
+        yield joined(taken(source))
+        source.restart()
+
+
+def test_a_process_of_its_own_gives_round_after_round_what_would_have_been_loaded(log_file: Path) -> None:
+    loaded, block = preload_messages([log_file], PlaySelection(), LARGE)
+    assert block is not None
+    with reading(log_file, loop=True) as (source, header):
+        assert list(rounds(source, 3)) == [list(block.messages())] * 3
+        assert header.topics == loaded.topics
+        assert (source.strays, header.torn) == (0, {})
+
+
+def _killed(source: MessageSource, _path: Path) -> None:
+    assert source._process is not None
+    source._process.kill()
+
+
+@pytest.mark.parametrize(
+    ("happens", "error", "says"),
+    [
+        (lambda _, path: path.unlink(), LogError, r"run\.mcap: cannot be read"),
+        (_killed, RuntimeFault, "the process that reads the log ended with -9"),
+    ],
+)
+def test_what_the_process_cannot_read_is_an_error_here(
+    happens: Callable[[MessageSource, Path], None], error: type[Exception], says: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
+    header, _ = preload_messages([path], PlaySelection(), 0)
+    with closing(MessageSource(header, None)) as source:
+        source.read([path], PlaySelection(), loop=True)
+        happens(source, path)
+        with pytest.raises(error, match=says):
+            list(rounds(source, 1000))
+
+
+def test_a_process_whose_player_is_gone_ends_by_itself(log_file: Path) -> None:
+    ours, theirs = Pipe()
+    reader = get_context("spawn").Process(
+        target=feed_player, args=(theirs, [log_file], PlaySelection(), True), daemon=True
+    )
+    reader.start()
+    theirs.close()
+    ours.close()
+    until(lambda: not reader.is_alive(), 30.0)
+    assert reader.exitcode == 0
