@@ -7,6 +7,8 @@ does not read, and the two share nothing else.
 
 import multiprocessing
 import os
+import pickle
+import struct
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -22,6 +24,9 @@ from trilat_net.errors import LogError, RuntimeFault
 from .batch import BatchBuilder, MessageBatch
 from .session_reader import HORIZON_NS, PlayedMessage, PlaySelection, SessionHeader, SessionReader
 
+SIZE = struct.Struct("<Q")
+"""Number of bytes of the pickle that follows, in the pipe of a reader process."""
+READ_BYTES = 65_536
 AHEAD_BYTES = 16 * 1024 * 1024
 STEP_NS = 10_000_000_000
 """Length of log that is put in order at a time."""
@@ -64,13 +69,15 @@ class MessageSource:
         self._header, self._batch = header, batch
         self._ahead: deque[ReadPiece | RoundEnd | LogError] = deque()
         self._ahead_bytes = 0
+        self._received = bytearray()
         self._process: multiprocessing.process.BaseProcess | None = None
         self.restart()
 
     def read(self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool) -> None:
         """Starts the reader process; `loop`: it reads round after round."""
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
+        self._pipe, theirs = context.Pipe(duplex=False)
+        os.set_blocking(self._pipe.fileno(), False)  # as its own methods would wait for the rest of a piece
         self._process = context.Process(
             target=feed_player, args=(theirs, paths, selection, loop), daemon=True
         )
@@ -104,19 +111,25 @@ class MessageSource:
         Raises:
             RuntimeFault: the process failed.
         """
-        if self._process is None or self._ahead_bytes > AHEAD_BYTES or not self._pipe.poll():
+        if self._process is None or self._ahead_bytes > AHEAD_BYTES:
             return False
         try:
-            item = self._pipe.recv()
-        except (EOFError, OSError):
-            self._process.join()
-            if self._process.exitcode:
-                raise RuntimeFault(
-                    f"the process that reads the log ended with {self._process.exitcode}"
-                ) from None
+            read = os.read(self._pipe.fileno(), READ_BYTES)
+        except BlockingIOError:
             return False
-        self._ahead.append(item)
-        self._ahead_bytes += len(item.batch.data) if isinstance(item, ReadPiece) else 0
+        if not read:
+            if self._process.exitcode:  # None while it ends, which takes time that the player does not have
+                raise RuntimeFault(f"the process that reads the log ended with {self._process.exitcode}")
+            return False
+        self._received += read
+        while len(self._received) >= SIZE.size:
+            end = SIZE.size + SIZE.unpack_from(self._received)[0]
+            if len(self._received) < end:
+                break
+            item = pickle.loads(self._received[SIZE.size : end])
+            del self._received[:end]
+            self._ahead.append(item)
+            self._ahead_bytes += len(item.batch.data) if isinstance(item, ReadPiece) else 0
         return True
 
     def restart(self) -> None:
@@ -193,7 +206,13 @@ def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelectio
     """Sends rounds of messages, until everything is read or the player has ended."""
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-    with suppress(BrokenPipeError, ConnectionResetError), process.pause_gc():
+
+    def send(item: ReadPiece | RoundEnd | LogError) -> None:
+        pickled = pickle.dumps(item)
+        sink.write(SIZE.pack(len(pickled)) + pickled)
+        sink.flush()
+
+    with suppress(BrokenPipeError), process.pause_gc(), open(pipe.fileno(), "wb", closefd=False) as sink:
         try:
             while True:
                 reader = SessionReader(paths, selection)
@@ -201,9 +220,9 @@ def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelectio
                 for batch in sorter.batches():
                     for piece in batch.pieces():
                         assert reader.header is not None  # there was a message
-                        pipe.send(ReadPiece(reader.header.topics, piece.compact()))
-                pipe.send(RoundEnd(sorter.strays, reader.header.torn if reader.header else {}))
+                        send(ReadPiece(reader.header.topics, piece.compact()))
+                send(RoundEnd(sorter.strays, reader.header.torn if reader.header else {}))
                 if not loop:
                     return
         except LogError as error:
-            pipe.send(LogError(str(error)))
+            send(LogError(str(error)))

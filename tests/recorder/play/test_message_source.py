@@ -132,7 +132,7 @@ def test_what_the_process_cannot_read_is_an_error_here(
 
 
 def test_a_process_whose_player_is_gone_ends_by_itself(log_file: Path) -> None:
-    ours, theirs = Pipe()
+    ours, theirs = Pipe(duplex=False)
     reader = get_context("spawn").Process(
         target=feed_player, args=(theirs, [log_file], PlaySelection(), True), daemon=True
     )
