@@ -41,30 +41,21 @@ _FLAT = 1e-8
 
 
 class EquilibriumRun(NamedTuple):
-    """The end of a run.
+    """The end of a run: its time, s, its largest joint speed in the last second, rad/s, and the pose.
 
     Attributes:
-        t_s: its time, s.
-        speed_rad_s: the largest joint speed of the last second, rad/s.
+        at_rest: True if it ended at an equilibrium; otherwise the pose is the mean over its last quarter.
         diverged: True if a site left its limits.
-        q: joint angles at the end, shape (N, 2), rad.
-        theta_hat: estimates at the end, shape (N, 5).
-        mean_q: mean joint angles over the last quarter, shape (N, 2), rad.
-        mean_theta_hat: mean estimates over the last quarter, shape (N, 5).
+        q: joint angles, shape (N, 2), rad.
+        theta_hat: estimates, shape (N, 5).
     """
 
     t_s: float
     speed_rad_s: float
+    at_rest: bool
     diverged: bool
     q: Array
     theta_hat: Array
-    mean_q: Array
-    mean_theta_hat: Array
-
-    @property
-    def at_rest(self) -> bool:
-        """True if the run ended at an equilibrium."""
-        return not self.diverged and self.speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
 
 
 def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
@@ -86,9 +77,14 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
         if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
             break
         until_s *= 2.0
-    mean_q, mean_theta_hat = (np.mean(values, axis=0) for values in zip(*states, strict=True))
     diverged = run.diverged_s is not None
-    return EquilibriumRun(run.ran_s, speed_rad_s, diverged, run.q, run.theta_hat, mean_q, mean_theta_hat)
+    at_rest = not diverged and speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
+    q, theta_hat = (
+        (run.q, run.theta_hat)
+        if at_rest
+        else (np.mean(values, axis=0) for values in zip(*states, strict=True))
+    )
+    return EquilibriumRun(run.ran_s, speed_rad_s, at_rest, diverged, q, theta_hat)
 
 
 def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
@@ -254,14 +250,15 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
 def _start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
     """Returns the start poses, at rest, with true estimates."""
     q = np.array([spec.q0_rad for spec in scenario.sites.values()])
-    theta = np.array([site.theta for site in conditions.sites])
-    return Equilibrium(q, _complete_estimates(conditions, theta), "", 0.0)
+    return Equilibrium(q, _complete_estimates(conditions), "", 0.0)
 
 
-def _complete_estimates(conditions: OperatingConditions, theta_hat: Array) -> Array:
-    """Returns estimates in which those of laws that learn nothing are the parameters of the law."""
+def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None = None) -> Array:
+    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters."""
+    truth = [site.theta for site in conditions.sites]
     rows = [
-        theta_hat[i] if has_estimate(site) else site.gains.known for i, site in enumerate(conditions.sites)
+        own if has_estimate(site) else site.gains.known
+        for site, own in zip(conditions.sites, truth if theta_hat is None else theta_hat, strict=True)
     ]
     return np.array(rows, dtype=np.float64)
 
@@ -270,8 +267,9 @@ def _take_pose(pose: tuple[float, float], conditions: OperatingConditions) -> Eq
     if len(pose) != 2 or not np.isfinite(pose).all():
         raise UsageError(f"--pose is two angles in rad, as in --pose 0.1,0.3, not {pose}")
     q = np.tile(np.array(pose, dtype=np.float64), (len(conditions.sites), 1))
-    theta = _complete_estimates(conditions, np.array([site.theta for site in conditions.sites]))
-    rest = Equilibrium(q, theta, "the pose that was asked for, with theta_hat = theta", 0.0)
+    rest = Equilibrium(
+        q, _complete_estimates(conditions), "the pose that was asked for, with theta_hat = theta", 0.0
+    )
     return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
 
 
@@ -281,16 +279,13 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         rest = predict_from_start(conditions, _start(conditions, scenario))
         how = f"the run diverges at {end.t_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
-    if end.at_rest:
-        q, theta_hat = end.q, end.theta_hat
-        how = f"the run is at rest at {end.t_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
-    else:
-        q, theta_hat = end.mean_q, end.mean_theta_hat
-        how = (
-            f"the run still moves at {end.t_s:.4g} s ({end.speed_rad_s:.2g} rad/s): the equilibrium nearest "
-            "to the mean of its last quarter"
-        )
-    start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
+    how = (
+        f"the run is at rest at {end.t_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
+        if end.at_rest
+        else f"the run still moves at {end.t_s:.4g} s ({end.speed_rad_s:.2g} rad/s): the equilibrium nearest "
+        "to the mean of its last quarter"
+    )
+    start = Equilibrium(end.q, _complete_estimates(conditions, end.theta_hat), how, 0.0)
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 

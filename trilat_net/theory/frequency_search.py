@@ -6,12 +6,13 @@ steps stay hidden.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
+from .characteristic_roots import Complex
 from .port_response import PortResponse
 
 FrequencyCurve = Callable[[Array], Array]
@@ -88,18 +89,31 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
 
     At a pole on the axis refinement stops when two points differ by a millionth.
     """
-    Y = response(w_rad_s)
-    for _ in range(_ROUNDS):
+
+    def find_wide(Y: Complex) -> NDArray[np.bool_]:
         size = np.linalg.norm(Y, axis=(1, 2))
         change = np.linalg.norm(np.diff(Y, axis=0), axis=(1, 2))
-        wide = change > _CHANGE * np.maximum(np.maximum(size[1:], size[:-1]), 1e-300)
-        wide &= w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST)
+        wide: NDArray[np.bool_] = change > _CHANGE * np.maximum(np.maximum(size[1:], size[:-1]), 1e-300)
+        return wide
+
+    return _refine(response, w_rad_s, find_wide)[0]
+
+
+def _refine(
+    function: Callable[[Array], NDArray[Any]],
+    w_rad_s: Array,
+    find_wide: Callable[[NDArray[Any]], NDArray[np.bool_]],
+) -> tuple[Array, NDArray[Any]]:
+    """Returns frequencies and a function's values at them, halving the steps that its values call wide."""
+    values = function(w_rad_s)
+    for _ in range(_ROUNDS):
+        wide = find_wide(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
         if not wide.any() or len(w_rad_s) > 2 * _MAX_POINTS:
             break
-        between = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide]
-        place = np.flatnonzero(wide) + 1
-        w_rad_s, Y = np.insert(w_rad_s, place, between), np.insert(Y, place, response(between), axis=0)
-    return w_rad_s
+        between, place = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide], np.flatnonzero(wide) + 1
+        w_rad_s = np.insert(w_rad_s, place, between)
+        values = np.insert(values, place, function(between), axis=0)
+    return w_rad_s, values
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
@@ -120,24 +134,20 @@ def find_minima(
         tolerance: least depth below the level, and of a minimum below its neighbours; None: zero.
     """
     allowed = tolerance or (lambda w: np.zeros(len(w)))
-    values, rounding = curve(w_rad_s), allowed(w_rad_s)
-    for _ in range(_ROUNDS):
-        wide = _find_steps_at_minima(values, rounding) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
-        if not wide.any() or len(w_rad_s) > 2 * _MAX_POINTS:
-            break
-        between = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide]
-        place = np.flatnonzero(wide) + 1
-        w_rad_s, values = np.insert(w_rad_s, place, between), np.insert(values, place, curve(between))
-        rounding = np.insert(rounding, place, allowed(between))
+    w_rad_s, both = _refine(
+        lambda w: np.stack([curve(w), allowed(w)], axis=1), w_rad_s, _find_steps_at_minima
+    )
+    values, rounding = both.T
     below = _find_bands_below(lambda w: curve(w) + allowed(w), w_rad_s, values + rounding, level)
     return Minima(w_rad_s, values, below)
 
 
-def _find_steps_at_minima(values: Array, rounding: Array) -> NDArray[np.bool_]:
+def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     """Returns the steps at minima that are not settled: a neighbour is more than 1 % above them.
 
     1 % of their depth, or of that of the deepest if that is more; and more than rounding.
     """
+    values, rounding = curve_and_rounding.T
     middle, rise = values[1:-1], np.maximum(values[:-2], values[2:]) - values[1:-1]
     low = (middle <= values[:-2]) & (middle <= values[2:])
     low &= rise > np.maximum(_SETTLED * np.maximum(np.abs(middle), abs(values.min())), rounding[1:-1])

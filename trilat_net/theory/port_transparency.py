@@ -19,7 +19,15 @@ from ..core.vectors import Array
 from ..errors import UsageError
 from .characteristic_roots import Complex
 from .linear_loop import LinearLoop
-from .port_response import CLAMPED, FREE, PortLoad, apply_loads, build_admittance, find_site_ports
+from .port_response import (
+    CLAMPED,
+    FREE,
+    PortLoad,
+    apply_loads,
+    build_admittance,
+    find_site_ports,
+    select_ports,
+)
 
 Z_WIDTH_BAND_HZ = (0.1, 10.0)
 """The band of Z-widths: below it operators drift, above it they do not move deliberately."""
@@ -79,28 +87,6 @@ class Transparency(NamedTuple):
         return float(np.exp(np.trapezoid(logs, x) / (x[-1] - x[0])))
 
 
-def compute_transmitted_impedance(
-    loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array
-) -> Complex:
-    """Returns the impedance matrix at a site, shape (F, 2, 2), N m s/rad.
-
-    Z_t(j w) = Y_ii(j w)^{-1} with Y of the loop with loads at the other sites; sites without a load are free.
-
-    Raises:
-        UsageError: no such site, or a load that is not valid.
-    """
-    return np.linalg.inv(_site_admittance(loop, site, loads, w_rad_s)).astype(np.complex128)
-
-
-def _site_admittance(loop: LinearLoop, site: str, loads: Mapping[str, PortLoad], w_rad_s: Array) -> Complex:
-    find_site_ports(loop, site)
-    if site in loads:
-        raise UsageError(f"a load at {site} would be at the operator's own site")
-    loaded = apply_loads(loop, loads)
-    places = find_site_ports(loaded, site)
-    return build_admittance(loaded)(w_rad_s)[:, places][:, :, places]
-
-
 def measure_transparency(
     loop: LinearLoop,
     at: str,
@@ -108,14 +94,9 @@ def measure_transparency(
     others: Mapping[str, PortLoad] | None = None,
     band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ,
 ) -> tuple[Transparency, ...]:
-    """Returns the transparency along each joint of a site, with another site free and clamped.
+    """Returns the transparency along each joint of site `at`, with site `of` free and clamped.
 
-    Args:
-        loop: the teleoperator.
-        at: the operator's site.
-        of: the site that is free or clamped.
-        others: loads at the rest; free if not named.
-        band_hz: the band of the means, Hz.
+    Z(j w) = 1 / Y_ii(j w) with Y of the loop with loads at `others`; the rest is free.
 
     Raises:
         UsageError: no such site, both are one, or the band is empty.
@@ -124,10 +105,17 @@ def measure_transparency(
     low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
     w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
-    free, clamped = (
-        _site_admittance(loop, at, {**(others or {}), of: load}, w_rad_s) for load in (FREE, CLAMPED)
-    )
-    joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in find_site_ports(loop, at)]
+    places = find_site_ports(loop, at)
+    if at == of or at in (others or {}):
+        raise UsageError(f"a load at {at} would be at the operator's own site")
+
+    def admittance(load: PortLoad) -> Complex:
+        """Returns the admittance at the operator's site with a load at the other one."""
+        loaded = apply_loads(loop, {**(others or {}), of: load})
+        return select_ports(build_admittance(loaded), find_site_ports(loaded, at))(w_rad_s)
+
+    free, clamped = admittance(FREE), admittance(CLAMPED)
+    joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
         Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)
         for n, joint in enumerate(joints)
