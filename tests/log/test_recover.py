@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import zstandard
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -137,6 +137,7 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
 
 @anywhere
 @given(made_by=LOGS, share=positions)
+@example(made_by=log, share=0.0)
 def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
     made_by: Callable[[], bytes], share: float, tmp_path: Path
 ) -> None:

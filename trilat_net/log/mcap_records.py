@@ -303,7 +303,7 @@ class RecordScanner:
 
     def footer(self) -> records.Footer | None:
         """Returns the footer of a finished file; None for another."""
-        content = self.read(self.size - FOOTER_BYTES + RECORD_HEAD_BYTES, 20)
+        content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
