@@ -46,11 +46,11 @@ def test_changes_come_in_the_order_in_which_they_hold_and_those_after_the_end_ne
 
 def test_what_is_stated_of_a_link_changes_with_it():
     log = logs.busy().log
-    assert [(s.from_s, s.link.describe()) for s in list_stated_models(log, "a->c")] == [
+    assert [(s.from_s, s.link.describe()) for s in list_stated_models(log, "a->c", list_changes(log))] == [
         (0.0, "50 ms"),
         (1.0, "90 ms, loss 10 %"),
     ]
-    assert [s.from_s for s in list_stated_models(log, "b->a")] == [0.0]
+    assert [s.from_s for s in list_stated_models(log, "b->a", list_changes(log))] == [0.0]
 
 
 @pytest.mark.parametrize("text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}'])

@@ -15,7 +15,7 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..log.log_layout import SESSION
 from ..log.log_reader import open_log
-from ..log.mcap_reader import ChannelInfo, McapReader, Progress
+from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
 from ..net import topics
 from ..net.loop_stats import ticks_per_stats
 from .health import JsonObject, describe_link_health, describe_session, describe_site_health, percentiles
@@ -26,11 +26,7 @@ MOST_LISTED_GAPS = 1000
 
 
 class FileInventory:
-    """Content of a file, or of the files of one log.
-
-    Args:
-        paths: the files.
-        progress: called with the bytes read and those in all.
+    """Content of a file, or of the files of one log; `progress` gets the bytes read and those in all.
 
     Attributes:
         files: facts of every file, keys ending in their units.
@@ -48,10 +44,9 @@ class FileInventory:
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
-            shifted = None if progress is None else _shifted(progress, before, total)
             try:
                 with path.open("rb") as stream:
-                    self._read(path, McapReader(stream, str(path), shifted))
+                    self._read(path, McapReader(stream, str(path), shift_progress(progress, before, total)))
             except OSError as error:
                 raise LogError(f"{path}: cannot be read: {error.strerror}") from None
             before += path.stat().st_size
@@ -75,7 +70,7 @@ class FileInventory:
                 "finished": walk.complete,
                 "cut_off_at_byte": None if walk.torn is None else walk.torn.offset,
                 "damaged": [
-                    {"offset": part.offset, "length": part.length, "problem": part.problem}
+                    {key: getattr(part, key) for key in ("offset", "length", "problem")}
                     for part in walk.damaged
                 ],
                 "chunks": walk.chunks.total(),
@@ -89,12 +84,7 @@ class FileInventory:
         )
 
     def channels(self, session: str = "", rates_hz: Mapping[str, int] | None = None) -> dict[str, JsonObject]:
-        """Returns the facts of every channel by topic, keys ending in their units.
-
-        Args:
-            session: its name, if these are files of ours.
-            rates_hz: the tick rates of its sites.
-        """
+        """Returns the facts of every channel by topic; gaps of those of a session's sites."""
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
         return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
 
@@ -109,7 +99,8 @@ class FileInventory:
             "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
-            "between_ms": _between_ms(log_ns),
+            # in the order of the file
+            "between_ms": percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6),
             "encoding": about.encoding,
             "schema": about.schema,
             **_numbers(topic, sequence, session, rates_hz),
@@ -132,56 +123,38 @@ def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int
     return {"missing": missing, "gaps": gaps, "duplicates": len(came) - len(there)}
 
 
-def _between_ms(log_ns: Any) -> JsonObject | None:
-    """Returns the time between messages in the order of the file, ms; None of less than two."""
-    return percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6)
-
-
-def _shifted(progress: Progress, before: int, total: int) -> Progress:
-    return lambda done, _: progress(before + done, total)
-
-
 def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
     """Returns the facts of a file, or of the parts of one log, ready for JSON; keys end in their units.
 
-    Args:
-        paths: the files.
-        progress: called with the amount read and that in all.
-
-    Returns:
-        files: facts of each.
-        kind: "trilat" for a log of ours that could be opened, else "mcap".
-        problem: why a log of ours could not be opened, or None.
-        session, sites, links: of a log of ours; else None, and empty.
-        channels: facts of each, by topic.
+    `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in `problem`.
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
     """
-    inventory = FileInventory(paths, _half(progress, 0))
+
+    def report(half: int) -> Progress | None:
+        return progress and (lambda done, total: progress(half * total + done, 2 * total))
+
+    inventory = FileInventory(paths, report(0))
     facts: JsonObject = {"files": inventory.files, "kind": "mcap", "problem": None, "session": None}
     facts |= {"sites": {}, "links": {}}
     name, rates_hz = "", {}
     if SESSION in inventory.metadata:
         try:
-            log = open_log(*paths, progress=_half(progress, 1))
-            sites = {site: describe_site_health(log, site) for site in log.sites}
-            links = {
-                f"{peer}->{site}": describe_link_health(log, peer, site)
-                for site in log.sites
-                for peer in log[site].peers
+            log = open_log(*paths, progress=report(1))
+            facts |= {
+                "kind": "trilat",
+                "session": describe_session(log),
+                "sites": {site: describe_site_health(log, site) for site in log.sites},
+                "links": {
+                    f"{peer}->{site}": describe_link_health(log, peer, site)
+                    for site in log.sites
+                    for peer in log[site].peers
+                },
             }
-            facts |= {"kind": "trilat", "session": describe_session(log), "sites": sites, "links": links}
             name = log.session["session"]
             rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
         except LogError as error:
             facts["problem"] = str(error)
     facts["channels"] = inventory.channels(name, rates_hz)
     return facts
-
-
-def _half(progress: Progress | None, which: int) -> Progress | None:
-    """Returns a callback for the first or the second half of the work."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(which * total + done, 2 * total)

@@ -19,16 +19,9 @@ from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns
 
 
 class ClockSummary(NamedTuple):
-    """The clock of a link's sender against the receiver's.
+    """The clock of a link's sender against the receiver's: `clock.*` of docs/definitions.md.
 
-    Attributes:
-        offset_us, offset_first_us: the sender's clock minus the receiver's, by the last and first estimate.
-        drift_ppm, drift_bound_ppm: growth of the offset, us/s, by the last estimate, and the bound of its
-            error; None without one.
-        bound_us, bound_p50_us, bound_max_us: bound of the error of the offset in force, by the last
-            statistics, us, the median of it and the largest.
-        rtt_min_us: smallest round trip; None without one.
-        faults: samples that arrived before they were sent by more than the bound: a clock has stepped.
+    `drift` and `rtt_min_us` are None without an estimate; `faults` says that a clock has stepped.
     """
 
     offset_us: int

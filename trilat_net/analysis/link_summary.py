@@ -55,20 +55,7 @@ class AgeHistogram(NamedTuple):
 
 
 class SampleCounts(NamedTuple):
-    """Counts of the samples of a link, by the receiver's records.
-
-    Attributes:
-        sent: by the peer.
-        judged: of those, the ones of which it is known whether they arrived.
-        arrived: of the judged.
-        missing: of the judged, lost on the way.
-        lost: of the arrived, lost by the link's model.
-        late: of the arrived, after they were due.
-        superseded: of the arrived, never used: a newer one came into use before or with them.
-        duplicate: arrivals of samples that had arrived before.
-        copies: duplicates made by the link's model.
-        refused: arrivals whose stamp was out of range.
-    """
+    """Counts of the samples of a link, by the receiver's records: `samples.*` of docs/definitions.md."""
 
     sent: int
     judged: int
@@ -83,20 +70,10 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """One directed link in a run, peer -> site; what the log does not determine is None.
+    """One directed link in a run, peer -> site, as docs/definitions.md ("Links") defines each quantity.
 
-    Attributes:
-        stated: its models in force, from the start and after every change.
-        drawn_ms: the delays that its model gave to the samples, before order and play-out.
-        age_ms: the effective delay, over the ticks from the first sample in use on.
-        ages: the same as a histogram.
-        first_use_s: when the first sample came into use, s.
-        ticks_without_new: share of ticks with the same sample in use as the tick before.
-        silence_ms: the longest time that one sample stayed in use, ms.
-        counts: of the samples.
-        loss: share of the judged samples that could not come into use: missing or lost.
-        burst: mean number of those in a row.
-        one_way_us: measured one-way delay of the arrivals, us.
+    What the log does not determine is None. `drawn_ms` is what the models in force, `stated`, gave to the
+    samples; `age_ms` and `ages` are the effective delay that the controller saw.
     """
 
     peer: str

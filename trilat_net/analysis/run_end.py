@@ -36,7 +36,7 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from .site_signals import SETTLED_ERROR_RAD
-from .timeline import run_diverged_at_s
+from .timeline import diverged_at_s
 
 SETTLED_SPEED_RAD_S = 1e-2
 """The largest speed of the last second of a converged run, rad/s: the arms have come to rest."""
@@ -166,7 +166,8 @@ def classify_log_end(log: Log) -> RunEnd:
     parts = [log[site] for site in log.sites]
     recorded = [part for part in parts if len(part)]
     span_s = max((float(part.tick[-1] - part.tick[0]) / part.rate_hz for part in recorded), default=0.0)
-    end = classify_run_end(list(map(_bucket_maxima, parts)), span_s, run_diverged_at_s(log))
+    diverged = min((at_s for part in parts if (at_s := diverged_at_s(part)) is not None), default=None)
+    end = classify_run_end(list(map(_bucket_maxima, parts)), span_s, diverged)
     return end._replace(
         frequency_hz=_frequency_hz(recorded) if end.behaviour is EndBehaviour.BOUNDED else None,
         missing_sites=tuple(part.name for part in parts if not len(part)),

@@ -9,15 +9,8 @@ from numpy.typing import ArrayLike
 from ..core.two_link_arm import JOINTS
 from ..log.log_reader import Log
 from ..scenario.expect import END_WINDOW_S
-from .health import (
-    PERCENTILES,
-    JsonObject,
-    count_overruns,
-    finite_or_none,
-    made_ticks,
-    percentiles,
-    summarise_clock,
-)
+from . import health
+from .health import JsonObject, finite_or_none
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
 from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_s
 from .timeline import diverged_at_s, find_mode_intervals, list_changes
@@ -54,13 +47,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 def _describe_scenario(log: Log) -> JsonObject:
     scenario = log.scenario
+    keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
     return {
-        "name": scenario.name,
-        "title": scenario.title,
-        "sha256": scenario.sha256,
-        "duration_s": scenario.duration_s,
-        "seed": scenario.seed,
-        "scheme": scenario.scheme,
+        **{key: getattr(scenario, key) for key in keys},
         "sites": list(scenario.names),
         "delay_ms": {name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()},
         "dominance": scenario.dominance,
@@ -72,8 +61,8 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
     part, spec = log[name], log.scenario.sites[name]
     end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
     moved = operator_displacement(log, twin, name)[2] if twin is not None else np.zeros((0, JOINTS))
-    made, expected = made_ticks(log, name), log.scenario.ticks(name)
-    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, PERCENTILES
+    made, expected = health.made_ticks(log, name), log.scenario.ticks(name)
+    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, health.PERCENTILES
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
     return {
         "role": spec.role,
@@ -90,16 +79,16 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
         "settle_s": settling_time_s(part),
         "peak_tau_nm": _largest(part.tau),
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
-        "late_us": percentiles(part.late_us, late) or dict.fromkeys(late),
-        "busy_us": percentiles(part.busy_us, busy) or dict.fromkeys(busy),
-        "overruns": count_overruns(part),
+        "late_us": health.percentiles(part.late_us, late) or dict.fromkeys(late),
+        "busy_us": health.percentiles(part.busy_us, busy) or dict.fromkeys(busy),
+        "overruns": health.count_overruns(part),
         "hands_moved_max_rad": np.abs(moved).max(axis=0).tolist() if len(moved) else None,
         "hands_moved_end_rad": moved[-1].tolist() if len(moved) else None,
     }
 
 
 def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
-    counts, clock = use.counts, summarise_clock(log, use.peer, use.site)
+    counts, clock = use.counts, health.summarise_clock(log, use.peer, use.site)
     return {
         "delay_ms": finite_or_none(use.stated[0].link.moments().mean_ms),
         "stated": [
@@ -114,9 +103,7 @@ def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
         "drawn_ms": use.drawn_ms._asdict() if use.drawn_ms else None,
         "age_ms": use.age_ms._asdict() if use.age_ms else dict.fromkeys(ValueStatistics._fields),
         "ages": use.ages._asdict() if use.ages else None,
-        "first_use_s": use.first_use_s,
-        "ticks_without_new": use.ticks_without_new,
-        "silence_ms": use.silence_ms,
+        **{key: getattr(use, key) for key in ("first_use_s", "ticks_without_new", "silence_ms")},
         "samples": counts._asdict() if counts else None,
         "late_samples": counts.late if counts else None,
         "duplicate_samples": counts.duplicate if counts else None,

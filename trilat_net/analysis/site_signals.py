@@ -4,9 +4,11 @@ Invariant: one definition of each signal, for figures, page, summary and metrics
 environment are those ON the arm, the negative of the record's tau_x of Eq. (8).
 """
 
+from collections.abc import Callable
+from operator import attrgetter
+
 import numpy as np
 
-from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
@@ -16,39 +18,28 @@ SETTLED_ERROR_RAD = 1e-2
 """A site has settled once no joint's error exceeds this any more, rad."""
 
 
-def joint_angles(part: SiteLog) -> Array:
-    """Returns q, shape (K, 2), rad."""
-    return part.q.reshape(-1, JOINTS)
-
-
-def reference_angles(part: SiteLog) -> Array:
-    """Returns q_des, Eq. (6), shape (K, 2), rad."""
-    return part.q_des.reshape(-1, JOINTS)
-
-
-def joint_errors(part: SiteLog) -> Array:
-    """Returns e = q - q_des, Eq. (9), shape (K, 2), rad."""
-    return part.e.reshape(-1, JOINTS)
+Signal = Callable[[SiteLog], Array]
+"""A column over the K records of a site."""
+joint_angles: Signal = attrgetter("q")
+"""q, shape (K, 2), rad."""
+reference_angles: Signal = attrgetter("q_des")
+"""q_des, Eq. (6), shape (K, 2), rad."""
+joint_errors: Signal = attrgetter("e")
+"""e = q - q_des, Eq. (9), shape (K, 2), rad."""
+controller_torques: Signal = attrgetter("tau")
+"""tau, Eq. (13), shape (K, 2), N m."""
+parameter_estimates: Signal = attrgetter("theta_hat")
+"""theta_hat, Eq. (15), shape (K, 5), kg m^2 and kg m."""
 
 
 def joint_error_rates(part: SiteLog) -> Array:
     """Returns qd - qd_des, Eq. (18), shape (K, 2), rad/s."""
-    return (part.qd - part.qd_des).reshape(-1, JOINTS)
-
-
-def controller_torques(part: SiteLog) -> Array:
-    """Returns tau, Eq. (13), shape (K, 2), N m."""
-    return part.tau.reshape(-1, JOINTS)
+    return part.qd - part.qd_des
 
 
 def external_torques(part: SiteLog) -> Array:
     """Returns the torque of operator and environment ON the arm, shape (K, 2), N m: the negative of tau_x."""
-    return 0.0 - part.tau_x.reshape(-1, JOINTS)  # 0 - 0 is 0, where -0 would print as such
-
-
-def parameter_estimates(part: SiteLog) -> Array:
-    """Returns the estimates of theta, Eq. (15), shape (K, 5), kg m^2 and kg m."""
-    return part.theta_hat.reshape(-1, PARAMETERS)
+    return 0.0 - part.tau_x  # 0 - 0 is 0, where -0 would print as such
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:

@@ -22,12 +22,9 @@ FOLLOWING_MODES = ("run", "diverged")
 
 
 class AppliedChange(NamedTuple):
-    """A change of a link or of a site's dominance factors.
+    """A change of a link or of a site's dominance factors, and the site that carried it out.
 
-    Attributes:
-        change: the whole change.
-        site: the site that carried it out.
-        taken_at_tick: the tick whose record names it; None for a change of the scenario.
+    `taken_at_tick` is the tick whose record names it; None for a change of the scenario.
     """
 
     change: Change
@@ -49,13 +46,7 @@ class AppliedChange(NamedTuple):
 
 
 class ModeInterval(NamedTuple):
-    """An interval in which a site held, braked or returned.
-
-    Attributes:
-        mode: "hold", "brake" or "return".
-        from_s: its first tick, s after the epoch.
-        to_s: the first tick after it, or the end of the last record's period, s.
-    """
+    """An interval of hold, brake or return, up to the first tick after it, or the end of the last period."""
 
     mode: str
     from_s: float
@@ -63,12 +54,7 @@ class ModeInterval(NamedTuple):
 
 
 class StatedModel(NamedTuple):
-    """A link model in force from a time on.
-
-    Attributes:
-        from_s: the first stamp for which it holds, s after the epoch.
-        link: the model.
-    """
+    """A link model, and the first stamp for which it holds, s after the epoch."""
 
     from_s: float
     link: LinkBase
@@ -84,33 +70,18 @@ def list_changes(log: Log) -> list[AppliedChange]:
     for site in log.sites:
         log.commands(site)  # refuses what is no change of that site's
         for tick, texts in log.changes(site).items():
-            found += [AppliedChange(_read(log, text), site, tick) for text in texts]
+            try:
+                found += [AppliedChange(msgspec.json.decode(t, type=Change), site, tick) for t in texts]
+            except msgspec.MsgspecError as error:
+                raise LogError(f"{log.source}: a record names a change that is none: {error}") from None
     before_s = recorded_end_s(log)
     return sorted((c for c in found if c.change.at_s < before_s), key=lambda changed: changed.change.at_s)
 
 
-def _read(log: Log, text: str) -> Change:
-    try:
-        return msgspec.json.decode(text, type=Change)
-    except msgspec.MsgspecError as error:
-        raise LogError(f"{log.source}: a record names a change that is none: {error}") from None
-
-
-def list_stated_models(
-    log: Log, link: str, changed: Sequence[AppliedChange] | None = None
-) -> list[StatedModel]:
-    """Returns the models of a link, "j->i", from the start and after every change of it.
-
-    Args:
-        log: the log.
-        link: its name.
-        changed: as from `list_changes`; None looks them up.
-    """
-    later = list_changes(log) if changed is None else changed
-    return [
-        StatedModel(0.0, log.scenario.links[link]),
-        *(StatedModel(c.change.at_s, c.change.after) for c in later if c.change.link == link),
-    ]
+def list_stated_models(log: Log, link: str, changed: Sequence[AppliedChange]) -> list[StatedModel]:
+    """Returns the models of a link, "j->i", from the start and after every listed change of it."""
+    later = [StatedModel(c.change.at_s, c.change.after) for c in changed if c.change.link == link]
+    return [StatedModel(0.0, log.scenario.links[link]), *later]
 
 
 def recorded_end_s(log: Log) -> float:
@@ -139,9 +110,3 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
 def diverged_at_s(part: SiteLog) -> float | None:
     """Returns when a site left its limits, s; None if it never did."""
     return float(part.t_s[-1]) if len(part) and part.mode[-1] == "diverged" else None
-
-
-def run_diverged_at_s(log: Log) -> float | None:
-    """Returns when the first site of a log left its limits, s; None if none did."""
-    times = [diverged_at_s(log[site]) for site in log.sites]
-    return min((at_s for at_s in times if at_s is not None), default=None)

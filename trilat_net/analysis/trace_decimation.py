@@ -13,13 +13,7 @@ from ..log.record_columns import Ints
 
 
 class DecimatedTrace(NamedTuple):
-    """Columns over time, ready to be drawn; a row of NaN stands in every gap that can be seen.
-
-    Attributes:
-        tick: ticks, shape (P,).
-        t_s: nominal time, shape (P,), s.
-        values: shape (P, C).
-    """
+    """C columns over P ticks, ready to be drawn; a row of NaN stands in every gap that can be seen."""
 
     tick: Ints
     t_s: Array
@@ -29,9 +23,7 @@ class DecimatedTrace(NamedTuple):
 def extreme_rows(values: Array, buckets: int) -> Ints:
     """Returns the rows to keep, ascending: the first, the last, and each bucket's extremes per column.
 
-    Args:
-        values: shape (K, C); NaN is no extreme, but a bucket of nothing else keeps one.
-        buckets: into how many equal runs of rows the K rows are parted.
+    Buckets are equal runs of rows. NaN is no extreme, but a bucket of nothing else keeps one.
     """
     rows, columns = values.shape
     if rows <= 2 * buckets or not columns:
@@ -51,13 +43,9 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
 
 
 def decimate(tick: Ints, t_s: Array, values: Array, buckets: int) -> DecimatedTrace:
-    """Returns a trace with at most 2 C + 3 points per bucket.
+    """Returns a trace with at most 2 C + 3 points per bucket; one bucket per pixel is enough.
 
-    Args:
-        tick: ticks, shape (K,), ascending.
-        t_s: their nominal time, shape (K,), s.
-        values: shape (K, C).
-        buckets: how many; about one per pixel is enough.
+    Ticks ascend and have nominal times, shape (K,), s; values have shape (K, C).
     """
     if not len(tick):
         return DecimatedTrace(tick, t_s, values)

@@ -16,7 +16,7 @@ from trilat_net.analysis.certificate.energy_terms import (
     torque_work,
 )
 from trilat_net.analysis.dominance_history import DominanceHistory
-from trilat_net.analysis.torque_split import TorqueSplit, split_torque
+from trilat_net.analysis.torque_sources import TorqueSplit, split_torque
 
 from . import runs
 

@@ -8,7 +8,7 @@ from tests.analysis.logs import rewritten
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import compute_end_effector
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.metrics.wall_contact import find_wall_contact, list_walls
+from trilat_net.analysis.torque_sources import wall_force
 from trilat_net.core.two_link_arm import JOINTS
 
 from .written import pair, simulated
@@ -88,8 +88,7 @@ def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = simulated("windup", {"duration_s": 20.0, "rate_hz": 250})
     spec, track = log.scenario.sites["s"], align_records(log)["s"]
-    how = find_wall_contact(
-        list_walls(spec)[0], track, compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
-    )
-    assert how.force[250 * 10] == pytest.approx(4.3, abs=0.05)
-    assert how.force[-1] == pytest.approx(8.5, abs=0.1)
+    end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
+    force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
+    assert force[250 * 10] == pytest.approx(4.3, abs=0.05)
+    assert force[-1] == pytest.approx(8.5, abs=0.1)

@@ -17,18 +17,9 @@ from ...log.log_reader import Log
 from ..aligned import AlignedRecords, Bools, PeerTrajectory, align_records, view_delayed_peer
 from ..dominance_history import trace_dominance
 from ..lyapunov_weights import compute_lyapunov_weights
-from ..torque_split import split_torque
-from .energy_terms import (
-    FunctionalParts,
-    Increment,
-    SiteMotion,
-    compute_dissipation,
-    compute_sampling_work,
-    compute_transfer,
-    compute_work,
-    derive_site_constants,
-    evaluate_functional,
-)
+from ..torque_sources import split_torque
+from . import energy_terms
+from .energy_terms import FunctionalParts, Increment, SiteMotion
 
 MIN_PERIODS = 10
 """Fewer show nothing of what happens within them."""
@@ -126,7 +117,7 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
         spec = log.scenario.sites[site]
         motion = SiteMotion(
             own,
-            derive_site_constants(spec),
+            energy_terms.derive_site_constants(spec),
             trace_dominance(log, site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
             split_torque(own, spec),
@@ -136,11 +127,11 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
         known = [own.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
         energies[site] = SiteEnergy(
             motion,
-            evaluate_functional(motion),
-            compute_dissipation(motion),
-            compute_transfer(motion),
-            compute_work(motion),
-            compute_sampling_work(motion),
+            energy_terms.evaluate_functional(motion),
+            energy_terms.compute_dissipation(motion),
+            energy_terms.compute_transfer(motion),
+            energy_terms.compute_work(motion),
+            energy_terms.compute_sampling_work(motion),
             np.logical_and.reduce(known),
         )
     return energies if energies and len(_find_common_times(energies)) > 1 else {}
@@ -237,12 +228,15 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
 
     With `ones` every site weighs the same, as in the paper; then it need not close.
     """
-    times, weights = _find_common_times(energies), _Weights(energies, ones=ones)
+    times, grids = _find_common_times(energies), {}
     columns, sites, unjudged = [], {}, np.zeros(len(times))
     sums: dict[tuple[str, str], Array] = {}
     for n, (site, energy) in enumerate(energies.items()):
         records = energy.motion.records
-        left, right = (beta[:, n] for beta in weights.along(records))
+        grid = records.first, len(records.known), records.rate_hz
+        if grid not in grids:
+            grids[grid] = _trace_weights(energies, records, ones=ones)
+        left, right = (beta[:, n] for beta in grids[grid])
         weighted = _weigh_site(energy, left, right)
         for key, values in weighted.items():
             values = _resample(times, records.t_s, values)
@@ -297,35 +291,27 @@ def _resample(times: Array, t_s: Array, values: Array) -> Array:
     return values if same else np.interp(times, t_s, values)
 
 
-class _Weights:
-    """beta over time; each dominance matrix is solved once."""
+def _trace_weights(
+    energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, ones: bool
+) -> tuple[Array, Array]:
+    """Returns beta at a site's ticks, shape (K, N), and at the ends of its periods, before a step there."""
+    Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
+    constant = all(energy.motion.dominance.constant for energy in energies.values())
+    solved: dict[bytes, Array] = {}  # by dominance matrix
 
-    def __init__(self, energies: Mapping[str, SiteEnergy], *, ones: bool) -> None:
-        self._energies, self._ones = energies, ones
-        self._Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
-        self._constant = all(energy.motion.dominance.constant for energy in energies.values())
-        self._solved: dict[bytes, Array] = {}
-        self._along: dict[tuple[int, int, int], tuple[Array, Array]] = {}
-
-    def along(self, records: AlignedRecords) -> tuple[Array, Array]:
-        """Returns beta at every tick, shape (K, N), and at the end of every period, before a step there."""
-        key = records.first, len(records.known), records.rate_hz
-        if key not in self._along:
-            self._along[key] = self._at(records.t_s), self._at(records.t_s[:-1], records.h_s)
-        return self._along[key]
-
-    def _at(self, t_s: Array, ahead_s: float = 0.0) -> Array:
-        if self._ones:
-            return np.ones((len(t_s), len(self._Kd)))
-        times = t_s[:1] if self._constant else t_s
-        alpha = np.round(_interpolate_dominance(self._energies, times, ahead_s), 12) + 0.0
-        matrices, place = np.unique(alpha.reshape(len(alpha), -1), axis=0, return_inverse=True)
+    def solve(t_s: Array, ahead_s: float) -> Array:
+        if ones:
+            return np.ones((len(t_s), len(Kd)))
+        alpha = _interpolate_dominance(energies, t_s[:1] if constant else t_s, ahead_s)
+        rows = np.round(alpha, 12).reshape(len(alpha), -1) + 0.0
+        matrices, place = np.unique(rows, axis=0, return_inverse=True)
         for matrix in matrices:
-            if (key := matrix.tobytes()) not in self._solved:
-                alpha = matrix.reshape(len(self._Kd), -1)
-                self._solved[key] = compute_lyapunov_weights(alpha, self._Kd).beta
-        beta: Array = np.array([self._solved[matrix.tobytes()] for matrix in matrices])[place.ravel()]
-        return np.tile(beta, (len(t_s), 1)) if self._constant else beta
+            if (key := matrix.tobytes()) not in solved:
+                solved[key] = compute_lyapunov_weights(matrix.reshape(len(Kd), -1), Kd).beta
+        beta = np.array([solved[matrix.tobytes()] for matrix in matrices])[place.ravel()]
+        return np.tile(beta, (len(t_s), 1)) if constant else beta
+
+    return solve(records.t_s, 0.0), solve(records.t_s[:-1], records.h_s)
 
 
 def _interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:

@@ -27,7 +27,7 @@ from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
 from ..arm_rows import inertia_product_rows, regressor_rows
 from ..dominance_history import DominanceHistory
-from ..torque_split import TorqueSplit
+from ..torque_sources import TorqueSplit
 
 
 class SiteConstants(NamedTuple):

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
-from ..aligned import AlignedRecords, Bools, find_latest_rows
-from ..torque_split import TorqueSplit
+from ..aligned import Bools, find_latest_rows
+from .metric_catalogue import SiteRun
 
 Complex = NDArray[np.complex128]
 
@@ -61,39 +61,30 @@ class FrequencyResponse(NamedTuple):
     why: str = ""
 
 
-class ResponseSignals(NamedTuple):
-    """Signals of a ratio, shape (K,) each.
-
-    Attributes:
-        drive: a signal that depends on no other.
-        put_in: the ratio's input.
-        came_out: its output.
-        usable: True for rows that are recorded while no other drive is active.
-    """
-
-    drive: Array
-    put_in: Array
-    came_out: Array
-    usable: Bools
-
-
-def estimate_response(signals: ResponseSignals, rate_hz: int, least: float) -> FrequencyResponse:
+def estimate_response(
+    drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
+) -> FrequencyResponse:
     """Returns the ratio of two signals at the line with the strongest drive, if that is `least` or larger.
 
+    The drive depends on no other signal. Usable are rows that are recorded while no other drive is active.
     Own code in place of `scipy.signal.csd`, which cannot leave out segments with unusable rows.
     """
     length = round(SEGMENT_S * rate_hz)
-    starts = _segment_starts(signals.usable, length)
+    starts: list[int] = []  # of segments with usable rows alone, each half a length after the one before
+    if length >= 4 * _LOWEST_LINE:
+        unusable = np.concatenate([[0], np.cumsum(~usable)])
+        first = np.arange(0, len(usable) - length + 1, length // 2)
+        starts = first[unusable[first + length] == unusable[first]].tolist()
     if not starts:
         return FrequencyResponse(why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives")
-    D = _spectra(signals.drive, starts, length)
+    D = _spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
         return FrequencyResponse(why="its numbers are too large")
     line = int(power.argmax())
     if math.sqrt(2.0 * power[line]) < least:
         return FrequencyResponse(why="nothing drives it")
-    X, Y = (_spectra(one, starts, length)[:, line] for one in (signals.put_in, signals.came_out))
+    X, Y = (_spectra(one, starts, length)[:, line] for one in (put_in, came_out))
     return _estimate_at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X, Y)
 
 
@@ -118,16 +109,6 @@ def _estimate_at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -
 def _coherence(D: Complex, X: Complex) -> float:
     power = float(np.vdot(D, D).real * np.vdot(X, X).real)
     return min(1.0, float(abs(np.vdot(D, X)) ** 2) / power) if power > 0.0 else 0.0
-
-
-def _segment_starts(usable: Bools, length: int) -> list[int]:
-    """Returns the first rows of segments, each half a length after the one before, with all rows usable."""
-    if length < 4 * _LOWEST_LINE:
-        return []
-    unusable = np.concatenate([[0], np.cumsum(~usable)])
-    starts = np.arange(0, len(usable) - length + 1, length // 2)
-    whole: list[int] = starts[unusable[starts + length] == unusable[starts]].tolist()
-    return whole
 
 
 def _spectra(signal: Array, starts: list[int], length: int) -> Complex:
@@ -166,53 +147,47 @@ class ImpedanceEstimate(NamedTuple):
         return "" if self.kind == "reflection" else "N m s/rad"
 
 
-def estimate_impedances(
-    aligned: Mapping[str, AlignedRecords], torques: Mapping[str, TorqueSplit]
-) -> list[ImpedanceEstimate]:
+def estimate_impedances(runs: Mapping[str, SiteRun]) -> list[ImpedanceEstimate]:
     """Returns the impedance at every operator, and its reflection of every environment elsewhere."""
-    operators = [site for site in aligned if torques[site].operator.any()]
-    walls = [site for site in aligned if torques[site].environment.any()]
+    operators = [site for site, run in runs.items() if run.torque.operator.any()]
+    walls = [site for site, run in runs.items() if run.torque.environment.any()]
     pairs = [(site, "") for site in operators]
     pairs += [(site, wall) for wall in walls for site in operators if site != wall]
-    return [one for site, wall in pairs for one in _estimate_joints(aligned, torques, site, wall)]
+    return [one for site, wall in pairs for one in _estimate_joints(runs, site, wall)]
 
 
-def _estimate_joints(
-    aligned: Mapping[str, AlignedRecords], torques: Mapping[str, TorqueSplit], site: str, wall: str
-) -> Iterator[ImpedanceEstimate]:
+def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Iterator[ImpedanceEstimate]:
     """Yields the impedance at a site's operator, or, with a site of a wall, the reflection from there."""
-    records, script = aligned[site], torques[site].script
-    others = [name for name in aligned if wall or name != site]
-    usable = _find_still_rows(aligned, torques, records, others)
-    rows, recorded = find_latest_rows(aligned[wall or site], records.t_s)
+    records, by_source, _ = runs[site]
+    script, usable = by_source.script, _find_still_rows(runs, site, alone=not wall)
+    rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)
     for joint in range(JOINTS):
         response = FrequencyResponse(why=NO_SCRIPT_TEXT)
         if script is not None and usable is not None:
-            operator = torques[site].operator[:, joint]
+            usable, operator = usable & records.known, by_source.operator[:, joint]
             if wall:
-                torque = torques[wall].environment[rows, joint]
-                signals = ResponseSignals(torque, torque, -operator, records.known & recorded & usable)
+                torque = runs[wall].torque.environment[rows, joint]
+                signals = torque, torque, -operator, usable & recorded
             else:
-                velocity = records.qd[:, joint]
-                signals = ResponseSignals(script[:, joint], velocity, operator, records.known & usable)
-            response = estimate_response(signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
+                signals = script[:, joint], records.qd[:, joint], operator, usable
+            response = estimate_response(*signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
         yield ImpedanceEstimate("reflection" if wall else "impedance", site, wall, joint + 1, response)
 
 
-def _find_still_rows(
-    aligned: Mapping[str, AlignedRecords],
-    torques: Mapping[str, TorqueSplit],
-    at: AlignedRecords,
-    sites: list[str],
-) -> Bools | None:
-    """Returns at which ticks of a site no operator of given sites moves; None if one has no script."""
-    still = np.ones(len(at.known), dtype=np.bool_)
-    for site in sites:
-        script = torques[site].script
-        if script is None:
+def _find_still_rows(runs: Mapping[str, SiteRun], at: str, *, alone: bool) -> Bools | None:
+    """Returns at which ticks of a site no operator moves, that of the site included unless `alone` drives.
+
+    None if one of them has no script.
+    """
+    t_s = runs[at].records.t_s
+    still = np.ones(len(t_s), dtype=np.bool_)
+    for site, (records, torque, _) in runs.items():
+        if alone and site == at:
+            continue
+        if torque.script is None:
             return None
-        if len(script) > 1:
-            rows, _ = find_latest_rows(aligned[site], at.t_s)
-            rate = np.abs(np.gradient(script, axis=0)).max(axis=1) * aligned[site].rate_hz
+        if len(torque.script) > 1:
+            rows, _ = find_latest_rows(records, t_s)
+            rate = np.abs(np.gradient(torque.script, axis=0)).max(axis=1) * records.rate_hz
             still &= rate[rows] < STILL_SCRIPT_NM_S
     return still

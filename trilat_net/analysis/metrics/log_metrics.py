@@ -14,26 +14,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...log.log_reader import Log
-from ..aligned import AlignedRecords, align_records
+from ..aligned import align_records
 from ..dominance_history import trace_dominance
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
-from ..torque_split import TorqueSplit, attribute_torque
-from .force_sharing import (
-    JointLoad,
-    SharingRatio,
-    count_static_windows,
-    find_joint_loads,
-    find_sharing_ratios,
-    measure_force_sharing,
-)
+from ..torque_sources import attribute_torque
+from . import motion_metrics as motion
+from . import static_windows
 from .impedance import ImpedanceEstimate, estimate_impedances
-from .metric_catalogue import ENERGY, LOOP, QUANTITIES, Metric, MetricValues, Quantity, metric, unavailable
-from .parameter_error import ParameterEstimates, measure_parameter_error, read_parameter_estimates
+from .metric_catalogue import (
+    ENERGY,
+    LOOP,
+    QUANTITIES,
+    Metric,
+    MetricValues,
+    Quantity,
+    SiteRun,
+    metric,
+    unavailable,
+)
+from .motion_metrics import ParameterEstimates
 from .port_energy import measure_delay_energy, measure_port_energy
-from .static_windows import StiffnessEstimate, estimate_stiffness, find_static_windows
-from .tracking_metrics import measure_effort, measure_following, measure_spread, measure_tracking
-from .wall_contact import list_walls, measure_wall_contact
+from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
 
 def measure_link(use: LinkSummary) -> MetricValues:
@@ -124,55 +126,54 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         LogError: a record cannot be read, or names a change that is none.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is no number
-        return _measure(log, align_records(log))
+        return _measure(log)
 
 
-def _measure(log: Log, aligned: dict[str, AlignedRecords]) -> LogMetrics:
+def _measure(log: Log) -> LogMetrics:
     scenario, specs = log.scenario, log.scenario.sites
-    torques = {site: attribute_torque(records, specs[site]) for site, records in aligned.items()}
-    dominance = {site: trace_dominance(log, site, records.t_s) for site, records in aligned.items()}
-    absent = [site for site in log.sites if site not in aligned]
-    windows = [] if absent else find_static_windows(aligned, torques, dominance)
-    loads = find_joint_loads(scenario, windows)
-    ratios = find_sharing_ratios(scenario, windows, loads)
+    runs = {
+        site: SiteRun(own, attribute_torque(own, specs[site]), trace_dominance(log, site, own.t_s))
+        for site, own in align_records(log).items()
+    }
+    absent = [site for site in log.sites if site not in runs]
+    windows = [] if absent else static_windows.find_static_windows(runs)
+    loads = static_windows.find_joint_loads(scenario, windows)
+    ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
     return LogMetrics(
-        {**measure_spread(log, aligned), **measure_force_sharing(absent, windows, ratios)},
-        {site: _measure_site(log, site, aligned.get(site), torques.get(site)) for site in log.sites},
+        {
+            **motion.measure_spread(log, runs),
+            **static_windows.measure_force_sharing(absent, windows, ratios),
+        },
+        {site: _measure_site(log, site, runs.get(site)) for site in log.sites},
         {
             use.name: {
-                **measure_following(log, aligned, use.peer, use.site),
-                **measure_delay_energy(log, aligned, dominance, use.peer, use.site),
+                **motion.measure_following(log, runs, use.peer, use.site),
+                **measure_delay_energy(log, runs, use.peer, use.site),
                 **measure_link(use),
             }
             for use in summarise_links(log)
         },
         {
-            f"{site}/{n}": measure_wall_contact(
-                wall, aligned.get(site), torques[site].end_effector if site in torques else None
-            )
+            f"{site}/{n}": motion.measure_wall_contact(wall, runs.get(site))
             for site in log.sites
-            for n, wall in enumerate(list_walls(specs[site]), 1)
+            for n, wall in enumerate(motion.list_walls(specs[site]), 1)
         },
-        {site: read_parameter_estimates(specs[site], records) for site, records in aligned.items()},
-        count_static_windows(absent, windows),
+        {site: motion.read_parameter_estimates(specs[site], run.records) for site, run in runs.items()},
+        static_windows.count_static_windows(absent, windows),
         loads,
         ratios,
-        estimate_stiffness(windows),
-        estimate_impedances(aligned, torques),
+        static_windows.estimate_stiffness(windows),
+        estimate_impedances(runs),
     )
 
 
-def _measure_site(
-    log: Log, site: str, records: AlignedRecords | None, torque: TorqueSplit | None
-) -> MetricValues:
-    ports = unavailable(ENERGY, f"no records of {site}", of="site")
-    if records is not None and torque is not None:
-        ports = measure_port_energy(log.scenario, records, torque)
+def _measure_site(log: Log, site: str, run: SiteRun | None) -> MetricValues:
+    none = unavailable(ENERGY, f"no records of {site}", of="site")
     return {
-        **measure_tracking(log, site),
-        **measure_effort(log, site),
-        **ports,
-        **measure_parameter_error(log.scenario.sites[site], records),
+        **motion.measure_tracking(log, site),
+        **motion.measure_effort(log, site),
+        **(measure_port_energy(log.scenario, run) if run else none),
+        **motion.measure_parameter_error(log.scenario.sites[site], run.records if run else None),
         **measure_loop(log, site),
     }
 
@@ -212,21 +213,11 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
     """Returns what is no single number: loads, force sharing, stiffness, responses."""
     return {
         "levers": [
-            {
-                **load._asdict(),
-                "weight": _values(load.weight),
-                "imbalance": load.imbalance.value,
-                "why": load.imbalance.why or None,
-            }
+            load._asdict() | {"weight": _values(load.weight)} | _value_and_why("imbalance", load.imbalance)
             for load in metrics.joint_loads
         ],
         "force_sharing": [
-            {
-                **pair._asdict(),
-                "expected_nm": pair.expected_nm.value,
-                "off": pair.off,
-                "why": pair.expected_nm.why or None,
-            }
+            pair._asdict() | {"off": pair.off} | _value_and_why("expected_nm", pair.expected_nm)
             for pair in metrics.sharing_ratios
         ],
         "stiffness": [one._asdict() for one in metrics.stiffness],
@@ -238,6 +229,10 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
             for one in metrics.responses
         ],
     }
+
+
+def _value_and_why(key: str, one: Metric) -> dict[str, Any]:
+    return {key: one.value, "why": one.why or None}
 
 
 def _finite(value: Any) -> Any:

@@ -10,6 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..aligned import AlignedRecords
+from ..dominance_history import DominanceHistory
+from ..torque_sources import TorqueSplit
+
+
+class SiteRun(NamedTuple):
+    """A site with records: these aligned, the torque ON its arm by source, and its dominance factors."""
+
+    records: AlignedRecords
+    torque: TorqueSplit
+    dominance: DominanceHistory
+
 
 class Metric(NamedTuple):
     """A number, or the reason why there is none.

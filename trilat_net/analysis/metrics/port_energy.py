@@ -19,10 +19,7 @@ from ...log.log_reader import Log
 from ...scenario import Scenario, SiteSpec
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
 from ..arm_rows import inertia_product_rows, regressor_rows
-from ..dominance_history import DominanceHistory
-from ..torque_split import TorqueSplit
-from .metric_catalogue import ENERGY, Metric, MetricValues, metric, unavailable
-from .parameter_error import has_known_theta
+from .metric_catalogue import ENERGY, Metric, MetricValues, SiteRun, metric, unavailable
 
 
 def held_work(torque: Array, q: Array) -> Array:
@@ -60,8 +57,9 @@ def mechanical_energy(spec: SiteSpec, records: AlignedRecords) -> Array:
     return energy
 
 
-def measure_port_energy(scenario: Scenario, records: AlignedRecords, torque: TorqueSplit) -> MetricValues:
+def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
     """Returns the energies of a site's ports, over the periods with both ends recorded."""
+    records, torque, _ = run
     spec, known, q = scenario.sites[records.site], records.known_periods, records.q
     if not known.any():
         return unavailable(ENERGY, "no two records in a row", of="site")
@@ -79,7 +77,7 @@ def measure_port_energy(scenario: Scenario, records: AlignedRecords, torque: Tor
         "walls_j": metric(walls[-1]) if spec.environment else NO_WALLS,
         "walls_most_j": metric(max(0.0, float(walls.max()))) if spec.environment else NO_WALLS,
     }
-    if not has_known_theta(spec):
+    if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**found, "mechanical_j": unknown, "unaccounted_j": unknown}
     change = total(np.diff(mechanical_energy(spec, records)))
@@ -90,13 +88,7 @@ def measure_port_energy(scenario: Scenario, records: AlignedRecords, torque: Tor
 NO_WALLS = Metric(None, "the scenario has no environment here", applies=False)
 
 
-def measure_delay_energy(
-    log: Log,
-    aligned: Mapping[str, AlignedRecords],
-    dominance: Mapping[str, DominanceHistory],
-    peer: str,
-    site: str,
-) -> MetricValues:
+def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
     """Returns the energy that the delay of a link injects: in all, and the most until any time, J.
 
     Over the periods that follow from records alone and in which the site follows its peers; of the torque
@@ -104,12 +96,12 @@ def measure_delay_energy(
     """
     spec = log.scenario.sites[site]
     gains = spec.control.gains(spec.arm.theta)
-    absent = [name for name in (peer, site) if name not in aligned]
+    absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
     if gains.law is Law.OWN:
         return unavailable(ENERGY, "a law of somebody's own: what it makes of a peer is not known", of="link")
-    records, other = aligned[site], aligned[peer]
+    records, other, factors = runs[site].records, runs[peer].records, runs[site].dominance
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
     view = view_delayed_peer(records, PeerTrajectory(other))
@@ -117,7 +109,7 @@ def measure_delay_energy(
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
-    j, factors = list(records.used).index(peer), dominance[site]
+    j = list(records.used).index(peer)
     torque = _delay_torque(gains, records, other, view, factors.alpha[:, [j]], factors.rate[:, [j]])
     injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
     return {"delay_j": metric(injected[-1]), "delay_most_j": metric(max(0.0, float(injected.max())))}

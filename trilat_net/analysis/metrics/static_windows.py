@@ -1,7 +1,9 @@
-"""Static windows of a run, with all arms at rest under constant torques, and the stiffness between two.
+"""Metrics at rest: windows in which all arms rest under constant torques, rendered stiffness, force sharing.
 
-Invariant: docs/metrics.md defines both. A stiffness is the operator's own, and is not given, if anything but
-that operator changed. It is a secant along the path taken: the other joint moves as well.
+Invariant: docs/metrics.md defines and derives each. A stiffness is the operator's own, and is not given, if
+anything but that operator changed; it is a secant along the path taken: the other joint moves as well. The
+torques tau_i ON the arms obey sum_i (pi_i / K_i) tau_i = 0 per joint, pi being the left Perron vector of the
+dominance matrix and K_i what holds e_i; if gravity is adapted the estimates take up the load.
 """
 
 from collections.abc import Mapping
@@ -10,13 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.exogenous import TorqueKind
+from ...core.site_setup import Law
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...log.record_columns import Ints
-from ..aligned import AlignedRecords, find_latest_rows
-from ..dominance_history import DominanceHistory
+from ...scenario import Scenario, SiteSpec
+from ..aligned import find_latest_rows
+from ..lyapunov_weights import find_closed_groups, left_perron_vector
 from ..run_end import STATIC_SPEED_RAD_S
-from ..torque_split import TorqueSplit
+from .metric_catalogue import Metric, MetricValues, SiteRun, metric
 
 WINDOW_S = 1.0
 """Length of a window, s; an interval must be as long."""
@@ -32,6 +37,10 @@ MIN_ANGLE_CHANGE_RAD = 1e-4
 """Least change of an angle, rad."""
 STILL_SCRIPT_NM = 1e-6
 """An operator whose script changed by no more between windows stood still, N m."""
+GRAVITY_THETA = (3, 4)
+"""The parameters of gravity, theta_4 and theta_5."""
+MIN_LOAD_SHARE = 0.02
+"""A site with less than this share of the largest torque is not loaded."""
 
 
 class StaticWindow(NamedTuple):
@@ -53,64 +62,43 @@ class StaticWindow(NamedTuple):
     alpha: Array
 
 
-def find_static_windows(
-    aligned: Mapping[str, AlignedRecords],
-    torques: Mapping[str, TorqueSplit],
-    dominance: Mapping[str, DominanceHistory],
-) -> list[StaticWindow]:
+def find_static_windows(runs: Mapping[str, SiteRun]) -> list[StaticWindow]:
     """Returns the static windows of all sites, in order."""
-    first = next(iter(aligned.values()))
+    first = next(iter(runs.values())).records
     rows, still = {}, first.known.copy()
-    for site, records in aligned.items():
+    for site, (records, torque, dominance) in runs.items():
         rows[site], recorded = find_latest_rows(records, first.t_s)
         slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
-        static = records.follows & slow & ~dominance[site].rate.any(axis=1)
-        script = torques[site].script
-        if script is not None:  # without a script the torque decides
-            moves = np.abs(np.diff(script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
+        static = records.follows & slow & ~dominance.rate.any(axis=1)
+        if torque.script is not None:  # without a script the torque decides
+            moves = np.abs(np.diff(torque.script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
             static &= ~(np.append(moves, False) | np.append(False, moves))
         still &= recorded & static[rows[site]]
     need = int(np.ceil(WINDOW_S * first.rate_hz))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]))).reshape(-1, 2).tolist()
     windows = []
-    for begin, end in edges.reshape(-1, 2).tolist():
-        if end - begin > need:
-            here = {site: row[end - need - 1 : end] for site, row in rows.items()}
-            if _torques_are_constant([aligned[site].tau_x[row] for site, row in here.items()]):
-                ends = float(first.t_s[end - need - 1]), float(first.t_s[end - 1])
-                windows.append(_static_window(*ends, aligned, torques, dominance, here))
+    for last in (slice(end - need - 1, end) for begin, end in edges if end - begin > need):
+        here = {site: row[last] for site, row in rows.items()}
+        pushed = [runs[site].records.tau_x[row] for site, row in here.items()]
+        largest = max(float(np.abs(values).max()) for values in pushed)
+        variation = max(float(np.ptp(values, axis=0).max()) for values in pushed)
+        if not variation > MAX_TORQUE_VARIATION * max(largest, MIN_LOAD_NM):
+            windows.append(_average_window(runs, here, first.t_s[last]))
     return windows
 
 
-def _torques_are_constant(torques: list[Array]) -> bool:
-    largest = max(float(np.abs(values).max()) for values in torques)
-    variation = max(float(np.ptp(values, axis=0).max()) for values in torques)
-    return not variation > MAX_TORQUE_VARIATION * max(largest, MIN_LOAD_NM)
-
-
-def _static_window(
-    from_s: float,
-    to_s: float,
-    aligned: Mapping[str, AlignedRecords],
-    torques: Mapping[str, TorqueSplit],
-    dominance: Mapping[str, DominanceHistory],
-    rows: Mapping[str, Ints],
-) -> StaticWindow:
-    names = list(aligned)
-    alpha = np.zeros((len(names), len(names)))
-    scripts = {site: torques[site].script for site in rows}
-    for i, site in enumerate(names):
-        for j, peer in enumerate(aligned[site].used):
-            alpha[i, names.index(peer)] = dominance[site].alpha[rows[site][-1], j]
-    return StaticWindow(
-        from_s,
-        to_s,
-        {site: -aligned[site].tau_x[row].mean(axis=0) for site, row in rows.items()},
-        {site: torques[site].environment[row].mean(axis=0) for site, row in rows.items()},
-        {site: None if one is None else one[rows[site]].mean(axis=0) for site, one in scripts.items()},
-        {site: aligned[site].q[row].mean(axis=0) for site, row in rows.items()},
-        alpha,
-    )
+def _average_window(runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: Array) -> StaticWindow:
+    names = list(runs)
+    window = StaticWindow(float(t_s[0]), float(t_s[-1]), {}, {}, {}, {}, np.zeros((len(names), len(names))))
+    for i, (site, (records, torque, dominance)) in enumerate(runs.items()):
+        row = rows[site]
+        window.torque[site] = -records.tau_x[row].mean(axis=0)
+        window.environment[site] = torque.environment[row].mean(axis=0)
+        window.script[site] = None if torque.script is None else torque.script[row].mean(axis=0)
+        window.q[site] = records.q[row].mean(axis=0)
+        for j, peer in enumerate(records.used):
+            window.alpha[i, names.index(peer)] = dominance.alpha[row[-1], j]
+    return window
 
 
 class StiffnessEstimate(NamedTuple):
@@ -134,8 +122,14 @@ def estimate_stiffness(windows: list[StaticWindow]) -> list[StiffnessEstimate]:
     """Returns the stiffness between each two static windows between which one operator alone moved."""
     estimates = []
     for before, after in pairwise(windows):
-        moved = _moved_operators(before, after)
-        if moved is None or len(moved) != 1 or (before.alpha != after.alpha).any():
+        moved, known = [], True
+        for site, now in after.script.items():
+            then = before.script[site]
+            if now is None or then is None:
+                known = False
+            elif np.abs(now - then).max() > STILL_SCRIPT_NM:
+                moved.append(site)
+        if not known or len(moved) != 1 or (before.alpha != after.alpha).any():
             continue
         site = moved[0]
         operator = [window.torque[site] - window.environment[site] for window in (before, after)]
@@ -149,13 +143,160 @@ def estimate_stiffness(windows: list[StaticWindow]) -> list[StiffnessEstimate]:
     return estimates
 
 
-def _moved_operators(before: StaticWindow, after: StaticWindow) -> list[str] | None:
-    """Returns the sites whose operators moved; None if one has no script."""
-    moved = []
-    for site, now in after.script.items():
-        then = before.script[site]
-        if now is None or then is None:
-            return None
-        if np.abs(now - then).max() > STILL_SCRIPT_NM:
-            moved.append(site)
-    return moved
+class SharingRatio(NamedTuple):
+    """Two loaded sites in a static window, from its first tick to its last; joints count from 1.
+
+    Attributes:
+        pushed, pushed_nm: the site of the torque, and that torque, ON its arm.
+        by_wall: True if the environment makes most of it.
+        holds, felt_nm: the site of the operator that feels it, and what: the negative of its own ON its arm.
+        expected_nm: the torque by the dominance factors.
+    """
+
+    from_s: float
+    to_s: float
+    joint: int
+    pushed: str
+    pushed_nm: float
+    by_wall: bool
+    holds: str
+    felt_nm: float
+    expected_nm: Metric
+
+    @property
+    def off(self) -> float | None:
+        """Relative deviation of the felt torque from the expected one; None without one."""
+        expected = self.expected_nm.value
+        return None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
+
+
+class JointLoad(NamedTuple):
+    """The torques of a joint, from 1, in a static window, of all loaded sites.
+
+    Attributes:
+        torque_nm: per loaded site, ON its arm.
+        weight: per loaded site pi_i / K_i, the largest of all sites 1.
+        imbalance: |sum of weight times torque| / largest |weight times torque|.
+    """
+
+    from_s: float
+    to_s: float
+    joint: int
+    torque_nm: dict[str, float]
+    weight: dict[str, Metric]
+    imbalance: Metric
+
+
+def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[JointLoad]:
+    """Returns the loaded joints of every static window."""
+    loads = []
+    for window in windows:
+        weights = _torque_weights(scenario, window.alpha)
+        for joint in range(JOINTS):
+            torque = {site: float(values[joint]) for site, values in window.torque.items()}
+            least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
+            loaded = {site: value for site, value in torque.items() if abs(value) >= least}
+            if loaded:
+                loads.append(_weigh_load(window, joint, loaded, weights))
+    return loads
+
+
+def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metric:
+    """Returns the number of static windows."""
+    if absent:
+        return Metric(None, f"no records of {', '.join(absent)}")
+    return metric(len(windows) or None, "no second in which all sites rest under torques that stand")
+
+
+def measure_force_sharing(
+    absent: list[str], windows: list[StaticWindow], pairs: list[SharingRatio]
+) -> MetricValues:
+    """Returns the largest deviation of force sharing from the dominance factors."""
+    offs = [pair.off for pair in pairs if pair.off is not None]
+    if offs:
+        return {"sharing_off": metric(max(offs))}
+    whys = "; ".join(dict.fromkeys(pair.expected_nm.why for pair in pairs))
+    why = count_static_windows(absent, windows).why or whys or "no two sites are loaded in a window at rest"
+    return {"sharing_off": Metric(None, why, applies=bool(absent))}
+
+
+def _weigh_load(
+    window: StaticWindow, joint: int, torque: dict[str, float], weights: Array | str
+) -> JointLoad:
+    if isinstance(weights, str):
+        why = Metric(None, weights)
+        return JointLoad(window.from_s, window.to_s, joint + 1, torque, dict.fromkeys(torque, why), why)
+    column = weights[:, joint] / weights[:, joint].max()
+    weight = dict(zip(window.torque, column.tolist(), strict=True))
+    moments = [weight[site] * value for site, value in torque.items()]
+    largest = max(map(abs, moments))
+    share = abs(sum(moments)) / largest if largest > 0.0 else None
+    imbalance = metric(share, "nobody who is followed is loaded")
+    shown = {site: metric(weight[site]) for site in torque}
+    return JointLoad(window.from_s, window.to_s, joint + 1, torque, shown, imbalance)
+
+
+def find_sharing_ratios(
+    scenario: Scenario, windows: list[StaticWindow], loads: list[JointLoad]
+) -> list[SharingRatio]:
+    """Returns the force sharing of every joint in a static window at which two sites are loaded.
+
+    The operator that feels is a spring; if both are or none, the slave is the site of the torque.
+    """
+    at = {window.from_s: window for window in windows}
+    pairs = []
+    for load in loads:
+        if len(load.torque_nm) == 2:
+            pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
+            torque = load.torque_nm[pushed]
+            by_wall = abs(float(at[load.from_s].environment[pushed][load.joint - 1])) > 0.5 * abs(torque)
+            one, other = load.weight[pushed], load.weight[holds]
+            if one.value is None or other.value is None:
+                expected = Metric(None, one.why)
+            elif other.value == 0.0:
+                expected = Metric(None, f"nobody ends up following {holds}")
+            else:
+                expected = metric(torque * one.value / other.value)
+            felt = -load.torque_nm[holds]
+            pairs.append(SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected))
+    return pairs
+
+
+def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
+    """Returns a sort key of the site that feels: a spring is active there and no wall; it is a master."""
+    spec = scenario.sites[site]
+    springs = (one.actor for one in spec.hands if one.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND))
+    held = any(spring.start_s <= at_s < spring.end_s for spring in springs)
+    return held and not spec.environment, spec.role == "master"
+
+
+def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
+    """Returns pi_i / K_i per joint, shape (N, 2); or the reason why that does not weigh torques."""
+    if len(find_closed_groups(alpha)) > 1:
+        return "two groups of sites follow nobody else: who feels whom is not unique"
+    stiffness = []
+    for site, spec in scenario.sites.items():
+        K, why = _holding_stiffness(spec)
+        if why:
+            return f"{site}: {why}"
+        stiffness.append(K)
+    return left_perron_vector(alpha)[:, np.newaxis] / np.array(stiffness)
+
+
+def _holding_stiffness(spec: SiteSpec) -> tuple[Array, str]:
+    """Returns the stiffness that holds e at rest, shape (2,), N m/rad, and the reason why more acts."""
+    gains = spec.control.gains(spec.arm.theta)
+    if gains.law is Law.OWN:
+        return np.zeros(JOINTS), "a law of somebody's own"
+    if not spec.arm.known:
+        return np.zeros(JOINTS), "theta of the arm is not known"
+    if any(gains.k_f):
+        return np.zeros(JOINTS), "it reflects force: e is not all that its law goes by"
+    adaptive = gains.law is Law.ADAPTIVE
+    estimate, truth = gains.theta_hat0 if adaptive else gains.known, spec.arm.theta
+    if adaptive and any(gains.Gamma[n] > 0.0 for n in GRAVITY_THETA):
+        return np.zeros(JOINTS), "gravity is learnt: the estimates take up the load"
+    if any(estimate[n] != truth[n] for n in GRAVITY_THETA) and spec.arm.g_m_s2 > 0.0:
+        return np.zeros(JOINTS), "gravity is not known exactly"
+    K = np.array(gains.Kp) * np.array(gains.Lambda) if adaptive else np.array(gains.K)
+    return K, "" if (K > 0.0).all() else "nothing holds its e"

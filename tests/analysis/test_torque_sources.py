@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 from tests.analysis.certificate import runs
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import compute_end_effector
-from trilat_net.analysis.torque_sources import compute_source_torque
-from trilat_net.analysis.torque_split import attribute_torque, compute_operator_script
+from trilat_net.analysis.torque_sources import (
+    attribute_torque,
+    compute_operator_script,
+    compute_source_torque,
+)
 from trilat_net.core import exogenous
 from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_source_rows
 

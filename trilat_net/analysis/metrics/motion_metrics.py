@@ -1,0 +1,209 @@
+"""Metrics of motion: tracking, spread between sites, following of a master, effort, contact, estimates.
+
+Invariant: e is Eq. (9) and includes the delay; the spread compares one instant; a slave is compared with its
+master as that was when the sample in use was taken. Effort counts the torque in the record: Eq. (13) within
+its limit, gravity compensation included. A wall is the scenario's, at the logged states; ticks without a
+record contribute nothing. A parameter counts if the control law adapts it (Gamma > 0); if theta is unknown
+there is no error, but the estimates are still reported.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.exogenous import TorqueKind, TorqueSource
+from ...core.site_setup import Law
+from ...log.log_reader import Log
+from ...scenario import SiteSpec
+from ...scenario.expect import END_WINDOW_S
+from .. import site_signals
+from ..aligned import AlignedRecords, find_latest_rows
+from ..torque_sources import wall_depth, wall_force
+from .metric_catalogue import (
+    CONTACT,
+    EFFORT,
+    FOLLOWING,
+    LEARNING,
+    SPREAD,
+    TRACKING,
+    MetricValues,
+    SiteRun,
+    metric,
+    peak,
+    rms,
+    unavailable,
+)
+
+LONG_END_S = 5.0
+"""Length of the end of a run for slopes of estimates and for contact, s."""
+
+
+def measure_tracking(log: Log, site: str) -> MetricValues:
+    """Returns settling, RMS and peak of a site's e."""
+    part = log[site]
+    if not len(part):
+        return unavailable(TRACKING, f"no records of {site}")
+    errors = site_signals.joint_errors(part)
+    unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} rad in the last record"
+    return {
+        "settle_s": metric(site_signals.settling_time_s(part), unsettled),
+        "rms_error_rad": metric(rms(errors)),
+        "max_error_rad": metric(peak(errors)),
+        "max_error_end_rad": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
+    }
+
+
+def measure_spread(log: Log, runs: Mapping[str, SiteRun]) -> MetricValues:
+    """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
+
+    Instants are the ticks of the first site at which every other site has its own latest tick recorded.
+    """
+    absent = [site for site in log.sites if site not in runs]
+    if absent:
+        return unavailable(SPREAD, f"no records of {', '.join(absent)}")
+    first = runs[log.sites[0]].records
+    known, poses = first.known.copy(), []
+    for records in (run.records for run in runs.values()):
+        row, recorded = find_latest_rows(records, first.t_s)
+        known &= recorded
+        poses.append(records.q[row])
+    if not known.any():
+        return unavailable(SPREAD, "no instant of which every site has a record")
+    spread = np.ptp(np.stack(poses)[:, known], axis=0)
+    end_s = min(float(run.records.t_s[-1]) for run in runs.values())
+    last = spread[first.t_s[known] > end_s - END_WINDOW_S]
+    none = "no instant of the last second of which every site has a record"
+    return {
+        "spread_rms_rad": metric(rms(spread)),
+        "spread_max_rad": metric(peak(spread)),
+        "spread_end_rad": metric(peak(last), none),
+    }
+
+
+def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
+    """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of the tick.
+
+    At every tick t_k of the slave from its first sample of that master on: the master's angles in the record
+    whose sample the slave has in use, less the slave's own.
+    """
+    if [log.scenario.sites[name].role for name in (peer, site)] != ["master", "slave"]:
+        return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
+    absent = [name for name in (peer, site) if name not in runs]
+    if absent:
+        return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
+    master, slave = runs[peer].records, runs[site].records
+    row = slave.used[peer] - master.first
+    inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
+    row = np.clip(row, 0, len(master.known) - 1)
+    known = slave.known & inside & master.known[row]
+    if not known.any():
+        return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
+    off = (master.q[row] - slave.q)[known]
+    return {
+        "following_rms_rad": metric(rms(off)),
+        "following_max_rad": metric(peak(off)),
+        "following_end_rad": metric(
+            peak(off[slave.known_at_end(END_WINDOW_S)[known]]), "no sample in the last second"
+        ),
+    }
+
+
+def measure_effort(log: Log, site: str) -> MetricValues:
+    """Returns effort and saturation of a site."""
+    part = log[site]
+    if not len(part):
+        return unavailable(EFFORT, f"no records of {site}")
+    tau = part.tau
+    at_limit = np.any(np.abs(tau) >= log.scenario.sites[site].limits.tau_limit_nm, axis=1)
+    return {
+        "effort_nm2_s": metric(float(np.einsum("kj,kj->", tau, tau)) / part.rate_hz),
+        "rms_tau_nm": metric(rms(tau)),
+        "peak_tau_nm": metric(peak(tau)),
+        "saturated_share": metric(float(at_limit.mean())),
+    }
+
+
+def list_walls(spec: SiteSpec) -> list[TorqueSource]:
+    """Returns the walls of a site, in scenario order."""
+    return [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
+
+
+def measure_wall_contact(wall: TorqueSource, run: SiteRun | None) -> MetricValues:
+    """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without records.
+
+    The first record, of all and after a gap, begins no contact: its beginning is unknown.
+    """
+    if run is None:
+        return unavailable(CONTACT, "no records of the site")
+    t_s, known, end_effector = run.records.nominal_s, run.records.known, run.torque.end_effector
+    force = wall_force(wall, t_s, end_effector)
+    touches = force > 0.0
+    began = touches & np.concatenate([[False], ~touches[:-1] & known[:-1]])
+    metrics = {
+        "contact_share": metric(float(touches[known].mean())),
+        "depth_max_m": metric(max(0.0, float(wall_depth(wall, end_effector)[known].max()))),
+    }
+    at_end = known & (t_s > t_s[known][-1] - LONG_END_S)
+    for prefix, rows in (("", known), ("end_", at_end)):
+        metrics[f"{prefix}force_mean_n"] = metric(float(force[rows].mean()))
+        metrics[f"{prefix}force_deviation_n"] = metric(float(force[rows].std()))
+        metrics[f"{prefix}force_peak_n"] = metric(float(force[rows].max()))
+        metrics[f"{prefix}hits"] = metric(float(np.count_nonzero(began[rows])))
+    return {key: metrics[key] for key in unavailable(CONTACT, "")}
+
+
+class ParameterEstimates(NamedTuple):
+    """Estimates of a site, shape (5,) each.
+
+    Attributes:
+        learnt: True for each that the law adapts.
+        theta: the true parameters; None if unknown.
+        first, last: the estimates of the first and the last record.
+        slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two records.
+    """
+
+    learnt: list[bool]
+    theta: list[float] | None
+    first: list[float]
+    last: list[float]
+    slope_per_s: list[float] | None
+
+
+def read_parameter_estimates(spec: SiteSpec, records: AlignedRecords) -> ParameterEstimates:
+    """Returns the estimates of a site, and their least-squares slopes at the end."""
+    gains, theta_hat = spec.control.gains(spec.arm.theta), records.theta_hat
+    moved = (theta_hat != theta_hat[0]).any(axis=0)
+    adapted = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
+    rows, slope = records.known_at_end(LONG_END_S), None
+    if np.count_nonzero(rows) >= 2:
+        x = records.t_s[rows] - records.t_s[rows].mean()
+        slope = (x @ theta_hat[rows] / (x @ x)).tolist()
+    theta = spec.arm.theta.tolist() if spec.arm.known else None
+    return ParameterEstimates(adapted.tolist(), theta, theta_hat[0].tolist(), theta_hat[-1].tolist(), slope)
+
+
+def measure_parameter_error(spec: SiteSpec, records: AlignedRecords | None) -> MetricValues:
+    """Returns the distance of the estimates from theta at both ends, and their rate of change at the end."""
+    if records is None:
+        return unavailable(LEARNING, "no records of the site")
+    estimates, gains = read_parameter_estimates(spec, records), spec.control.gains(spec.arm.theta)
+    rows = np.array(estimates.learnt)
+    if not rows.any():
+        return unavailable(LEARNING, "nothing is learnt", applies=False)
+    slopes = estimates.slope_per_s
+    slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
+    metrics = unavailable(LEARNING, "theta of the arm is not known")
+    metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
+    if estimates.theta is None:
+        return metrics
+    off = np.array([estimates.first, estimates.last])[:, rows] - np.array(estimates.theta)[rows]
+    distance = np.linalg.norm(off, axis=1).tolist()
+    energy: list[float | None] = [None, None]
+    if gains.law is Law.ADAPTIVE:
+        energy = (0.5 * (off**2 / np.array(gains.Gamma)[rows]).sum(axis=1)).tolist()
+    why = "it is no finite number" if gains.law is Law.ADAPTIVE else "the gains of learning are not known"
+    for n, end in enumerate(("first", "last")):
+        metrics[f"theta_error_{end}"] = metric(distance[n])
+        metrics[f"theta_energy_{end}_j"] = metric(energy[n], why)
+    return metrics
