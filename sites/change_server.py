@@ -26,13 +26,7 @@ AHEAD_MS = 100
 
 
 class ChangeServer:
-    """The change requests to one site.
-
-    Args:
-        scenario: the experiment.
-        site: the site's name.
-        queries: where the requests arrive.
-    """
+    """The change requests to one site."""
 
     def __init__(self, scenario: Scenario, site: str, queries: QueryInbox) -> None:
         self._scenario, self._site, self._queries = scenario, site, queries
@@ -43,11 +37,7 @@ class ChangeServer:
         self._accepted = 0
 
     def take(self, k: int) -> Sequence[CoreChange]:
-        """Replies to every request; returns the accepted changes, for tick k.
-
-        Args:
-            k: the next tick.
-        """
+        """Replies to every request; returns the accepted changes, for the next tick, k."""
         query = self._queries.poll()
         if query is None:
             return ()

@@ -23,7 +23,7 @@ from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 
 from .monitor import SessionDisplay, SessionMonitor
-from .warmup import warm_up
+from .site_parts import warm_up
 
 POLL_NS = 100_000_000
 END_TIMEOUT_NS = 15 * NS_PER_S
@@ -32,13 +32,7 @@ END_TIMEOUT_NS = 15 * NS_PER_S
 
 @dataclass(slots=True)
 class SessionResult:
-    """How a session ended.
-
-    Attributes:
-        log: its log.
-        problems: what failed, in order.
-        interrupted: number of the signal that ended it, or 0.
-    """
+    """How a session ended: what failed, in order, and the number of the signal that ended it, or 0."""
 
     log: Path
     problems: list[str] = field(default_factory=list)
@@ -89,13 +83,7 @@ def demo_session_name(scenario: Scenario) -> str:
 
 
 def run_demo(scenario: Scenario, folder: Path, display: SessionDisplay) -> SessionResult:
-    """Runs a session of all sites and a recorder; its log is valid whenever the session began.
-
-    Args:
-        scenario: the experiment.
-        folder: an existing folder for the log and the output of the processes.
-        display: shows progress.
-    """
+    """Runs a session of all sites and a recorder; its log is valid whenever the session began."""
     result = SessionResult(folder / "run.mcap")
     session, clock = demo_session_name(scenario), SystemClock()
     with Interrupt() as interrupt:

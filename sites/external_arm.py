@@ -28,16 +28,9 @@ _MAX_POLL_GAP_NS = 20_000_000
 class ExternalArm:
     """The measurements of one arm.
 
-    Args:
-        site: the site of the arm.
-        ring: where its measurements arrive.
-        clock: the time.
-        dropped: counts what is dropped, by reason.
-        place: key and endpoint where they arrive, for messages to the user.
-
     Attributes:
         newest: the newest measurement, None before the first.
-        taken: number of measurements taken.
+        taken: number of measurements taken; the others are counted in `dropped`, by reason.
     """
 
     def __init__(
@@ -77,22 +70,17 @@ class ExternalArm:
         return False
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Accepts from now on only the program that sends now; returns a warning about the pose, or "".
+        """Accepts from now on only the program that sends now.
 
-        Args:
-            q0_rad: the start pose that the peers assume.
+        Returns a warning if the arm is off the start pose that the peers assume, else "".
         """
         self.poll()
         self._bound = True
         self._silent_ns = 0
         pairs = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
         off_rad = max(abs(a - b) for a, b in pairs)
-        if off_rad <= START_POSE_TOLERANCE_RAD:
-            return ""
-        return (
-            f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start: their "
-            "references will jump"
-        )
+        told = f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start"
+        return f"{told}: their references will jump" if off_rad > START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
         """Takes the measurements that have arrived."""

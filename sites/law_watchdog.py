@@ -46,12 +46,6 @@ def read_thread_usage() -> tuple[int, int]:
 class LawWatchdog:
     """Steps a site under a user's law; a context within which a law that hangs is stopped.
 
-    Args:
-        site: the site.
-        law: the law, as in "package.module:Law".
-        clock: the time.
-        usage: the thread's usage, see `read_thread_usage`.
-
     Attributes:
         hiccups: number of ticks at which the law took longer than a tick period.
         longest_ns: the longest of all ticks.

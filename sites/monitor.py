@@ -19,12 +19,7 @@ from trilat_net.scenario import Scenario
 
 
 class SessionMonitor:
-    """The latest statistics and the events of a session.
-
-    Attributes:
-        latest: latest statistics of every site.
-        news: event texts for the user, not yet taken.
-    """
+    """The latest statistics of every site of a session, and event texts for the user, not yet taken."""
 
     def __init__(self, bus: Bus, session: str, sites: Sequence[str]) -> None:
         self.latest: dict[str, LinkStats] = {}
@@ -93,15 +88,8 @@ class SessionDisplay:
                 table.add_row(name, "braked", "", "", "", "", "")
                 continue
             ages = "  ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
-            table.add_row(
-                name,
-                stats.mode,
-                f"{stats.t_ns / NS_PER_S:.1f} s",
-                f"{stats.tick}",
-                f"{stats.late_max_us} us",
-                f"{stats.overruns}",
-                ages,
-            )
+            time, late = f"{stats.t_ns / NS_PER_S:.1f} s", f"{stats.late_max_us} us"
+            table.add_row(name, stats.mode, time, f"{stats.tick}", late, f"{stats.overruns}", ages)
         return table
 
     def _line(self, latest: dict[str, LinkStats]) -> str:

@@ -19,11 +19,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def prepare(cpu: int | None) -> dict[str, str]:
-    """Requests every setting that helps a loop; returns the settings obtained, by name.
-
-    Args:
-        cpu: the processor to stay on, or None for any.
-    """
+    """Requests every setting that helps a loop, on a processor or any; returns what was obtained, by name."""
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": _set_timer_slack,

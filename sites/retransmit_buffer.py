@@ -23,13 +23,9 @@ EVENTS_KEPT, EVENTS_BYTES = 4_096, 4_000_000
 
 
 class ChannelBuffer:
-    """The last messages of one channel; their numbers count from 0.
+    """The last messages of one channel; their numbers count from 0. `size_bytes` holds any one message.
 
     The memory is allocated at the start: nothing is allocated while the loop runs.
-
-    Args:
-        capacity: most messages.
-        size_bytes: most bytes; more than one message has.
 
     Attributes:
         made: number of messages so far.
@@ -59,12 +55,7 @@ class ChannelBuffer:
             self.oldest += 1
 
     def chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns the number of the first message and the messages of one answer.
-
-        Args:
-            first: number of the first one wanted; the oldest one kept comes first if that is later.
-            last: number of the last one wanted.
-        """
+        """Returns the number of the first message and the messages of one answer, of those that are kept."""
         first = max(first, self.oldest)
         payloads: list[bytes] = []
         size = 0
@@ -79,17 +70,7 @@ class ChannelBuffer:
 
 
 class RetransmitBuffer:
-    """The recently published messages of a site.
-
-    Args:
-        site: its name.
-        boot: its process start.
-        rate_hz: its tick rate.
-        queries: where requests for them arrive.
-
-    Attributes:
-        channels: the messages by channel.
-    """
+    """The recently published messages of a site, by channel."""
 
     def __init__(self, site: str, boot: int, rate_hz: int, queries: QueryInbox) -> None:
         self._site, self._boot, self._queries = site, boot, queries
@@ -111,16 +92,13 @@ class RetransmitBuffer:
             return True  # a stranger's: it gets no answer
         buffer = self.channels[wanted.channel]
         first, payloads = buffer.chunk(wanted.first, wanted.last)
-        query.answer(
-            encode(
-                Backfill(
-                    member=self._site,
-                    boot=self._boot,
-                    channel=wanted.channel,
-                    first=first,
-                    payloads=payloads,
-                    made=buffer.made,
-                )
-            )
+        reply = Backfill(
+            member=self._site,
+            boot=self._boot,
+            channel=wanted.channel,
+            first=first,
+            payloads=payloads,
+            made=buffer.made,
         )
+        query.answer(encode(reply))
         return True

@@ -31,7 +31,6 @@ class PingResult:
     """Round trips to one member.
 
     Attributes:
-        info: its identity.
         rtts_ns: round trips, without the time that it held them.
         shared: whether its clock is the client's own.
         estimate: offset of its clock from the client's; None if too few round trips agree.

@@ -24,15 +24,7 @@ QUERIED_NS = NS_PER_S
 
 
 class LeavingSite:
-    """A site after its last tick.
-
-    Args:
-        parts: the site.
-        publisher: its events and identity.
-        boots: the members of the session.
-        output: its last record; None without one.
-        failure: the reason for which this site ended the run, if it did.
-    """
+    """A site after its last tick, with its last record if any, and the reason for which it ended the run."""
 
     def __init__(
         self,

@@ -23,15 +23,9 @@ from trilat_net.net.wire import decode, encode, encode_state
 
 
 class PeerInbox:
-    """The samples of a site's peers.
+    """The samples of a site's peers; every sequence has one entry for each, in scenario order.
 
-    Args:
-        peers: names of the peers, in scenario order; the other sequences have one entry for each.
-        rings: where their records arrive.
-        rates: their tick rates, Hz.
-        boots: the starts of them that belong to the session; messages of others are dropped.
-        monitors: timing of their links.
-        dropped: counts what is dropped, by reason.
+    Messages of other boots are dropped; `dropped` counts what is dropped, by reason.
     """
 
     def __init__(
@@ -48,11 +42,7 @@ class PeerInbox:
         self._last = [-1] * len(peers)
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
-        """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS.
-
-        Args:
-            since_epoch_ns: nominal time since the epoch, ns.
-        """
+        """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS."""
         arrivals: list[Arrival] = []
         for index, ring in enumerate(self._rings):
             while len(arrivals) < MAX_ARRIVALS and (message := ring.poll()) is not None:
@@ -116,18 +106,7 @@ def run_loop(
     stats: LoopStats,
     io: LoopIO,
 ) -> TickRecord | None:
-    """Runs a site in real time, from tick 0, and returns its last record; None without a tick.
-
-    Args:
-        site: the site, at its start.
-        boot: this process's boot.
-        ticks: number of ticks.
-        clock: the time.
-        inbox: the peers' samples.
-        timing: deadlines and stamps.
-        stats: counters of the loop.
-        io: everything else.
-    """
+    """Runs a site in real time, from tick 0, and returns its last record; None without a tick."""
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
     busy_us, mode, last = 0, Mode.RUN, None
     for k in range(ticks):

@@ -7,13 +7,19 @@ declares itself alive is ready for its session.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, PlantState, TickInput, TickRecord
+from trilat_net.errors import LawFailed
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
+from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.membership import new_boot
+from trilat_net.net.messages import PeerSample
+from trilat_net.net.offset import OffsetEstimator, OffsetLimit
+from trilat_net.net.wire import decode, encode_state
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.laws import ImportedLaw
@@ -23,7 +29,6 @@ from .external_arm import MEASUREMENTS_KEPT, ExternalArm
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
-from .warmup import warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +36,7 @@ class SiteOptions:
     """How a site takes part in a session.
 
     Attributes:
-        session: the session's name.
-        connection: its connection to the network.
         join_timeout_s: how long to wait for the others, s.
-        needs_recorder: whether the session needs a recorder.
         cpu: the processor to stay on, or None.
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
         clock_offset_s: injected offset of the clock from the machine's, s.
@@ -56,17 +58,11 @@ class SiteParts:
 
     Attributes:
         site: the site, at its start.
-        boot: this process's boot.
-        rates: tick rates of the peers, Hz.
-        stats: counters of its loop.
         rings: the peers' records as they arrive.
         watchdog: steps the site under a user's law; None without one.
         arm: measurements of its external arm; None without one.
-        buffer: its recently published messages.
         publish_state: publishes a record, and keeps it in the buffer.
         publish_link: publishes statistics, and keeps them.
-        monitor: presence of the other members.
-        changes: answers change requests.
     """
 
     def __init__(
@@ -114,3 +110,39 @@ class SiteParts:
             publish(payload)
 
         return keep_and_publish
+
+
+WARM_UP_TICKS = 200
+
+
+def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
+    """Steps a throw-away site, so that all code of a tick is compiled and in memory; it leaves no trace.
+
+    Raises:
+        LawFailed: a user law fails already with every arm at rest where it starts.
+    """
+    setup, law = scenario.setup(name), scenario.sites[name].control
+    site = Site(setup)
+    try:
+        if isinstance(law, ImportedLaw):
+            with LawWatchdog(site, law.code, clock or SystemClock()) as watchdog:
+                _warm(setup, site, watchdog.step)
+        else:
+            _warm(setup, site, site.step)
+    except LawFailed as failed:
+        problem = f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
+        raise LawFailed(problem, site=name, law=failed.law, tick=failed.tick) from None
+
+
+def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
+    estimator = OffsetEstimator()
+    measured = PlantState(setup.q0, setup.qd0) if setup.external else None
+    for k in range(WARM_UP_TICKS):
+        arrivals = [
+            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0)) for j, link in enumerate(setup.links) if k > 0
+        ]
+        output = step(TickInput(k, arrivals, (), measured))
+        echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
+        decode(encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo), PeerSample)
+        estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
+        estimator.estimate(k)

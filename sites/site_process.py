@@ -35,12 +35,6 @@ POLL_NS = 5_000_000
 def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]) -> int:
     """Runs one site of a scenario from its start to its end.
 
-    Args:
-        scenario: the experiment.
-        name: the site.
-        options: how it takes part.
-        say: prints a line for the user.
-
     Returns:
         The exit code: 0, or 128 and the number of the signal that ended it.
 
@@ -55,13 +49,8 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         law.check_unchanged(name)
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
-        bus = open_bus(
-            options.connection,
-            clock,
-            interrupt.requested,
-            options.join_timeout_s,
-            lambda text: say(f"{name}: {text}"),
-        )
+        named, timeout_s = (lambda text: say(f"{name}: {text}")), options.join_timeout_s
+        bus = open_bus(options.connection, clock, interrupt.requested, timeout_s, named)
         if bus is None:
             return interrupt.exit_code
         with closing(bus):

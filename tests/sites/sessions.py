@@ -3,12 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgpack
 
 from recorder.record_process import Recorder
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import take_part
+from trilat_net.errors import RunFailed, SessionError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
@@ -42,17 +44,43 @@ class Session:
     """Of members on clocks of their own: how far ahead (ns), and how much faster (ns/s)."""
     storage: LogStorage | None = None
     """Where the log goes, if not simply to `path`."""
+    stay_s: float = 0.0
+    works_ns: int = 0
+    """How long the sites wait for the recorder to leave, and how long it works on when it has all."""
+    left_ns: dict[str, int] = field(default_factory=dict)
+    """When a member left, and when the log was whole ("log")."""
+    ends: dict[str, object] | None = None
+    """What each site came to, its exit code or its error; None where an error fails the test."""
+
+    @classmethod
+    def whole(cls, scenario: Scenario, folder: Path, **fields: Any) -> "Session":
+        """A session of a recorder and all sites."""
+        session = cls(scenario, folder / "run.mcap", **fields)
+        session.recorder()
+        for name in scenario.names:
+            session.site(name)
+        return session
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
         """Adds a site."""
         self.interrupts[name] = Interrupt()
-        self.clocks[name] = self.relay.add(
-            name, lambda clock: self.live(name, clock, needs_recorder=needs_recorder), at_ns
-        )
+
+        def run(clock: RelayClock) -> object:
+            try:
+                end: object = self.live(name, clock, needs_recorder=needs_recorder)
+            except (RunFailed, SessionError) as failed:
+                if self.ends is None:
+                    raise
+                end = failed
+            if self.ends is not None:
+                self.ends[name] = end
+            return end
+
+        self.clocks[name] = self.relay.add(name, run, at_ns)
 
     def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
         """A site's life, from its connection to its exit code."""
-        options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder)
+        options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder, stay_s=self.stay_s)
         interrupt = self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
         bus = self.network.join()
@@ -60,6 +88,7 @@ class Session:
             return take_part(SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append))
         finally:
             bus.close()
+            self.left_ns[name] = clock.monotonic_ns()
 
     def _own(self, name: str, clock: RelayClock) -> Clock:
         return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
@@ -79,6 +108,9 @@ class Session:
                 epoch = recorder.join(30.0)
                 assert epoch is not None
                 recording = recorder.record(epoch)
+                self.left_ns["log"] = clock.monotonic_ns()
+                clock.sleep_until(clock.monotonic_ns() + self.works_ns)
+                self.left_ns["recorder"] = clock.monotonic_ns()
                 problem = recording.problem()
                 return [*recording.summary(), *([problem] if problem else [])]
             finally:

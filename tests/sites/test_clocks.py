@@ -22,13 +22,8 @@ def run(
     folder: Path, skews: dict[str, tuple[int, int]], duration_s: float, relay: Relay | None = None
 ) -> tuple[Session, Log]:
     """A session of `asymmetric` in which members are on clocks of their own."""
-    session = Session(
-        load_scenario("asymmetric", {"duration_s": duration_s}), folder / "run.mcap", relay or Relay()
-    )
-    session.skews = skews
-    session.recorder()
-    for name in session.scenario.names:
-        session.site(name)
+    scenario = load_scenario("asymmetric", {"duration_s": duration_s})
+    session = Session.whole(scenario, folder, relay=relay or Relay(), skews=skews)
     return session, session.run()
 
 
@@ -100,7 +95,7 @@ def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log])
 
 @pytest.mark.usefixtures("unprepared")
 def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) -> None:
-    session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.5)
+    session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.2)
     assert not any(event.kind == "clock" for event in log.events)
     for site in log.sites:
         for stats in log.link_stats(site):
@@ -124,8 +119,8 @@ class Stepping(Relay):
 @pytest.mark.usefixtures("unprepared")
 def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: Path) -> None:
     (tmp_path / "steady").mkdir()
-    _, steady = run(tmp_path / "steady", SKEWS, 0.7)
-    session, log = run(tmp_path, SKEWS, 0.7, Stepping())
+    _, steady = run(tmp_path / "steady", SKEWS, 0.3)
+    session, log = run(tmp_path, SKEWS, 0.3, Stepping())
     assert session.relay.readings > 0
     assert in_log(log) == in_log(steady)
     for site in log.sites:
@@ -138,11 +133,9 @@ def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: 
 @pytest.mark.usefixtures("unprepared")
 @pytest.mark.parametrize("at_ns", [1_050_000_000, 1_250_000_000])
 def test_a_member_on_another_clock_that_hangs_while_joining_is_waited_for(at_ns: int, tmp_path: Path) -> None:
-    session = Session(load_scenario("two_sites", {"duration_s": 0.3}), tmp_path / "run.mcap")
-    session.skews = {"s": (S, 50_000)}
-    session.recorder()
-    for name in session.scenario.names:
-        session.site(name)
+    session = Session.whole(
+        load_scenario("two_sites", {"duration_s": 0.3}), tmp_path, skews={"s": (S, 50_000)}
+    )
     session.clocks["s"].stall(at_ns, 900_000_000)
     log = session.run()
     assert log.complete

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.external_arm import MEASUREMENTS_KEPT, SILENCE_LIMIT_NS, ExternalArm
-from trilat_net.errors import RunFailed, SessionError
+from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
@@ -28,6 +28,7 @@ from trilat_net.scenario import load_scenario
 from .relay import RelayClock
 from .sessions import SESSION, Session
 
+pytestmark = pytest.mark.usefixtures("unprepared")
 OUTSIDE = {"duration_s": 1.0, "sites.s.plant": "external", "sites.s.arm.known": False}
 PERIOD_NS = 1_000_000
 A_SECOND = 1_000_000_000
@@ -70,27 +71,13 @@ def driving(sent: list[list[float]], torques: list[tuple[float, ...]], until_ns:
 
 def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
     """A session with that arm, and what became of its sites once it has run."""
-    session = Session(load_scenario("two_sites", {**OUTSIDE, **overrides}), folder / "run.mcap")
-    ends: dict[str, object] = {}
-    live = session.live
-
-    def told(site: str, *arguments: object, **options: object) -> int:
-        try:
-            ends[site] = live(site, *arguments, **options)
-        except (RunFailed, SessionError) as failed:
-            ends[site] = failed
-        return 0
-
-    session.live = told
-    session.recorder()
-    for site in session.scenario.names:
-        session.site(site)
+    scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
+    session = Session.whole(scenario, folder, ends={})
     if act is not None:
         session.stranger(act, at_ns=A_SECOND + 200_250_000)
-    return session, ends
+    return session, session.ends
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_what_the_arm_measures_is_the_record_and_the_record_is_what_drives_it(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
@@ -120,7 +107,6 @@ def whole(log: Log) -> None:
     assert compare_with_virtual(log).fed.identical == verdict.records
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_an_arm_that_falls_silent_ends_the_session_in_order_and_is_named(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_000_000_000))
     log = session.run()
@@ -131,7 +117,6 @@ def test_an_arm_that_falls_silent_ends_the_session_in_order_and_is_named(tmp_pat
     whole(log)
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
@@ -143,7 +128,6 @@ def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tm
     session.relay.run()
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], []))
 
@@ -261,24 +245,10 @@ def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
     site = network.join()
     port = ArmPort(network.join(), clock, "t", "s")
     assert port.torque() is None
-    state = {
-        "v": VERSION,
-        "site": "s",
-        "boot": 5,
-        "tick": 0,
-        "t_ns": 0,
-        "mode": "run",
-        **{key: [0.0, 0.0] for key in ("q", "qd", "q_des", "qd_des", "tau_x")},
-        "tau": [1.5, -2.5],
-        "theta_hat": [0.0] * 5,
-        "used": {},
-        "rx": [],
-        "rx_crc": 0,
-        "cmd": [],
-        "mem": [],
-        "late_us": 0,
-        "busy_us": 0,
-    }
+    zeros = dict.fromkeys(("tick", "t_ns", "rx_crc", "late_us", "busy_us"), 0)
+    vectors = {key: [0.0, 0.0] for key in ("q", "qd", "q_des", "qd_des", "tau_x")}
+    state = {"v": VERSION, "site": "s", "boot": 5, "mode": "run", **zeros, **vectors, "tau": [1.5, -2.5]}
+    state |= {"theta_hat": [0.0] * 5, "used": {}, "rx": [], "cmd": [], "mem": []}
     say = site.publisher("trilat/t/s/state")
     say(msgpack.packb(state))
     assert port.torque() == (1.5, -2.5)

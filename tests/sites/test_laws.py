@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sites.warmup import warm_up
-from trilat_net.errors import LawFailed, RunFailed
+from sites.site_parts import warm_up
+from trilat_net.errors import LawFailed
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
@@ -18,23 +18,9 @@ pytestmark = pytest.mark.usefixtures("unprepared")
 
 def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
     """The log of a session, and per site its exit code or what it was ended by."""
-    scenario = load_scenario(name, {"duration_s": 1.0, **overrides})
-    session = Session(scenario, folder / "run.mcap")
-    session.recorder()
-    ends: dict[str, object] = {}
-    live = session.live
-
-    def told(site: str, *arguments: object, **options: object) -> int:
-        try:
-            ends[site] = live(site, *arguments, **options)
-        except RunFailed as failed:
-            ends[site] = failed
-        return 0
-
-    session.live = told
-    for site in scenario.names:
-        session.site(site)
-    return session.run(), ends
+    scenario = load_scenario(name, {"duration_s": 0.5, **overrides})
+    session = Session.whole(scenario, folder, ends={})
+    return session.run(), session.ends or {}
 
 
 def test_a_law_that_repeats_the_papers_is_virtual_time_and_the_papers_bit_for_bit(tmp_path: Path) -> None:
@@ -42,27 +28,27 @@ def test_a_law_that_repeats_the_papers_is_virtual_time_and_the_papers_bit_for_bi
     log, ends = lived(tmp_path, "two_sites", control=law)
     assert ends == {"m": 0, "s": 0}
     assert in_log(log) == in_virtual_time(log.scenario)
-    assert in_log(log) == in_virtual_time(load_scenario("two_sites", {"duration_s": 1.0}))
+    assert in_log(log) == in_virtual_time(load_scenario("two_sites", {"duration_s": 0.5}))
     verdict = verify(log)
     assert verdict.whole_run
-    assert verdict.identical == verdict.records == 2000
+    assert verdict.identical == verdict.records == 1000
 
 
 @pytest.mark.parametrize("how", ["nan", "raises"])
 def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) -> None:
-    control = {"law": "tests.laws:Failing", "how": how, "at": 400}
+    control = {"law": "tests.laws:Failing", "how": how, "at": 250}
     log, ends = lived(tmp_path, "paper", **{"sites.m2.control": control})
     assert isinstance(ends["m2"], LawFailed)
     text = str(ends["m2"])
-    assert text.startswith("the law tests.laws:Failing of m2 failed at tick 400: ")
+    assert text.startswith("the law tests.laws:Failing of m2 failed at tick 250: ")
     for other in ("m1", "s"):
         assert str(ends[other]) == f"{other} ended because {text}"
     assert log.complete
     assert [event.text for event in log.events if event.kind == "failed"] == [text]
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    assert made["m2"] == len(log["m2"]) == 400
+    assert made["m2"] == len(log["m2"]) == 250
     for other in ("m1", "s"):
-        assert 400 < made[other] == len(log[other]) < 1000
+        assert 250 < made[other] == len(log[other]) < 500
     assert verify(log).passed
     twins = compare_with_virtual(log)
     assert twins.fed.first is None

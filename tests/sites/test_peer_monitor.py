@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import pytest
+
 from sites.peer_monitor import PeerMonitor
 from trilat_net.net import topics
 from trilat_net.net.bus import LocalBus, LocalNetwork
@@ -38,48 +40,32 @@ class Desk:
         return [(event.kind, event.about) for event in read_events(self._heard)]
 
 
-def test_a_peer_that_goes_without_a_word_is_lost() -> None:
+@pytest.mark.parametrize(
+    ("boot", "event", "news", "ended_by"),
+    [
+        (2, "", [("lost", "m2")], ""),
+        (2, "end", [], ""),
+        (2, "diverged", [("lost", "m2")], "m2 diverged"),
+        (22, "diverged", [], ""),  # another start is nobody
+    ],
+)
+def test_a_peer_that_goes_is_lost_unless_it_said_its_end(
+    boot: int, event: str, news: list[tuple[str, str]], ended_by: str
+) -> None:
     desk = Desk()
-    bus = desk.comes("m2", 2)
+    bus = desk.comes("m2", boot)
     assert desk.told() == []
+    if event:
+        desk.says("m2", boot, event)
     bus.close()
-    assert desk.told() == [("lost", "m2")]
+    assert (desk.told(), desk.company.ended_by) == (news, ended_by)
 
 
-def test_a_peer_that_has_said_its_end_may_go() -> None:
-    desk = Desk()
-    bus = desk.comes("m2", 2)
-    desk.says("m2", 2, "end")
-    bus.close()
-    assert desk.told() == []
-
-
-def test_other_starts_of_a_peer_are_nobody() -> None:
-    desk = Desk()
-    desk.comes("m2", 22).close()
-    desk.says("m2", 22, "diverged")
-    assert desk.told() == []
-    assert desk.company.ended_by == ""
-
-
-def test_a_peer_that_diverged_ends_the_run() -> None:
-    desk = Desk()
-    desk.says("s", 3, "diverged")
-    desk.told()
-    assert desk.company.ended_by == "s diverged"
-
-
-def test_the_recorder_of_the_beginning_is_no_news() -> None:
-    desk = Desk()
-    desk.comes(topics.RECORDER, 9)
-    assert desk.told() == []
-    assert desk.company.recorders == {"9"}
-
-
-def test_a_recorder_that_comes_later_is_told_of_and_counted_in() -> None:
+def test_the_recorder_of_the_beginning_is_no_news_and_a_later_one_is_told_of_and_counted_in() -> None:
     desk = Desk()
     first = desk.comes(topics.RECORDER, 9)
-    desk.told()
+    assert desk.told() == []
+    assert desk.company.recorders == {"9"}
     first.close()
     assert desk.told() == [("lost", topics.RECORDER)]
     assert desk.company.recorders == set()

@@ -1,10 +1,13 @@
 """Every step warns and goes on: what a process obtained is said, whatever it was."""
 
 import json
+import os
 import subprocess
 import sys
 
 import pytest
+
+from sites import realtime
 
 PROGRAM = """
 import json, os, sys
@@ -25,32 +28,29 @@ def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool
     return tuple(json.loads(done.stdout))
 
 
-def test_every_step_says_what_it_obtained() -> None:
-    obtained, collecting, _ = prepared()
+def test_every_step_says_what_it_obtained_and_a_process_stays_on_its_processor() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    obtained, collecting, cpus = prepared(cpu)
     assert list(obtained) == ["affinity", "timer_slack", "memory", "scheduling", "collector"]
     assert all(obtained.values())
     assert not collecting
     assert obtained["collector"] == "frozen and off"
-
-
-def test_a_process_stays_on_its_processor() -> None:
-    _, _, (cpu, *_) = prepared()
-    obtained, _, cpus = prepared(cpu)
     assert cpus == [cpu]
     assert obtained["affinity"] == f"cpu {cpu}"
 
 
 @pytest.mark.parametrize("cpu", [-1, 1023, 2**80])
-def test_a_processor_that_is_not_there_is_a_warning(cpu: int) -> None:
-    obtained, _, _ = prepared(cpu)
-    assert obtained["affinity"].startswith("not obtained (")
+def test_a_processor_that_is_not_there_is_a_warning(cpu: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for step in ("_set_timer_slack", "_lock_memory", "_set_scheduling", "_stop_collector"):
+        monkeypatch.setattr(realtime, step, str)
+    assert realtime.prepare(cpu)["affinity"].startswith("not obtained (")
+
+
+REFUSE = "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
 
 
 def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
-    refuse = (
-        "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
-        "os.sched_setscheduler = os.setpriority = realtime._libc_call = refuse"
-    )
+    refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._libc_call = refuse"
     obtained, collecting, _ = prepared(before=refuse)
     assert obtained["scheduling"].startswith("normal (")
     assert obtained["memory"] == obtained["timer_slack"] == "not obtained (Operation not permitted)"
@@ -58,11 +58,7 @@ def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
 
 
 def test_another_priority_is_better_than_none() -> None:
-    refuse = (
-        "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
-        "os.sched_setscheduler = refuse\n"
-        "os.setpriority = lambda *_: None"
-    )
+    refuse = f"{REFUSE}os.sched_setscheduler = refuse\nos.setpriority = lambda *_: None"
     assert prepared(before=refuse)[0]["scheduling"] == "nice -10 (SCHED_FIFO was not permitted)"
 
 

@@ -25,12 +25,8 @@ MS = 1_000_000
 SITES = ("m", "s")
 
 
-def session_of(path: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
-    session = Session(load_scenario("two_sites", {"duration_s": duration_s}), path, storage=storage)
-    session.recorder()
-    for name in SITES:
-        session.site(name)
-    return session
+def session_of(folder: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
+    return Session.whole(load_scenario("two_sites", {"duration_s": duration_s}), folder, storage=storage)
 
 
 def records(path: Path) -> dict[str, int]:
@@ -41,7 +37,7 @@ def records(path: Path) -> dict[str, int]:
 
 def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    session = session_of(path, 0.4)
+    session = session_of(tmp_path, 0.4)
     looks: list[tuple[int, int]] = []
 
     def look(_: Bus, clock: RelayClock) -> None:
@@ -70,7 +66,7 @@ def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
 ) -> None:
     path = tmp_path / "run.mcap"
     monkeypatch.setattr(log_writer, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
-    session = session_of(path, 2.0)
+    session = session_of(tmp_path, 2.0)
     with pytest.raises(LogRefused, match="the disk is full; the log ends there, finished") as refusal:
         session.run()
     assert refusal.value.exit_code == 5
@@ -87,9 +83,10 @@ def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
 
 
 def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
-    whole = session_of(tmp_path / "whole.mcap", 1.0).run()
+    (tmp_path / "whole").mkdir()
+    whole = session_of(tmp_path / "whole", 0.5).run()
     path = tmp_path / "run.mcap"
-    session = session_of(path, 1.0, LogStorage(path, split_ns=300 * MS))
+    session = session_of(tmp_path, 0.5, LogStorage(path, split_ns=125 * MS))
     with pytest.raises(Exception, match="No such file"):
         session.run()  # there is no file of that name
     names = [part.name for part in sorted(find_parts(path).values())]
@@ -112,7 +109,7 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
 def test_what_is_left_out_is_neither_in_the_file_nor_missing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     choice = ChannelFilter(("**/m/**", "**/s/event"), ("**/link",))
-    log = session_of(path, 0.3, LogStorage(path, choice=choice)).run()
+    log = session_of(tmp_path, 0.3, LogStorage(path, choice=choice)).run()
     assert len(log["m"]) == 300
     assert len(log["s"]) == 0
     kept = {f"/trilat/{SESSION}/{what}" for what in ("m/state", "m/event", "s/event")}
