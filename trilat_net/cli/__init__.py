@@ -65,39 +65,80 @@ app = typer.Typer(
     help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
     epilog="Begin with: trilat demo paper",
 )
-for _module in (
-    demo,
-    site,
-    record,
-    ping,
-    router,
-    sim,
-    verify,
-    certify,
-    metrics,
-    compare,
-    figure,
-    report,
-    replay,
-    rerun,
-):
-    app.add_typer(_module.app)
-app.add_typer(log.app, name="log")
-for _module in (test, sweep, linear):
-    app.add_typer(_module.app)
-app.add_typer(scenario.app, name="scenario")
-app.add_typer(set_command.app, name="set")
+
+
+def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any) -> typer.Typer:
+    """Returns a group of commands: by name a function and arguments of examples, which follow `words`."""
+    group = typer.Typer(**options)
+    for name, (run, *examples) in commands.items():
+        epilog = "\n\n".join(f"Example: trilat {words}{name} {example}".rstrip() for example in examples)
+        group.command(name, epilog=epilog)(run)
+    return group
+
+
+_SINGLE = {
+    "demo": (demo.demo_command, "paper --duration 10 --set control.Kd=5"),
+    "site": (site.site_command, "m1 --scenario paper"),
+    "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
+    "ping": (ping.ping_command, "--session paper"),
+    "router": (router.router_command, f"--listen {router.ANY_ADDRESS}"),
+    "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
+    "verify": (verify.verify_command, "run.mcap"),
+    "certify": (certify.certify_command, "run.mcap"),
+    "metrics": (metrics.metrics_command, "run.mcap"),
+    "compare": (compare.compare_command, "a.mcap b.mcap", "--tune free --law adaptive,p_d"),
+    "figure": (
+        figure.figure_command,
+        "run.mcap positions settling --width 3.5 --format pdf --out paper",
+    ),
+    "report": (report.report_command, "run.mcap -o report"),
+    "replay": (replay.replay_command, "run.mcap --rate 2 --start 5"),
+    "rerun": (rerun.rerun_command, "run.mcap --replace s --set control.Kd=5 -o kd5.mcap"),
+}
+_LOG = {
+    "info": (log.log_info_command, "run.mcap"),
+    "check": (log.log_check_command, "run.mcap"),
+    "recover": (log.log_recover_command, "run.mcap.active"),
+    "export": (log.log_export_command, "run.mcap --to parquet"),
+    "view": (log.log_view_command, "run.mcap"),
+}
+_STUDIES = {
+    "test": (test.test_command, "jitter --seeds 1..20 --junit out.xml"),
+    "sweep": (
+        sweep.sweep_command,
+        "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
+        "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
+        "runs/sweep-p_d_margin-001 --cell 17",
+    ),
+    "linear": (linear.linear_command, "p_d_margin --set control.d=0.9 --over control.d=0.1:3"),
+}
+_SCENARIO = {
+    "list": (scenario.scenario_list_command, ""),
+    "show": (scenario.scenario_show_command, "paper --set control.Kd=5"),
+    "check": (scenario.scenario_check_command, "mine.toml"),
+    "new": (scenario.scenario_new_command, "mine.toml"),
+}
+_SET = {
+    "link": (set_command.set_link_command, "'m1->s' --delay 350ms --loss 5%"),
+    "dominance": (set_command.set_dominance_command, "s m1=0.9 m2=0.1"),
+}
+_CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
+_CHANGES.callback()(set_command.set_command)
+app.add_typer(_group(_SINGLE))
+app.add_typer(
+    _group(_LOG, "log ", no_args_is_help=True, help="Inspects, checks, recovers, exports or shows a log."),
+    name="log",
+)
+app.add_typer(_group(_STUDIES))
+app.add_typer(
+    _group(_SCENARIO, "scenario ", no_args_is_help=True, help="The shipped scenarios and your own."),
+    name="scenario",
+)
+app.add_typer(_CHANGES, name="set")
 
 
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
-    try:
-        _run()
-    finally:
-        gc.freeze()  # at exit, Python need not traverse every record
-
-
-def _run() -> None:
     try:
         app()
     except TrilatError as error:
@@ -111,3 +152,5 @@ def _run() -> None:
     except OSError as error:  # a full disk, a folder that vanished
         print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror}")
         sys.exit(1)
+    finally:
+        gc.freeze()  # at exit, Python need not traverse every record

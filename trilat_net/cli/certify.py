@@ -5,15 +5,13 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from ..reporting.terminal_output import open_with_progress, out, print_json, print_table
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import JsonOption, LogsArgument
+from . import options
 
 if TYPE_CHECKING:
     from ..analysis.certificate.stability_certificate import Certificate
 
-
-app = typer.Typer()
 
 _HOLDS = {True: "holds", False: "fails", None: "not told"}
 _MARKS = {
@@ -24,8 +22,7 @@ _MARKS = {
 }
 
 
-@app.command("certify", epilog="Example: trilat certify run.mcap")
-def certify_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+def certify_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Judges the stability of a run: V and its energy balance, the theorem's premises, growth.
 
     Nothing is executed; docs/certificate.md defines every word and every key of the JSON.
@@ -37,9 +34,9 @@ def certify_command(files: LogsArgument, as_json: JsonOption = False) -> None:
     from ..analysis.certificate.stability_certificate import certificate_to_json
     from ..analysis.certificate.stability_certificate import certify as certified
 
-    found = certified(open_with_progress(*files))
+    found = certified(terminal.open_with_progress(*files))
     if as_json:
-        print_json(certificate_to_json(found))
+        terminal.print_json(certificate_to_json(found))
     else:
         _show(found)
     if not found.passed:
@@ -51,12 +48,12 @@ def _show(found: "Certificate") -> None:
     from ..reporting.certificate_text import describe_certificate, list_energies
 
     for line in describe_certificate(found):
-        out.print(f"{_MARKS[line.mark]} {escape(line.text)}", soft_wrap=True)
+        terminal.out.print(f"{_MARKS[line.mark]} {escape(line.text)}", soft_wrap=True)
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in found.premises]
-    out.print()
-    print_table(TextTable(("premise", "", "found"), rows), {"holds": "green", "fails": "yellow"})
+    terminal.out.print()
+    terminal.print_table(TextTable(("premise", "", "found"), rows), {"holds": "green", "fails": "yellow"})
     if found.balance is None:
         return
     energies = [(name, f"{amount:.4g}") for name, amount in list_energies(found.balance)]
-    out.print()
-    print_table(TextTable(("energy", "J"), energies, align="lr"))
+    terminal.out.print()
+    terminal.print_table(TextTable(("energy", "J"), energies, align="lr"))

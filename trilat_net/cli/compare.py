@@ -4,6 +4,7 @@ Invariant: numbers are printed and nothing is ranked.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,18 +13,9 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import (
-    open_with_progress,
-    out,
-    print_json,
-    print_paths,
-    print_table,
-    print_text,
-    progress_bar,
-    sanitize,
-)
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import DurationOption, ForceOption, JobsOption, JsonOption, OnOption, SetOption, list_overrides
+from . import options
 
 if TYPE_CHECKING:
     from ..analysis.metrics.log_metrics import MetricComparison
@@ -34,7 +26,7 @@ if TYPE_CHECKING:
 _MOST_REASONS = 6
 
 
-def print_log_comparison(
+def _print_comparison(
     logs: Sequence["Log"],
     different: Sequence["ScenarioDifference"],
     found: "MetricComparison",
@@ -43,19 +35,20 @@ def print_log_comparison(
     """Prints the differences of the experiments, the quantities of the logs, and remarks per log."""
     names = {log.scenario.name for log in logs}
     if len(names) > 1:
-        print_text(f"logs of different scenarios: {', '.join(sorted(names))}")
+        terminal.print_text(f"logs of different scenarios: {', '.join(sorted(names))}")
     if different:
-        out.print()
+        terminal.out.print()
         rows = [(str(one), *one.values) for one in different]
-        print_table(TextTable(("differs", *found.columns), rows))
+        terminal.print_table(TextTable(("differs", *found.columns), rows))
     else:
-        out.print("one and the same experiment")
-    out.print()
-    print_table(_tabulate_quantities(found))
-    out.print()
+        terminal.out.print("one and the same experiment")
+    terminal.out.print()
+    terminal.print_table(_tabulate_quantities(found))
+    terminal.out.print()
     for name, lines in remarks.items():
         for line in lines:
-            out.print(f"[bold]note[/bold] {escape(sanitize(f'{name}: {line}'))}", soft_wrap=True)
+            text = escape(terminal.sanitize(f"{name}: {line}"))
+            terminal.out.print(f"[bold]note[/bold] {text}", soft_wrap=True)
     _print_reasons(found)
 
 
@@ -79,9 +72,9 @@ def _print_reasons(found: "MetricComparison") -> None:
         if entry.value is None and entry.applies
     ]
     for line in reasons[:_MOST_REASONS]:
-        print_text(line)
+        terminal.print_text(line)
     if len(reasons) > _MOST_REASONS:
-        out.print(f"and {len(reasons) - _MOST_REASONS} more, which --json names")
+        terminal.out.print(f"and {len(reasons) - _MOST_REASONS} more, which --json names")
 
 
 _MAX_FRONT_ROWS = 8
@@ -89,13 +82,7 @@ _MAX_FRONT_ROWS = 8
 
 
 def _run_tuning(
-    asked: "TuningPlan",
-    folder: Path | None,
-    jobs: int | None,
-    *,
-    on: str | None,
-    force: bool,
-    as_json: bool,
+    asked: "TuningPlan", folder: Path | None, jobs: int | None, on: str | None, *, force: bool, as_json: bool
 ) -> None:
     """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
     from ..files import make_results_folder
@@ -106,14 +93,14 @@ def _run_tuning(
     chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
     if not as_json:
         _print_procedure(asked, workers)
-    with progress_bar("searching") as progress:
+    with terminal.progress_bar("searching") as progress:
         found = asked.run(jobs, progress, on)
     paths = write_tuning(found, chosen)
     if as_json:
-        print_json(tuning_to_json(found))
+        terminal.print_json(tuning_to_json(found))
     else:
         _print_tuned(found)
-        print_paths(paths)
+        terminal.print_paths(paths)
 
 
 def _print_procedure(asked: "TuningPlan", workers: int) -> None:
@@ -121,12 +108,14 @@ def _print_procedure(asked: "TuningPlan", workers: int) -> None:
     from ..studies.tuning.tuning_report import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
-    print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
+    terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
     for line in describe_procedure(asked):
-        print_text(f"  {line}")
+        terminal.print_text(f"  {line}")
     cores = "1 core" if workers == 1 else f"{workers} cores"
     duration = _format_duration(asked.estimate_s(workers))
-    print_text(f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine")
+    terminal.print_text(
+        f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
+    )
 
 
 def _format_duration(seconds: float) -> str:
@@ -144,144 +133,99 @@ def _print_tuned(found: "TuningResult") -> None:
         tabulate_paper_gains,
     )
 
-    out.print()
-    print_table(tabulate_laws(found))
+    terminal.out.print()
+    terminal.print_table(tabulate_laws(found))
     for line in list_class_meanings():
-        print_text(f"  {line}")
+        terminal.print_text(f"  {line}")
     for law in found.found:
         if law.front:
-            out.print()
-            print_table(tabulate_front(found, law, _MAX_FRONT_ROWS))
-    out.print(
+            terminal.out.print()
+            terminal.print_table(tabulate_front(found, law, _MAX_FRONT_ROWS))
+    terminal.out.print(
         f"  * no candidate of any law is better in both; of long fronts {_MAX_FRONT_ROWS} points are shown"
     )
-    out.print()
-    print_table(tabulate_paper_gains(found))
+    terminal.out.print()
+    terminal.print_table(tabulate_paper_gains(found))
     for law in found.found:
         for gain in found.at_edge(law):
-            print_text(f"note: {law.space.law} is best at the edge of the range of {gain}; widen the search")
+            terminal.print_text(
+                f"note: {law.space.law} is best at the edge of the range of {gain}; widen the search"
+            )
     if not any(law.front for law in found.found):
-        out.print("\nno candidate of any law settled: a longer --duration or a larger --budget may show more")
+        terminal.out.print(
+            "\nno candidate of any law settled: a longer --duration or a larger --budget may show more"
+        )
         return
-    out.print("\nthe last of each front, to run; front.md has the others:")
+    terminal.out.print("\nthe last of each front, to run; front.md has the others:")
     for law in found.found:
         for place in law.front[-1:]:
-            print_text(f"  {found.candidate(law, place).command}")
+            terminal.print_text(f"  {found.candidate(law, place).command}")
 
 
-app = typer.Typer()
-
-_TUNING = "Tune laws"
+_option = partial(typer.Option, rich_help_panel="Tune laws")
 
 
-@app.command(
-    "compare",
-    epilog="Example: trilat compare a.mcap b.mcap\n\nExample: trilat compare --tune free --law adaptive,p_d",
-)
 def compare_command(
+    context: typer.Context,
     files: Annotated[
         list[Path] | None, typer.Argument(help="Two or more MCAP logs.", metavar="FILE FILE...")
     ] = None,
     tune: Annotated[
         str | None,
-        typer.Option(
-            "--tune",
-            metavar="SCENARIO",
-            help="Compare laws instead, each tuned alike in this scenario.",
-            rich_help_panel=_TUNING,
-        ),
+        _option("--tune", metavar="SCENARIO", help="Compare laws instead, tuned alike in this scenario."),
     ] = None,
     law: Annotated[
         str | None,
-        typer.Option(
+        _option(
             "--law",
             metavar="LAW,LAW...",
             help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: p_f, known.",
-            rich_help_panel=_TUNING,
         ),
     ] = None,
-    budget: Annotated[
-        int | None,
-        typer.Option(
-            "--budget", metavar="N", help="Candidates per law; default: 64.", rich_help_panel=_TUNING
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", metavar="S", help="Seed of the search; default: 1.", rich_help_panel=_TUNING),
-    ] = None,
+    budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,
+    seed: Annotated[int, _option("--seed", metavar="S", help="Seed of the search.")] = 1,
     objective: Annotated[
-        str | None,
-        typer.Option(
-            "--objective",
-            metavar="error|settling",
-            help="The objective besides effort; default: error.",
-            rich_help_panel=_TUNING,
-        ),
-    ] = None,
+        str, _option("--objective", metavar="error|settling", help="The objective besides effort.")
+    ] = "error",
     gravity: Annotated[
-        float | None,
-        typer.Option(
-            "--gravity",
-            metavar="PERCENT",
-            help="Gravity that all laws assume, in % of the truth; default: 100.",
-            rich_help_panel=_TUNING,
-        ),
-    ] = None,
-    duration: DurationOption = None,
-    overrides: SetOption = None,
-    jobs: JobsOption = None,
-    on: OnOption = None,
+        float,
+        _option("--gravity", metavar="PERCENT", help="Gravity that all laws assume, in % of the truth."),
+    ] = 100.0,
+    duration: options.DurationOption = None,
+    overrides: options.SetOption = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Folder of the results; default: the next free runs/tune-...",
-            rich_help_panel=_TUNING,
-        ),
+        _option("--out", metavar="DIR", help="Folder of the results; default: the next free runs/tune-..."),
     ] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compares logs side by side, with the differences of their experiments; or laws, each tuned alike.
 
     Nothing is ranked: arms that hang, or that nobody pushed, have small errors too.
     """
     if tune is None:
-        of_tuning = {
-            "--law": law,
-            "--budget": budget,
-            "--seed": seed,
-            "--objective": objective,
-            "--gravity": gravity,
-            "--duration": duration,
-            "--set": overrides,
-            "--jobs": jobs,
-            "--on": on,
-            "--out": output,
-            "--force": force or None,
-        }
-        for name, value in of_tuning.items():
-            if value is not None:
+        for name in options.given_options(context):
+            if name not in ("files", "--json"):
                 raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
         _compare_logs(files or [], as_json=as_json)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave the logs out, or --tune")
     from ..studies.tuning import plan_tuning
-    from ..studies.tuning.tuning_plan import DEFAULT_BUDGET
 
     asked = plan_tuning(
         tune,
-        list_overrides(overrides, duration),
-        laws=[name.strip() for name in law.split(",")] if law is not None else (),
-        budget=DEFAULT_BUDGET if budget is None else budget,
-        seed=1 if seed is None else seed,
-        objective="error" if objective is None else objective,
-        gravity_percent=100.0 if gravity is None else gravity,
+        options.list_overrides(overrides, duration),
+        laws=options.split_names(law),
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity,
     )
-    _run_tuning(asked, output, jobs, on=on, force=force, as_json=as_json)
+    _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
 
 
 def _compare_logs(files: list[Path], *, as_json: bool) -> None:
@@ -292,25 +236,21 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     from ..scenario.describe import compare_scenarios
     from ..studies.tuning.final_posture import check_final_posture
 
-    logs = [open_with_progress(file) for file in files]
+    logs = [terminal.open_with_progress(file) for file in files]
     names = name_columns(files)
     different = compare_scenarios([log.scenario for log in logs])
     remarks = {name: check_final_posture(log) for name, log in zip(names, logs, strict=True)}
     found = compare_metrics(logs, names)
     if not as_json:
-        print_log_comparison(logs, different, found, remarks)
+        _print_comparison(logs, different, found, remarks)
         return
     entries = [
         {"name": name, "file": str(file), "scenario": log.scenario.name, "sha256": log.scenario.sha256}
         for name, file, log in zip(names, files, logs, strict=True)
     ]
-    facts = {
-        "logs": entries,
-        "differences": [one._asdict() for one in different],
-        "remarks": remarks,
-        **comparison_to_json(found),
-    }
-    print_json(facts)
+    differences = [one._asdict() for one in different]
+    facts = {"logs": entries, "differences": differences, "remarks": remarks, **comparison_to_json(found)}
+    terminal.print_json(facts)
 
 
 def name_columns(files: list[Path]) -> list[str]:

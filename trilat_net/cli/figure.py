@@ -7,29 +7,16 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import (
-    open_with_progress,
-    out,
-    print_json,
-    print_paths,
-    print_table,
-    progress_bar,
-)
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import ForceOption, LogArgument
+from . import options
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
 
 
-app = typer.Typer()
-
-
-@app.command(
-    "figure", epilog="Example: trilat figure run.mcap positions settling --width 3.5 --format pdf --out paper"
-)
 def figure_command(
-    file: LogArgument,
+    file: options.LogArgument,
     names: Annotated[
         list[str] | None,
         typer.Argument(help="Names of figures, see --list; default: all that FILE has.", metavar="NAME"),
@@ -45,10 +32,10 @@ def figure_command(
     ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only list the figures.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
-    force: ForceOption = False,
+    force: options.ForceOption = False,
 ) -> None:
     """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
-    log = open_with_progress(file)
+    log = terminal.open_with_progress(file)
     if listed:
         _list_figures(log, as_json=as_json)
         return
@@ -56,14 +43,14 @@ def figure_command(
 
     place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
     kinds = _formats(formats)
-    with progress_bar("drawing") as progress:
+    with terminal.progress_bar("drawing") as progress:
         paths = write_figures(
             log, place, names or (), width_in=width_in, formats=kinds, force=force, progress=progress
         )
     if as_json:
-        print_json([str(path) for path in paths])
+        terminal.print_json([str(path) for path in paths])
         return
-    print_paths(paths)
+    terminal.print_paths(paths)
 
 
 def _formats(text: str) -> list[str]:
@@ -80,10 +67,10 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
     absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
     if as_json:
         rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
-        print_json(rows)
+        terminal.print_json(rows)
         return
     drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
-    print_table(TextTable(("figure", "shows"), drawable))
+    terminal.print_table(TextTable(("figure", "shows"), drawable))
     for name, why in absent.items():
         if why:
-            out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)
+            terminal.out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)

@@ -8,16 +8,13 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out, print_json, print_paths, print_table, print_text
-from .options import ForceOption, JsonOption, ScenarioArgument, SetOption
+from ..reporting import terminal_output as terminal
+from . import options
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
     from ..theory import LinearAnalysis, LinearEdge
     from ..theory.port_analysis import PortAnalysis
-
-
-app = typer.Typer()
 
 
 class LinearFigure(StrEnum):
@@ -31,10 +28,9 @@ class LinearFigure(StrEnum):
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
-@app.command("linear", epilog="Example: trilat linear p_d_margin --set control.d=0.9 --over control.d=0.1:3")
 def linear_command(
-    scenario: ScenarioArgument,
-    overrides: SetOption = None,
+    scenario: options.ScenarioArgument,
+    overrides: options.SetOption = None,
     pose: Annotated[
         str | None,
         typer.Option(
@@ -55,8 +51,8 @@ def linear_command(
     what: Annotated[
         LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
     ] = LinearFigure.ROOTS,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Linearises the loop about its equilibrium: stability of small motions, and the operators' impedances.
 
@@ -87,11 +83,11 @@ def linear_command(
         from ..reporting.port_text import describe_ports
 
         for text in describe_ports(section):
-            print_text(text)
+            terminal.print_text(text)
     for (key, low, high), line in zip(spans, lines.values(), strict=True):
-        print_text(_edge_words(key, low, high, line, found.scenario))
+        terminal.print_text(_edge_words(key, low, high, line, found.scenario))
     if picture is not None:
-        print_paths([picture])
+        terminal.print_paths([picture])
 
 
 def _pose(text: str | None) -> tuple[float, float] | None:
@@ -150,7 +146,7 @@ def _print_json(
 
     ports = None if section is None else ports_to_json(section)
     edges = {key: [one._asdict() for one in line] for key, line in lines.items()}
-    print_json({**linear_to_json(found), "ports": ports, "edges": edges})
+    terminal.print_json({**linear_to_json(found), "ports": ports, "edges": edges})
 
 
 def _show(found: "LinearAnalysis") -> None:
@@ -158,15 +154,15 @@ def _show(found: "LinearAnalysis") -> None:
     from ..reporting import linear_text
 
     for line in (*linear_text.describe_equilibrium(found), *linear_text.describe_effective_delays(found)):
-        print_text(line)
-    out.print()
-    print_table(linear_text.tabulate_roots(found))
-    print_text(linear_text.describe_zero_roots(found))
+        terminal.print_text(line)
+    terminal.out.print()
+    terminal.print_table(linear_text.tabulate_roots(found))
+    terminal.print_text(linear_text.describe_zero_roots(found))
     verdict, _, rest = linear_text.describe_linear_verdict(found).partition(":")
-    out.print(f"[{_COLOURS[verdict]}]{verdict}[/]:{escape(rest)}", soft_wrap=True)
-    print_text(linear_text.describe_delay_margin(found))
+    terminal.out.print(f"[{_COLOURS[verdict]}]{verdict}[/]:{escape(rest)}", soft_wrap=True)
+    terminal.print_text(linear_text.describe_delay_margin(found))
     for note in found.notes:
-        print_text(f"note: {note}")
+        terminal.print_text(f"note: {note}")
 
 
 def _edge_words(key: str, low: float, high: float, line: "list[LinearEdge]", scenario: "Scenario") -> str:

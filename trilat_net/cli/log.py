@@ -1,113 +1,89 @@
 """`trilat log`: info, check, recover, export, view. None of them executes the log."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..reporting import terminal_output as terminal
 from ..reporting.overview_tables import print_overview
-from ..reporting.terminal_output import (
-    open_with_progress,
-    out,
-    print_check,
-    print_json,
-    print_note,
-    print_table,
-    print_text,
-    progress_bar,
-    warn_if_unfinished,
-)
 from ..reporting.text_table import TextTable
-from .options import ForceOption, JsonOption, LogArgument, LogsArgument
+from . import options
 
 if TYPE_CHECKING:
     from ..log.recover import Recovery
     from ..log.session_check import LogCheckResult
 
 
-app = typer.Typer(no_args_is_help=True, help="Inspects, checks, recovers, exports or shows a log.")
-
 _MAX_PLACES = 10
 """Places of a failed check that are printed; the JSON has all."""
+_MAX_LOSSES = 10
+"""Losses that are printed."""
+_LOSSY_EXIT_CODE = 3
 
 
-@app.command("info", epilog="Example: trilat log info run.mcap")
-def log_info_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
     from ..analysis.file_overview import describe_files
 
-    with progress_bar(f"reading {files[0]}") as progress:
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts = describe_files(files, progress)
     if as_json:
-        print_json(facts)
+        terminal.print_json(facts)
         return
     print_overview(facts)
     for path in files:
-        warn_if_unfinished(path)
+        terminal.warn_if_unfinished(path)
 
 
-@app.command("check", epilog="Example: trilat log check run.mcap")
-def log_check_command(files: LogsArgument, as_json: JsonOption = False) -> None:
+def log_check_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Checks that a log is well-formed, complete and consistent; executes nothing.
 
     Exit code 0: sound; 1: not; 2: no such file. Files of other programs: structure only.
     """
     from ..log.session_check import check_log
 
-    with progress_bar(f"checking {files[0]}") as progress:
+    with terminal.progress_bar(f"checking {files[0]}") as progress:
         found = check_log(files, progress)
     if as_json:
-        print_json(_check_json(files, found))
+        checks = [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in found.findings]
+        facts = {"files": [str(path) for path in files], "kind": "trilat" if found.ours else "mcap"}
+        terminal.print_json({**facts, "sound": found.passed, "checks": checks})
     else:
         _print_check(files, found)
     if not found.passed:
         raise typer.Exit(1)
 
 
-def _check_json(files: list[Path], found: "LogCheckResult") -> dict[str, Any]:
-    return {
-        "files": [str(path) for path in files],
-        "kind": "trilat" if found.ours else "mcap",
-        "sound": found.passed,
-        "checks": [
-            {**finding._asdict(), "places": [place._asdict() for place in finding.places]}
-            for finding in found.findings
-        ],
-    }
-
-
 def _print_check(files: list[Path], found: "LogCheckResult") -> None:
     """Prints a line per check, and the places where it failed."""
     for finding in found.findings:
-        print_check(finding.passed, f"{finding.check:<9}  {finding.text}")
+        terminal.print_check(finding.passed, f"{finding.check:<9}  {finding.text}")
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
         for place in finding.places[:_MAX_PLACES]:
             where = f"{place.file}: " if len(files) > 1 and place.file else ""
-            print_text(f"       {where}{place}")
+            terminal.print_text(f"       {where}{place}")
         if finding.wrong > _MAX_PLACES:
-            out.print(f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}")
+            terminal.out.print(
+                f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}"
+            )
     if not found.ours:
-        print_note("this is no log of trilat-net: only its structure was checked")
+        terminal.print_note("this is no log of trilat-net: only its structure was checked")
     for path in files:
-        warn_if_unfinished(path)
+        terminal.warn_if_unfinished(path)
 
 
-LOSSY_EXIT_CODE = 3
-"""Exit code after a loss."""
-
-
-@app.command("recover", epilog="Example: trilat log recover run.mcap.active")
 def log_recover_command(
-    file: LogArgument,
+    file: options.LogArgument,
     output: Annotated[
         Path | None,
         typer.Option(
             "-o", "--output", metavar="OUT", help="Default: FILE without .active, or FILE.recovered.mcap."
         ),
     ] = None,
-    force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Makes a whole file of a torn or damaged one, which stays as it is.
 
@@ -116,14 +92,14 @@ def log_recover_command(
     """
     from ..log.recover import recover_log
 
-    with progress_bar(f"reading {file}") as progress:
+    with terminal.progress_bar(f"reading {file}") as progress:
         result = recover_log(file, output, force=force, progress=progress)
     if as_json:
-        print_json(_recovery_json(result))
+        terminal.print_json(_recovery_json(result))
     else:
         _print_recovery(result)
     if not result.lossless:
-        raise typer.Exit(LOSSY_EXIT_CODE)
+        raise typer.Exit(_LOSSY_EXIT_CODE)
 
 
 def _recovery_json(result: "Recovery") -> dict[str, object]:
@@ -144,26 +120,23 @@ def _recovery_json(result: "Recovery") -> dict[str, object]:
 
 def _print_recovery(result: "Recovery") -> None:
     how = "was finished" if result.finished else "was not finished"
-    print_text(f"{result.output}: made of {result.path}, which {how}")
+    terminal.print_text(f"{result.output}: made of {result.path}, which {how}")
     rows = []
     if result.sites:
         rows.append(("records", ", ".join(f"{site} {count}" for site, count in result.sites.items())))
     rows.append(("messages", f"{result.messages} in {result.duration_s:.3f} s"))
     for name, lines in (("lost", result.lost), ("missing", result.missing)):
-        rows += [("" if n else name, text) for n, text in enumerate(lines[:MAX_LOSSES] or ["nothing"])]
-        if len(lines) > MAX_LOSSES:
-            rows.append(("", f"and {len(lines) - MAX_LOSSES} more; --json lists all"))
-    print_table(TextTable(("", ""), [(f"  {name}", text) for name, text in rows]))
+        rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]
+        if len(lines) > _MAX_LOSSES:
+            rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
+    terminal.print_table(TextTable(("", ""), [(f"  {name}", text) for name, text in rows]))
 
 
-MAX_LOSSES = 10
-"""Losses that are printed."""
 _FORMATS = ("ros2", "parquet", "csv", "npz", "mat")
 
 
-@app.command("export", epilog="Example: trilat log export run.mcap --to parquet")
 def log_export_command(
-    files: LogsArgument,
+    files: options.LogsArgument,
     form: Annotated[
         str,
         typer.Option(
@@ -179,7 +152,7 @@ def log_export_command(
             "-o", "--out", metavar="OUT", help="File or folder; default: next to FILE, named after it."
         ),
     ] = None,
-    force: ForceOption = False,
+    force: options.ForceOption = False,
 ) -> None:
     """Exports a log to files for other tools: names end in their units, numbers are exact."""
     from ..errors import UsageError
@@ -190,16 +163,15 @@ def log_export_command(
     chosen = ExportFormat(form)
     path = output if output is not None else default_export_path(chosen, files[0])
     exporter = Exporter(chosen, path, force=force)
-    log = open_with_progress(*files)
-    with progress_bar(f"writing {path}") as progress:
+    log = terminal.open_with_progress(*files)
+    with terminal.progress_bar(f"writing {path}") as progress:
         exporter.export(log, progress)
     records = sum(len(log[site]) for site in log.sites)
-    print_text(f"{path}: {records} records of {', '.join(log.sites)}")
+    terminal.print_text(f"{path}: {records} records of {', '.join(log.sites)}")
 
 
-@app.command("view", epilog="Example: trilat log view run.mcap")
 def log_view_command(
-    files: LogsArgument,
+    files: options.LogsArgument,
     full: Annotated[
         bool, typer.Option("--full", help="Show every record, not the decimated channels.")
     ] = False,
@@ -210,7 +182,7 @@ def log_view_command(
         Path | None,
         typer.Option("--save", metavar="OUT.rrd", help="Write a recording for Rerun instead of opening it."),
     ] = None,
-    force: ForceOption = False,
+    force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun: every curve with its name, a column per site.
 
@@ -224,9 +196,9 @@ def log_view_command(
         refuse_existing(save, force=force)
     open_rerun(
         files,
-        lambda: open_with_progress(*files),
+        lambda: terminal.open_with_progress(*files),
         ViewerOptions(full=full, web=web, save=save),
-        print_text,
+        terminal.print_text,
     )
     if save is not None:
-        print_text(f"{save}: open it with: rerun {save}")
+        terminal.print_text(f"{save}: open it with: rerun {save}")

@@ -4,25 +4,21 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-import typer
 from rich.markup import escape
 
-from ..reporting.terminal_output import open_with_progress, out, print_json, print_table, sanitize
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import JsonOption, LogArgument
+from . import options
 
 if TYPE_CHECKING:
     from ..analysis.metrics.log_metrics import LogMetrics
     from ..analysis.metrics.metric_catalogue import Metric, Quantity
 
 
-app = typer.Typer()
-
 _NO_NUMBER = "–"
 
 
-@app.command("metrics", epilog="Example: trilat metrics run.mcap")
-def metrics_command(file: LogArgument, as_json: JsonOption = False) -> None:
+def metrics_command(file: options.LogArgument, as_json: options.JsonOption = False) -> None:
     """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
 
     Sites, links and walls are columns. A dash stands for a missing number; if there could be one, the reason
@@ -30,10 +26,10 @@ def metrics_command(file: LogArgument, as_json: JsonOption = False) -> None:
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
 
-    log = open_with_progress(file)
+    log = terminal.open_with_progress(file)
     found = compute_log_metrics(log)
     if as_json:
-        print_json(metrics_to_json(log, found))
+        terminal.print_json(metrics_to_json(log, found))
     else:
         _show(found)
 
@@ -48,7 +44,12 @@ def _show(found: "LogMetrics") -> None:
     _print_statics(found)
     _print_impedance(found)
     for why, where in reasons.items():
-        out.print(f"[bold]{_NO_NUMBER}[/bold] {escape(sanitize(', '.join(where)))}: {escape(sanitize(why))}")
+        _explain(terminal.sanitize(", ".join(where)), why)
+
+
+def _explain(what: str, why: str) -> None:
+    text = escape(f"{what}: {terminal.sanitize(why)}")
+    terminal.out.print(f"[bold]{_NO_NUMBER}[/bold] {text}")
 
 
 def _print_group(
@@ -62,14 +63,8 @@ def _print_group(
     ]
     if not names:
         return
-    _print(
-        [group, "", *names],
-        (
-            [quantity.name, quantity.unit, *(_cell(places[name]) for name in names)]
-            for quantity, places in could.items()
-        ),
-        words=2,
-    )
+    cells = [[q.name, q.unit, *(_cell(places[name]) for name in names)] for q, places in could.items()]
+    _print([group, "", *names], cells, words=2)
     for quantity, places in could.items():
         for name in names:
             if places[name].value is None and places[name].applies:
@@ -80,42 +75,24 @@ def _print_group(
 def _print_statics(found: "LogMetrics") -> None:
     """Prints the reflected torques of the windows at rest, and the stiffness between them."""
     if found.sharing_ratios:
-        _print(
-            ["at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off"],
-            (
-                [
-                    f"{pair.from_s:.1f} - {pair.to_s:.1f} s",
-                    str(pair.joint),
-                    f"{pair.pushed}{' (wall)' if pair.by_wall else ''}",
-                    _number(pair.pushed_nm),
-                    pair.holds,
-                    _number(pair.felt_nm),
-                    _cell(pair.expected_nm),
-                    _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %",
-                ]
-                for pair in found.sharing_ratios
-            ),
-            words=1,
-        )
+        heads = ("at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off")
+        rows = []
+        for pair in found.sharing_ratios:
+            pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
+            off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %"
+            row = [f"{pair.from_s:.1f} - {pair.to_s:.1f} s", str(pair.joint), pushed, _number(pair.pushed_nm)]
+            rows.append([*row, pair.holds, _number(pair.felt_nm), _cell(pair.expected_nm), off])
+        _print(heads, rows, words=1)
         for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
             if why:
-                out.print(f"[bold]{_NO_NUMBER}[/bold] nothing is expected: {escape(sanitize(why))}")
+                _explain("nothing is expected", why)
     if found.stiffness:
-        _print(
-            ["stiffness felt", "joint", "by", "N m more", "rad further", "N m/rad"],
-            (
-                [
-                    f"{one.from_s:.1f} to {one.to_s:.1f} s",
-                    str(one.joint),
-                    one.site,
-                    _number(one.torque_nm),
-                    _number(one.angle_rad),
-                    _NO_NUMBER if one.stiffness_nm_rad is None else _number(one.stiffness_nm_rad),
-                ]
-                for one in found.stiffness
-            ),
-            words=1,
-        )
+        rows = []
+        for one in found.stiffness:
+            stiffness = _NO_NUMBER if one.stiffness_nm_rad is None else _number(one.stiffness_nm_rad)
+            row = [f"{one.from_s:.1f} to {one.to_s:.1f} s", str(one.joint), one.site]
+            rows.append([*row, _number(one.torque_nm), _number(one.angle_rad), stiffness])
+        _print(("stiffness felt", "joint", "by", "N m more", "rad further", "N m/rad"), rows, words=1)
 
 
 def _print_impedance(found: "LogMetrics") -> None:
@@ -130,14 +107,9 @@ def _print_impedance(found: "LogMetrics") -> None:
             rows.append([what, one.unit, "", "", "", "", ratio.why])
             continue
         numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
-        rows.append(
-            [what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {_percent(ratio.error)}"]
-        )
+        error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
+        rows.append([what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {error}"])
     _print(["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2)
-
-
-def _percent(share: float | None) -> str:
-    return _NO_NUMBER if share is None else f"{100.0 * share:.1g} %"
 
 
 def _cell(one: "Metric") -> str:
@@ -151,5 +123,5 @@ def _number(value: float) -> str:
 def _print(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> None:
     """Prints a table; its first columns hold words, the others numbers."""
     align = "l" * words + "r" * (len(heads) - words - 1) + ("r" if heads[-1] else "l")
-    print_table(TextTable(heads, list(rows), align))
-    out.print()
+    terminal.print_table(TextTable(heads, list(rows), align))
+    terminal.out.print()

@@ -129,6 +129,17 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
     return [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])]
 
 
+def split_names(text: str | None) -> list[str]:
+    """Returns the names of a text such as adaptive,p_d; none for None."""
+    return [] if text is None else [name.strip() for name in text.split(",")]
+
+
+def given_options(context: typer.Context) -> list[str]:
+    """Returns the options and arguments that were given, by the first name of each, as they are declared."""
+    sources = ((param, context.get_parameter_source(param.name or "")) for param in context.command.params)
+    return [param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"]
+
+
 def resolve_connection(
     listen: list[str] | None,
     connect: list[str] | None,

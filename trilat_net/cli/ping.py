@@ -5,24 +5,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
-from ..reporting.terminal_output import out, print_json, print_table, print_text
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import (
-    ClockDriftOption,
-    ClockOffsetOption,
-    ConnectOption,
-    RouterOption,
-    ZenohConfigOption,
-    check_seconds,
-    check_session_name,
-    resolve_connection,
-)
+from . import options
 
 if TYPE_CHECKING:
     from sites.session_ping import PingResult, SessionPing
-
-
-app = typer.Typer()
 
 
 def _check_count(value: int) -> int:
@@ -32,12 +20,11 @@ def _check_count(value: int) -> int:
     return value
 
 
-@app.command("ping", epilog="Example: trilat ping --session paper")
 def ping_command(
     session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to measure.")] = "paper",
-    connect: ConnectOption = None,
-    router: RouterOption = None,
-    zenoh_config: ZenohConfigOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
     count: Annotated[
         int, typer.Option("--count", metavar="N", help="Round trips to each member.", callback=_check_count)
     ] = 50,
@@ -47,12 +34,12 @@ def ping_command(
             "--timeout",
             metavar="S",
             help="Longest wait for the first answer, s.",
-            callback=check_seconds,
+            callback=options.check_seconds,
         ),
     ] = 3.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
-    clock_offset: ClockOffsetOption = 0.0,
-    clock_drift: ClockDriftOption = 0.0,
+    as_json: options.JsonOption = False,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
 ) -> None:
     """Shows round trip, clock offset and jitter between here and every member of a session.
 
@@ -64,17 +51,17 @@ def ping_command(
     from ..net.clock import make_system_clock
     from ..process import Interrupt
 
-    connection = resolve_connection(None, connect, router, zenoh_config, [], None)
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         probe = ping_session(
-            connection, clock, check_session_name(session), count, timeout, interrupt.requested
+            connection, clock, options.check_session_name(session), count, timeout, interrupt.requested
         )
         if probe is None:
             raise typer.Exit(interrupt.exit_code)
     members, links = [_member(reach) for reach in probe.reached()], _links(probe)
     if as_json:
-        print_json({"session": session, "members": members, "links": links})
+        terminal.print_json({"session": session, "members": members, "links": links})
     else:
         _show(session, members, links)
     if not any(member["answers"] for member in members):
@@ -126,7 +113,9 @@ def _links(probe: "SessionPing") -> list[dict[str, Any]]:
 
 def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any]]) -> None:
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
-    print_text(f"session {session} {state}; times in us; a clock is the one there minus the one here")
+    terminal.print_text(
+        f"session {session} {state}; times in us; a clock is the one there minus the one here"
+    )
     rows = []
     for member in members:
         rtt = member.get("rtt_us", {})
@@ -134,10 +123,10 @@ def _show(session: str, members: list[dict[str, Any]], links: list[dict[str, Any
         times = ("" if number is None else f"{number:.0f}" for number in numbers)
         rows.append([member["member"], member["host"], str(member["answers"]), *times, _clock(member)])
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
-    print_table(TextTable(headers, rows, align="llrrrrrl"))
+    terminal.print_table(TextTable(headers, rows, align="llrrrrrl"))
     if links:
-        out.print("between the sites, in the last tenth of a second of each:")
-        print_table(_tabulate_links(links))
+        terminal.out.print("between the sites, in the last tenth of a second of each:")
+        terminal.print_table(_tabulate_links(links))
 
 
 def _tabulate_links(links: list[dict[str, Any]]) -> TextTable:

@@ -7,31 +7,16 @@ from typing import Annotated
 import typer
 
 from ..errors import RunFailed, UsageError
-from ..reporting.terminal_output import conclude_files, print_line
-from .options import (
-    ClockDriftOption,
-    ClockOffsetOption,
-    ConnectOption,
-    ForceOption,
-    ListenOption,
-    RouterOption,
-    ViewsOption,
-    ZenohConfigOption,
-    check_seconds,
-    check_session_name,
-    resolve_connection,
-)
-
-app = typer.Typer()
+from ..reporting import terminal_output as terminal
+from . import options
 
 
-@app.command("record", epilog="Example: trilat record --session paper -o run.mcap --split-duration 600")
 def record_command(
     session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to record.")],
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    router: RouterOption = None,
-    zenoh_config: ZenohConfigOption = None,
+    listen: options.ListenOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
     ] = None,
@@ -41,11 +26,11 @@ def record_command(
             "--join-timeout",
             metavar="S",
             help="Longest wait for its start, s; default: no limit.",
-            callback=check_seconds,
+            callback=options.check_seconds,
         ),
     ] = None,
-    clock_offset: ClockOffsetOption = 0.0,
-    clock_drift: ClockDriftOption = 0.0,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
     concluded: Annotated[
         bool,
         typer.Option("--conclude", help="Verify the log afterwards and write its report into its folder."),
@@ -72,8 +57,8 @@ def record_command(
     durable: Annotated[
         bool, typer.Option("--durable", help="Sync to the disk every 100 ms instead of every second.")
     ] = False,
-    views: ViewsOption = "100",
-    force: ForceOption = False,
+    views: options.ViewsOption = "100",
+    force: options.ForceOption = False,
 ) -> None:
     """Records one session, from its epoch to its end or to Ctrl-C.
 
@@ -88,8 +73,8 @@ def record_command(
     from ..log.ros2.viz_channels import parse_viz_rate
     from ..net.clock import make_system_clock
 
-    connection = resolve_connection(listen, connect, router, zenoh_config, [], None)
-    path = output if output is not None else Path(f"{check_session_name(session)}.mcap")
+    connection = options.resolve_connection(listen, connect, router, zenoh_config, [], None)
+    path = output if output is not None else Path(f"{options.check_session_name(session)}.mcap")
     place = LogStorage(
         path,
         force=force,
@@ -109,14 +94,14 @@ def record_command(
     clock = make_system_clock(clock_offset, clock_drift)
     then = (lambda: _conclude(list(find_parts(path).values()))) if concluded else lambda: None
     code = record_session(
-        check_session_name(session), place, connection, join_timeout, clock, print_line, then
+        options.check_session_name(session), place, connection, join_timeout, clock, terminal.print_line, then
     )
     raise typer.Exit(code)
 
 
 def _conclude(parts: list[Path]) -> None:
     """Verifies and reports a log, into its own folder."""
-    log, conclusion = conclude_files(parts, parts[0].parent)
+    log, conclusion = terminal.conclude_files(parts, parts[0].parent)
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
     if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):

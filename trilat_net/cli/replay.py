@@ -9,25 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ..errors import UsageError
-from ..reporting.terminal_output import (
-    err,
-    out,
-    print_error,
-    print_json,
-    print_note,
-    print_table,
-    print_text,
-    progress_bar,
-)
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import (
-    ConnectOption,
-    ListenOption,
-    RouterOption,
-    ZenohConfigOption,
-    check_session_name,
-    resolve_connection,
-)
+from . import options
 
 if TYPE_CHECKING:
     from recorder.play.play_process import PlaybackSummary
@@ -37,12 +21,9 @@ if TYPE_CHECKING:
     from ..net.clock import Clock
 
 
-app = typer.Typer()
-
 _MIB = 1 << 20
 
 
-@app.command("replay", epilog="Example: trilat replay run.mcap --rate 2 --start 5")
 def replay_command(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
@@ -101,11 +82,11 @@ def replay_command(
             help="Largest log held in memory; a process reads larger ones meanwhile.",
         ),
     ] = 256,
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    router: RouterOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    listen: options.ListenOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a session of its own.
 
@@ -125,12 +106,14 @@ def replay_command(
         raise UsageError(f"--preload is a number of MiB, not {preload}")
     selection = parse_selection(include or (), exclude or (), start, stop, duration, _time(time))
     speed = parse_rate(rate)
-    with progress_bar(f"reading {files[0]}") as progress:
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
-    name = check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    connection = resolve_connection(listen, connect, router, zenoh_config, [default_endpoint(name, 0)], [])
-    options = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
-    console = err if as_json else out
+    name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
+    connection = options.resolve_connection(
+        listen, connect, router, zenoh_config, [default_endpoint(name, 0)], []
+    )
+    play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
+    console = terminal.err if as_json else terminal.out
     tell = partial(console.print, markup=False, soft_wrap=True)
     for line in _opening_lines(facts, name, speed):
         tell(line)
@@ -140,13 +123,13 @@ def replay_command(
     show = _line(clock)
     with Interrupt() as interrupt:
         outcome = play_log(
-            (facts, block), files, selection, options, connection, clock, interrupt.requested, tell, show
+            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, show
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
     _report_playback(outcome, name, speed, reported, as_json=as_json)
     if interrupt.requested():
-        err.print("interrupted")
+        terminal.err.print("interrupted")
         raise typer.Exit(interrupt.exit_code)
     if outcome.cut or outcome.strays:
         raise typer.Exit(1)
@@ -157,7 +140,7 @@ def _report_playback(
 ) -> None:
     """Prints the summary of a playback, and warns of damage not `reported` before and of gaps."""
     if as_json:
-        print_json({"session": name, **_facts(outcome, speed)})
+        terminal.print_json({"session": name, **_facts(outcome, speed)})
     else:
         _show(outcome)
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
@@ -197,10 +180,10 @@ def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
             f"{progress.position_ns / 1e9:8.1f} s   x{rate:.2f}   {progress.published} messages   "
             f"latest {progress.late_max_us / 1e3:.2f} ms late"
         )
-        err.file.write(f"\r{text:<72}")
-        err.file.flush()
+        terminal.err.file.write(f"\r{text:<72}")
+        terminal.err.file.flush()
 
-    return show if err.is_interactive else lambda _: None
+    return show if terminal.err.is_interactive else lambda _: None
 
 
 def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
@@ -225,40 +208,42 @@ def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
 
 def _show(outcome: "PlaybackSummary") -> None:
     """Prints the summary."""
-    if err.is_interactive:
-        err.file.write("\r" + " " * 72 + "\r")
+    if terminal.err.is_interactive:
+        terminal.err.file.write("\r" + " " * 72 + "\r")
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
-    print_table(TextTable(("channel", "messages"), rows, align="lr"))
+    terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
     late = outcome.lateness
     total = f"{sum(outcome.counts.values())} messages in {outcome.took_s:.2f} s"
     rounds = f", {outcome.rounds} rounds" if outcome.rounds > 1 else ""
     how = f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us" if late else ""
     held = f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
     dropped = "" if outcome.cut else "; none dropped"
-    print_text(f"{total}{rounds}{how}{held}{dropped}")
+    terminal.print_text(f"{total}{rounds}{how}{held}{dropped}")
     if outcome.recorders:
         has = "has everything" if outcome.stored else "has not confirmed that it has everything"
         given = (
             f"; {outcome.refilled} messages that it had missed were sent again" if outcome.refilled else ""
         )
-        print_text(f"the recorder {has}{given}")
+        terminal.print_text(f"the recorder {has}{given}")
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
     """Warns of torn files, with the command that mends them."""
     for path, text in torn.items():
-        print_note(f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}")
+        terminal.print_note(
+            f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}"
+        )
 
 
 def _warn_undelivered(outcome: "PlaybackSummary") -> None:
     """Reports messages that did not arrive, or arrived late."""
     if outcome.cut:
-        print_error(
+        terminal.print_error(
             f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "
             "that were played then"
         )
     if outcome.strays:
-        print_error(
+        terminal.print_error(
             f"{outcome.strays} messages lie more than a minute from their place in the file, and were "
             "played late; with a larger --preload they are played in order"
         )

@@ -6,28 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import UsageError
-from ..reporting.terminal_output import (
-    open_with_progress,
-    print_json,
-    print_paths,
-    print_table,
-    print_text,
-    progress_bar,
-    warn_user_laws,
-)
+from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
-from .options import ForceOption, JsonOption, LogsArgument, SetOption
+from . import options
 
 if TYPE_CHECKING:
     from ..execution.rerun import LinkEffect, LogAndRerun, Rerun
 
 
-app = typer.Typer()
-
-
-@app.command("rerun", epilog="Example: trilat rerun run.mcap --replace s --set control.Kd=5 -o kd5.mcap")
 def rerun_command(
-    files: LogsArgument,
+    files: options.LogsArgument,
     replace: Annotated[
         list[str] | None,
         typer.Option("--replace", metavar="SITE", help="Execute this site again; repeatable."),
@@ -35,12 +23,12 @@ def rerun_command(
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Execute all sites, over the network of the log.")
     ] = False,
-    overrides: SetOption = None,
+    overrides: options.SetOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result as a log.")
     ] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Executes sites of a log again with changed settings, and compares the result with the log.
 
@@ -50,14 +38,14 @@ def rerun_command(
 
     if output is not None:
         _check_output(output, files, force=force)
-    log = open_with_progress(*files)
-    warn_user_laws(log, needed=False)  # another law may take its place
-    with progress_bar("executing") as progress:
+    log = terminal.open_with_progress(*files)
+    terminal.warn_user_laws(log, needed=False)  # another law may take its place
+    with terminal.progress_bar("executing") as progress:
         again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
     if output is not None:
         again.save(output, force=force)
     if as_json:
-        print_json({**again.to_json(), "file": str(output) if output else None})
+        terminal.print_json({**again.to_json(), "file": str(output) if output else None})
     else:
         _show(again, output)
     if again.diverged or again.broken:
@@ -80,16 +68,16 @@ def _show(again: "Rerun", output: Path | None) -> None:
 
     asked = again.request
     others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
-    print_text(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}")
+    terminal.print_text(f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}")
     for line in describe_rerun_changes(asked) or ["nothing is changed: this is the experiment of the log"]:
-        print_text(f"  {line}")
-    print_table(_tabulate_sites(again))
+        terminal.print_text(f"  {line}")
+    terminal.print_table(_tabulate_sites(again))
     for line in _lines(again):
-        print_text(line)
+        terminal.print_text(line)
     for note in again.notes:
-        print_text(f"note: {note}")
+        terminal.print_text(f"note: {note}")
     if output is not None:
-        print_paths([output])
+        terminal.print_paths([output])
 
 
 def _tabulate_sites(again: "Rerun") -> TextTable:

@@ -4,15 +4,12 @@ from typing import Annotated
 
 import typer
 
-from ..reporting.terminal_output import print_line
-from .options import ConnectOption, ZenohConfigOption, check_seconds
-
-app = typer.Typer()
+from ..reporting import terminal_output as terminal
+from . import options
 
 ANY_ADDRESS = "tcp/0.0.0.0:7447"
 
 
-@app.command("router", epilog=f"Example: trilat router --listen {ANY_ADDRESS}")
 def router_command(
     listen: Annotated[
         list[str] | None,
@@ -20,15 +17,15 @@ def router_command(
             "--listen", metavar="EP", help=f"Endpoint to listen at; repeatable; default: {ANY_ADDRESS}."
         ),
     ] = None,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
+    connect: options.ConnectOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
     until_idle: Annotated[
         float | None,
         typer.Option(
             "--until-idle",
             metavar="S",
             help="End once all members have been gone for this long, s; default: never.",
-            callback=check_seconds,
+            callback=options.check_seconds,
         ),
     ] = None,
 ) -> None:
@@ -46,13 +43,19 @@ def router_command(
     connection = resolve_router_connection(listen, connect, file, [ANY_ADDRESS])
     clock = SystemClock()
     with Interrupt() as interrupt:
-        bus = open_bus(connection, clock, interrupt.requested, None, print_line)
+        bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
         try:
-            print_line(f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            terminal.print_line(
+                f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it"
+            )
             run_router(
-                bus, clock, interrupt.requested, lambda text: print_line(f"router: {text}"), until_idle
+                bus,
+                clock,
+                interrupt.requested,
+                lambda text: terminal.print_line(f"router: {text}"),
+                until_idle,
             )
         finally:
             bus.close()

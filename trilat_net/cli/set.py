@@ -7,10 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import UsageError
-from ..reporting.terminal_output import print_text
-from .options import ConnectOption, RouterOption, ZenohConfigOption, resolve_connection
-
-app = typer.Typer(no_args_is_help=True)
+from ..reporting import terminal_output as terminal
+from . import options
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 
@@ -49,24 +47,22 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
     return table
 
 
-@app.callback()
 def set_command(
     context: typer.Context,
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Session to change; required.")
     ] = None,
-    connect: ConnectOption = None,
-    router: RouterOption = None,
-    zenoh_config: ZenohConfigOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
 ) -> None:
     """Changes a link, or a site's shares in its peers, while a session runs.
 
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
-    context.obj = session, resolve_connection(None, connect, router, zenoh_config, [], None)
+    context.obj = session, options.resolve_connection(None, connect, router, zenoh_config, [], None)
 
 
-@app.command("link", epilog="Example: trilat set --session paper link 'm1->s' --delay 350ms --loss 5%")
 def set_link_command(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
@@ -94,7 +90,6 @@ def set_link_command(
     _send_change(context, receiver, {"link": name, "to": table})
 
 
-@app.command("dominance", epilog="Example: trilat set --session paper dominance s m1=0.9 m2=0.1")
 def set_dominance_command(
     context: typer.Context,
     site: Annotated[str, typer.Argument(help="Site whose shares change.")],
@@ -126,4 +121,4 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     )
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
-    print_text(reply.text)
+    terminal.print_text(reply.text)

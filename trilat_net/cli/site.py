@@ -4,27 +4,10 @@ from typing import Annotated
 
 import typer
 
-from ..reporting.terminal_output import print_line
-from .options import (
-    ClockDriftOption,
-    ClockOffsetOption,
-    ConnectOption,
-    DurationOption,
-    ListenOption,
-    RouterOption,
-    SeedOption,
-    SetOption,
-    ZenohConfigOption,
-    check_seconds,
-    check_session_name,
-    load_chosen_scenario,
-    resolve_connection,
-)
-
-app = typer.Typer()
+from ..reporting import terminal_output as terminal
+from . import options
 
 
-@app.command("site", epilog="Example: trilat site m1 --scenario paper")
 def site_command(
     name: Annotated[str, typer.Argument(help="Name of the site in the scenario.")],
     scenario: Annotated[
@@ -33,14 +16,17 @@ def site_command(
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Default: the scenario's name.")
     ] = None,
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    router: RouterOption = None,
-    zenoh_config: ZenohConfigOption = None,
+    listen: options.ListenOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
     join_timeout: Annotated[
         float,
         typer.Option(
-            "--join-timeout", metavar="S", help="Longest wait for the others, s.", callback=check_seconds
+            "--join-timeout",
+            metavar="S",
+            help="Longest wait for the others, s.",
+            callback=options.check_seconds,
         ),
     ] = 60.0,
     needs_recorder: Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")] = False,
@@ -51,14 +37,14 @@ def site_command(
             "--stay",
             metavar="S",
             help="Wait at the end until the recorder has left, s at most.",
-            callback=check_seconds,
+            callback=options.check_seconds,
         ),
     ] = 0.0,
-    clock_offset: ClockOffsetOption = 0.0,
-    clock_drift: ClockDriftOption = 0.0,
-    duration: DurationOption = None,
-    seed: SeedOption = None,
-    overrides: SetOption = None,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
 ) -> None:
     """Runs one site as one process: for separate terminals or machines.
 
@@ -71,16 +57,17 @@ def site_command(
     from ..net.connection import default_endpoints
     from ..scenario import find_site
 
-    chosen = load_chosen_scenario(scenario, overrides, duration, seed)
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     find_site(chosen, name)
-    identity = check_session_name(session or chosen.name)
+    identity = options.check_session_name(session or chosen.name)
     places = default_endpoints(identity, chosen.names)
     before = chosen.names[: chosen.names.index(name)]
-    options = SiteOptions(
+    connection = options.resolve_connection(
+        listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
+    )
+    how = SiteOptions(
         session=identity,
-        connection=resolve_connection(
-            listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
-        ),
+        connection=connection,
         join_timeout_s=join_timeout,
         needs_recorder=needs_recorder,
         cpu=cpu,
@@ -88,5 +75,4 @@ def site_command(
         clock_offset_s=clock_offset,
         clock_drift_ppm=clock_drift,
     )
-    code = run_site(chosen, name, options, print_line)
-    raise typer.Exit(code)
+    raise typer.Exit(run_site(chosen, name, how, terminal.print_line))

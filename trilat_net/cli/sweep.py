@@ -6,7 +6,7 @@ interrupted prints the command that resumes it.
 
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,93 +15,32 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import UsageError
-from ..reporting.terminal_output import (
-    err,
-    out,
-    print_line,
-    print_note,
-    print_paths,
-    print_table,
-    print_text,
-    progress_bar,
-)
-from .options import DurationOption, JobsOption, OnOption, SetOption, list_overrides
+from ..reporting import terminal_output as terminal
+from . import options
 from .test import parse_seeds
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
     from ..studies.sweep import FinishedSweep
     from ..studies.sweep.live_confirmation import LiveSession
+    from ..studies.sweep.margin_search import SearchRange
     from ..studies.sweep.sweep_folder import SweepFolder
     from ..studies.sweep.sweep_plan import SweepPlan
     from ..studies.sweep.sweep_results import SweepResults
     from ..studies.sweep.sweep_run import DurationEstimate
 
 
-_PANEL = "Maps and edges"
-_WIDTH_IN = 3.5
-
-MapOption = Annotated[
-    bool,
-    typer.Option("--map", help="Draw the stability map with the lines of theory.", rich_help_panel=_PANEL),
-]
-WidthOption = Annotated[
-    float | None,
-    typer.Option(
-        "--width", metavar="3.5|7", help="Width of the map, in; default: one column.", rich_help_panel=_PANEL
-    ),
-]
-MarginOption = Annotated[
-    str | None,
-    typer.Option(
-        "--margin",
-        metavar="KEY=FROM:TO",
-        help="Search the edge of stability along a key instead, at every point of the grid.",
-        rich_help_panel=_PANEL,
-    ),
-]
-ToleranceOption = Annotated[
-    float | None,
-    typer.Option(
-        "--tolerance",
-        metavar="SHARE",
-        help="Width of an edge relative to its value; default: 0.005.",
-        rich_help_panel=_PANEL,
-    ),
-]
-ConfirmOption = Annotated[
-    int | None,
-    typer.Option(
-        "--confirm",
-        metavar="K",
-        min=1,
-        help="With results: run this many cells on each side of the edge live.",
-        rich_help_panel=_PANEL,
-    ),
-]
+_option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
-def _check_modes(
-    mapped: bool,
-    width: float | None,
-    margin: str | None,
-    tolerance: float | None,
-    confirm: int | None,
-    cell: int | None,
-) -> None:
+def _check_modes(given: Sequence[str]) -> None:
     """Refuses options of two modes at once, and options of a mode that is not chosen."""
-    modes = {
-        "--map": mapped,
-        "--margin": margin is not None,
-        "--confirm": confirm is not None,
-        "--cell": cell is not None,
-    }
-    chosen = [name for name, is_chosen in modes.items() if is_chosen]
+    chosen = [name for name in ("--map", "--margin", "--confirm", "--cell") if name in given]
     if len(chosen) > 1:
         raise UsageError(f"{' and '.join(chosen)} exclude each other: give one at a time")
-    if width is not None and not mapped:
+    if "--width" in given and "--map" not in given:
         raise UsageError("--width is of a map: use it with --map")
-    if tolerance is not None and margin is None:
+    if "--tolerance" in given and "--margin" not in given:
         raise UsageError("--tolerance is of an edge: use it with --margin")
 
 
@@ -109,28 +48,22 @@ def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
     """Draws the map of a sweep into a folder: map.png, map.svg, map.md."""
-    from ..reporting.figure_size import make_print_size
+    from ..reporting.figure_size import COLUMN_IN, make_print_size
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map, build_sweep_command
 
-    form = make_print_size(_WIDTH_IN if width is None else width)
+    form = make_print_size(COLUMN_IN if width is None else width)
     words = [] if width is None else ["--width", f"{width:g}"]
-    with progress_bar("linear analysis") as progress:
-        made = build_stability_map(
-            results, (build_sweep_command(results.plan, "--map", *words),), jobs, progress, on=on
-        )
+    command = build_sweep_command(results.plan, "--map", *words)
+    with terminal.progress_bar("linear analysis") as progress:
+        made = build_stability_map(results, (command,), jobs, progress, on=on)
     for line in made.remarks:
-        print_text(f"note: {line}")
-    print_paths(write_map(made, folder, form.width_in))
+        terminal.print_text(f"note: {line}")
+    terminal.print_paths(write_map(made, folder, form.width_in))
 
 
 def _search_margins(
-    asked: "SweepPlan",
-    margin: str,
-    tolerance: float | None,
-    folder: Path | None,
-    jobs: int | None,
-    on: str | None,
+    asked: "SweepPlan", within: "SearchRange", folder: Path | None, jobs: int | None, on: str | None
 ) -> None:
     """Searches edges along one key, prints them with theory, and writes margin.json and margin.md.
 
@@ -138,25 +71,22 @@ def _search_margins(
     """
     from ..files import make_results_folder, write_whole
     from ..studies.sweep.margin_search import (
-        MARGIN_TOLERANCE,
         build_margin_page,
         margins_to_json,
-        parse_search_range,
         search_margins,
         tabulate_margins,
     )
 
-    within = parse_search_range(margin, MARGIN_TOLERANCE if tolerance is None else tolerance)
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
-    with progress_bar("searching") as progress:
+    with terminal.progress_bar("searching") as progress:
         found = search_margins(asked, within, jobs, progress, on)
-    out.print()
-    print_table(tabulate_margins(asked, within, found))
+    terminal.out.print()
+    terminal.print_table(tabulate_margins(asked, within, found))
     paths = chosen / "margin.json", chosen / "margin.md"
     facts = margins_to_json(asked, within, found)
     write_whole(paths[0], json.dumps(facts, indent=2, allow_nan=False) + "\n")
     write_whole(paths[1], build_margin_page(asked, within, found))
-    print_paths(paths)
+    terminal.print_paths(paths)
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
@@ -167,10 +97,10 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
     keys = [one.key for one in results.plan.axes]
     rows = choose_cells_near_edges(results.rows, keys, count)
     found = [confirm_cell(row, partial(_run_live, results.plan.base.name)) for row in rows]
-    out.print()
-    print_table(tabulate_confirmations(found, keys))
+    terminal.out.print()
+    terminal.print_table(tabulate_confirmations(found, keys))
     same = sum(one.same for one in found)
-    out.print(f"{same} of {len(found)} verdicts are the same")
+    terminal.out.print(f"{same} of {len(found)} verdicts are the same")
     if same < len(found):
         raise typer.Exit(1)
 
@@ -184,11 +114,11 @@ def _run_live(name: str, scenario: "Scenario", cell: str) -> "LiveSession":
     from ..studies.sweep.live_confirmation import LiveSession
 
     folder = make_results_folder(None, f"confirm-{name}-{cell}", force=False)
-    print_text(f"{cell}: {scenario.duration_s:g} s live, into {folder}")
-    with SessionDisplay(scenario, out) as display:
+    terminal.print_text(f"{cell}: {scenario.duration_s:g} s live, into {folder}")
+    with SessionDisplay(scenario, terminal.out) as display:
         outcome = run_demo(scenario, folder, display)
     if outcome.interrupted:
-        err.print("interrupted")
+        terminal.err.print("interrupted")
         raise typer.Exit(128 + outcome.interrupted)
     return LiveSession(outcome.log, outcome.problems)
 
@@ -201,41 +131,43 @@ def _start_sweep(
     asked: "SweepPlan", output: Path | None, jobs: int | None, on: str | None, *, yes: bool
 ) -> "FinishedSweep":
     """Runs a sweep, or continues it if its folder holds it."""
-    from ..studies.executor import count_workers
     from ..studies.sweep.sweep_folder import PLAN_FILE, prepare_sweep_folder
-    from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
 
     if output is not None and (output / PLAN_FILE).exists():
         return _resume_sweep(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
     _print_plan(asked)
-    workers = count_workers(jobs, on)
-    expected = estimate_sweep(asked, jobs=workers)
-    if not yes:
-        refuse_oversized_sweep(asked, expected, workers)
+    expected = _estimate(asked, [], jobs, on, yes=yes)
     return _run_in_folder(prepare_sweep_folder(asked, output), jobs, on, expected)
 
 
 def _resume_sweep(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
     """Runs the rest of a sweep."""
-    from ..studies.executor import count_workers
-    from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
-
     with folder.journal() as journal:
         done = list(journal.done)
     _print_plan(folder.plan)
-    print_text(f"  {len(done)} runs are done already")
+    terminal.print_text(f"  {len(done)} runs are done already")
+    return _run_in_folder(folder, jobs, on, _estimate(folder.plan, done, jobs, on, yes=yes))
+
+
+def _estimate(
+    asked: "SweepPlan", done: list[tuple[int, int]], jobs: int | None, on: str | None, *, yes: bool
+) -> "DurationEstimate":
+    """Returns how long a sweep will take; refuses one that is too large."""
+    from ..studies.executor import count_workers
+    from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
+
     workers = count_workers(jobs, on)
-    expected = estimate_sweep(folder.plan, done, workers)
+    expected = estimate_sweep(asked, done, workers)
     if not yes:
-        refuse_oversized_sweep(folder.plan, expected, workers)
-    return _run_in_folder(folder, jobs, on, expected)
+        refuse_oversized_sweep(asked, expected, workers)
+    return expected
 
 
 def _print_plan(asked: "SweepPlan") -> None:
     from ..studies.sweep.sweep_report import describe_sweep_plan
 
     for line in describe_sweep_plan(asked):
-        print_text(line)
+        terminal.print_text(line)
 
 
 def _run_in_folder(
@@ -243,11 +175,13 @@ def _run_in_folder(
 ) -> "FinishedSweep":
     """Runs a sweep in its folder and prints its summary; on Ctrl-C, the command that resumes it."""
     from ..studies.sweep import run_sweep
-    from ..studies.sweep.sweep_report import describe_sweep_speed, summarize_sweep
+    from ..studies.sweep.sweep_report import describe_sweep_speed
     from ..studies.sweep.sweep_run import format_wall_time
 
     if expected.seconds:
-        print_text(f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}")
+        terminal.print_text(
+            f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}"
+        )
     try:
         with _sweep_progress() as progress:
             swept = run_sweep(folder, jobs, progress, expected.entries, on)
@@ -255,29 +189,30 @@ def _run_in_folder(
         with folder.journal() as journal:
             done = len(journal.done)
         resume = f"trilat sweep --resume {shlex.quote(str(folder.path))}"
-        err.print(f"{done} runs are done and kept; go on with: {resume}", markup=False, soft_wrap=True)
+        terminal.err.print(
+            f"{done} runs are done and kept; go on with: {resume}", markup=False, soft_wrap=True
+        )
         raise
     if not (expected.entries or swept.speed.runs):
-        out.print("nothing was left to run")
+        terminal.out.print("nothing was left to run")
     speed = [describe_sweep_speed(swept.speed)] if swept.speed.runs else []
-    for line in [*summarize_sweep(swept.results), *speed, f"results: {swept.folder.results}"]:
-        print_text(line)
-    _print_next_commands(swept.folder.path)
+    _print_results(swept.results, [*speed, f"results: {swept.folder.results}"], swept.folder.path)
     return swept
 
 
-def _print_next_commands(path: Path) -> None:
-    from ..studies.sweep.sweep_report import list_next_commands
+def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
+    """Prints the summary of a finished sweep, more lines, and what can be done next."""
+    from ..studies.sweep.sweep_report import list_next_commands, summarize_sweep
 
-    for line in list_next_commands(path):
-        print_text(f"  {line}")
+    for line in [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]:
+        terminal.print_text(line)
 
 
 @contextmanager
 def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
     """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
-    if err.is_interactive:
-        with progress_bar("sweeping") as show:
+    if terminal.err.is_interactive:
+        with terminal.progress_bar("sweeping") as show:
             yield show
         return
     from ..net.clock import SystemClock
@@ -294,21 +229,9 @@ def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
             return
         printed = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
-        print_text(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
+        terminal.print_text(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
 
     yield line
-
-
-def _print_results(path: Path) -> None:
-    """Prints the plan and the summary of a finished sweep."""
-    from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_report import summarize_sweep
-
-    results = read_results(path)
-    _print_plan(results.plan)
-    for line in summarize_sweep(results):
-        print_text(line)
-    _print_next_commands(path)
 
 
 def _print_cell_commands(path: Path, number: int) -> None:
@@ -320,20 +243,12 @@ def _print_cell_commands(path: Path, number: int) -> None:
     for row in results.of_cell(number):
         command, note = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
         if note:
-            print_note(note)
-        print_line(command)
+            terminal.print_note(note)
+        terminal.print_line(command)
 
 
-app = typer.Typer()
-
-
-@app.command(
-    "sweep",
-    epilog="Example: trilat sweep p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1\n\n"
-    "Example: trilat sweep p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3\n\n"
-    "Example: trilat sweep runs/sweep-p_d_margin-001 --cell 17",
-)
 def sweep_command(
+    context: typer.Context,
     scenario: Annotated[
         str | None,
         typer.Argument(
@@ -354,14 +269,14 @@ def sweep_command(
         typer.Option(
             "--seeds",
             metavar="N|LIST",
-            help="Number of seeds per cell, or a list, as in 1..20; default: one.",
+            help="How many seeds, or a list, as in 1..20; default: one.",
         ),
     ] = None,
     law: Annotated[
         str | None,
         typer.Option("--law", metavar="LAW,LAW...", help="Sweep laws as well; default: the scenario's."),
     ] = None,
-    duration: DurationOption = None,
+    duration: options.DurationOption = None,
     longest: Annotated[
         float | None,
         typer.Option(
@@ -388,31 +303,51 @@ def sweep_command(
             "--cell", metavar="N", help="With results: print the commands that make logs of a cell."
         ),
     ] = None,
-    jobs: JobsOption = None,
-    on: OnOption = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Run an oversized sweep.")] = False,
-    overrides: SetOption = None,
-    mapped: MapOption = False,
-    width: WidthOption = None,
-    margin: MarginOption = None,
-    tolerance: ToleranceOption = None,
-    confirm: ConfirmOption = None,
+    overrides: options.SetOption = None,
+    mapped: Annotated[bool, _option("--map", help="Draw the stability map and lines of theory.")] = False,
+    width: Annotated[
+        float | None,
+        _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column."),
+    ] = None,
+    margin: Annotated[
+        str | None,
+        _option(
+            "--margin",
+            metavar="KEY=FROM:TO",
+            help="Search the edge of stability along a key instead, at every point of the grid.",
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float,
+        _option("--tolerance", metavar="SHARE", help="Width of an edge relative to its value."),
+    ] = 0.005,
+    confirm: Annotated[
+        int | None,
+        _option(
+            "--confirm",
+            metavar="K",
+            min=1,
+            help="With results: run this many cells on each side of the edge live.",
+        ),
+    ] = None,
 ) -> None:
     """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
     Finished runs are kept however the sweep ends: the same command with the same -o, or --resume, continues.
     """
     from ..studies.sweep import open_sweep_folder, plan_sweep
+    from ..studies.sweep.margin_search import format_range_axis, parse_search_range
     from ..studies.sweep.sweep_results import require_polars
 
     require_polars()
-    _check_modes(mapped, width, margin, tolerance, confirm, cell)
+    given = options.given_options(context)
+    _check_modes(given)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     if cell is not None or resume is not None or results is not None:
-        planned: dict[str, object] = {"--over": over, "--seeds": seeds, "--law": law, "-o": output}
-        planned |= {"--longest": longest, "--set": overrides, "--duration": duration}
-        _refuse_given(planned, "is of the sweep already: leave it out")
-        _refuse_given({"--margin": margin}, "is of a scenario, and searches anew: name that")
+        _refuse_beside_results(given)
     elif confirm is not None:
         raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
     if resume is not None:
@@ -428,16 +363,17 @@ def sweep_command(
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
+        within = None if margin is None else parse_search_range(margin, tolerance)
         asked = plan_sweep(
             scenario,
-            list_overrides(overrides, duration),
-            over=[*(over or []), *([] if margin is None else [_margin_axis(margin)])],
+            options.list_overrides(overrides, duration),
+            over=[*(over or []), *([] if within is None else [format_range_axis(within)])],
             seeds=parse_seed_count(seeds),
-            laws=[name.strip() for name in law.split(",")] if law is not None else (),
+            laws=options.split_names(law),
             longest_s=longest,
         )
-        if margin is not None:
-            return _search_margins(asked, margin, tolerance, output, jobs, on)
+        if within is not None:
+            return _search_margins(asked, within, output, jobs, on)
         swept = _start_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
         _draw_map(swept.results, swept.folder.path, width, jobs, on)
@@ -456,19 +392,23 @@ def _show_results(
     """Draws the map of finished results, confirms some of their cells live, or prints their summary."""
     from ..studies.sweep import read_results
 
+    results = read_results(path)
     if confirm is not None:
-        _confirm_cells(read_results(path), confirm)
+        _confirm_cells(results, confirm)
     elif mapped:
-        _draw_map(read_results(path), path if path.is_dir() else path.parent, width, jobs, on)
+        _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
     else:
-        _print_results(path)
+        _print_plan(results.plan)
+        _print_results(results, [], path)
 
 
-def _margin_axis(margin: str) -> str:
-    """Returns the range of a margin as an axis of its two ends, so that a plan checks both."""
-    from ..studies.sweep.margin_search import format_range_axis, parse_search_range
-
-    return format_range_axis(parse_search_range(margin))
+def _refuse_beside_results(given: Sequence[str]) -> None:
+    """Refuses options that a sweep was planned with where it is finished or continued."""
+    for name in ("--over", "--seeds", "--law", "-o", "--longest", "--set", "--duration"):
+        if name in given:
+            raise UsageError(f"{name} is of the sweep already: leave it out")
+    if "--margin" in given:
+        raise UsageError("--margin is of a scenario, and searches anew: name that")
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
@@ -488,9 +428,3 @@ def _is_results(source: str) -> bool:
     return source not in list_shipped() and (
         source.endswith(".parquet") or (Path(source) / PLAN_FILE).exists()
     )
-
-
-def _refuse_given(options: Mapping[str, object], reason: str) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise UsageError(f"{name} {reason}")

@@ -11,20 +11,17 @@ import typer
 from rich.markup import escape
 
 from ..errors import UsageError
-from ..reporting.terminal_output import err, out, print_text
-from .options import JobsOption, OnOption, SetOption
+from ..reporting import terminal_output as terminal
+from . import options
 
 if TYPE_CHECKING:
     from ..studies.trials.trial import Trial, TrialResult
     from ..studies.trials.trial_report import TrialReport
 
 
-app = typer.Typer()
-
 MAX_SEEDS = 100_000
 
 
-@app.command("test", epilog="Example: trilat test jitter --seeds 1..20 --junit out.xml")
 def test_command(
     scenarios: Annotated[
         list[str] | None,
@@ -45,9 +42,9 @@ def test_command(
     junit: Annotated[
         Path | None, typer.Option("--junit", metavar="FILE", help="Write the results as JUnit XML as well.")
     ] = None,
-    jobs: JobsOption = None,
-    on: OnOption = None,
-    overrides: SetOption = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    overrides: options.SetOption = None,
 ) -> None:
     r"""Runs scenarios and checks their \[expect]: which held, by what margin, how to repeat the others."""
     from ..files import write_whole
@@ -106,15 +103,15 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
     from ..studies.trials.trial_runner import run_trials
 
     to_do = Counter(trial.source for trial in batch)
-    with Progress(console=out, transient=True, disable=not out.is_terminal) as progress:
+    with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:
         task = progress.add_task("runs", total=len(batch))
 
         def done(result: "TrialResult") -> None:
             progress.advance(task)
             source = result.trial.source
             to_do[source] -= 1
-            if not to_do[source] and not out.is_terminal:
-                print_text(f"{source}: ran")
+            if not to_do[source] and not terminal.out.is_terminal:
+                terminal.print_text(f"{source}: ran")
 
         return run_trials(batch, jobs, done, on)
 
@@ -134,12 +131,12 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
     results = []
     for trial in batch:
         folder = make_results_folder(None, f"test-{trial}", force=False)
-        print_text(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}")
+        terminal.print_text(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}")
         began_ns = clock.monotonic_ns()
-        with SessionDisplay(trial.scenario, out) as display:
+        with SessionDisplay(trial.scenario, terminal.out) as display:
             outcome = run_demo(trial.scenario, folder, display)
         if outcome.interrupted:
-            err.print("interrupted")
+            terminal.err.print("interrupted")
             raise typer.Exit(128 + outcome.interrupted)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
@@ -149,10 +146,10 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
 def _show(report: "TrialReport") -> None:
     """Prints the table, what failed and how to repeat it, and how fast it went."""
     heads, *rows = report.table()
-    out.print(heads, soft_wrap=True)
+    terminal.out.print(heads, soft_wrap=True)
     for line in rows:
         mark, space, rest = line.partition(" ")
         color = "green" if mark == "ok" else "red"
-        out.print(f"[{color}]{mark}[/{color}]{space}{escape(rest)}", soft_wrap=True)
+        terminal.out.print(f"[{color}]{mark}[/{color}]{space}{escape(rest)}", soft_wrap=True)
     for line in [*report.failures(), *report.remarks()]:
-        print_text(line)
+        terminal.print_text(line)
