@@ -49,15 +49,7 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """The requests to one site.
-
-    Args:
-        bus: the connection.
-        session: the session's name.
-        reception: the site's messages so far.
-        dropped: counts invalid answers, by reason.
-        now_ns: the recorder's clock.
-    """
+    """The requests to one site; `dropped` counts its invalid answers by reason."""
 
     def __init__(
         self, bus: Bus, session: str, reception: SiteReception, dropped: Counter[str], now_ns: int = 0
@@ -81,12 +73,7 @@ class GapRepair:
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Yields missing messages that have arrived; requests more.
-
-        Args:
-            now_ns: the time.
-            alive: whether the site is present.
-        """
+        """Yields missing messages that have arrived; requests more."""
         if self._open is not None:
             yield from self._read_answers(self._open, now_ns)
         if alive:

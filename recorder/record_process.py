@@ -37,17 +37,7 @@ FLUSH_NS = 80_000_000
 
 
 class Recorder:
-    """One recording, from the first poll to the end mark of the file.
-
-    Args:
-        bus: the connection.
-        clock: the time.
-        session: the session's name.
-        boot: this process's boot.
-        storage: where the log goes.
-        stopped: True once the recorder should end.
-        say: prints a line for the user.
-    """
+    """One recording, from the first poll to the end mark of the file."""
 
     def __init__(
         self,
@@ -79,10 +69,7 @@ class Recorder:
         self._joining = SessionJoin(bus, clock, session, self._publisher, ())
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for a session to begin; returns its epoch, or None if `stopped`.
-
-        Args:
-            timeout_s: how long, s; None for as long as it takes.
+        """Waits for a session to begin, without a timeout for ever; returns its epoch, or None if `stopped`.
 
         Raises:
             SessionError: none began in time.
@@ -126,11 +113,7 @@ class Recorder:
         with LogParts(self._storage, begin) as log:
             recording = Recording(log, scenario, self._session, epoch, self._bus, self._publisher)
             log.so_far = partial(recording.account_texts, self._queue)
-            boot = self._publisher.info.boot
-            report = RecorderReport(
-                *(self._bus, self._clock, self._session, boot, epoch, recording, self._queue),
-                lambda: log.written_bytes,
-            )
+            report = RecorderReport(self._bus, self._clock, recording, self._queue, lambda: log.written_bytes)
             self._begin(recording, epoch, log.path)
             discarded = InboundQueue(self._clock)  # on a full disk there is no room for the queue
             discarded.overflowed = self._queue.overflowed

@@ -6,16 +6,17 @@ the bus and the log; they are bounded, and a stepping wall clock shows in them a
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any
 
 from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account
+from trilat_net.log.log_writer import LogParts, LogWriter
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import Epoch, EventPublisher
-from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
+from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario
 
@@ -33,46 +34,19 @@ LAST_NS = 6_000_000_000
 """Longest stay of a site after its last due tick: 5 s, and a margin."""
 
 
-class MessageWriter(Protocol):
-    """The sink of a recording: `LogWriter`, or a replacement in tests."""
-
-    def add(
-        self,
-        key: str,
-        payload: bytes,
-        t_ns: int,
-        log_time_ns: int,
-        number: int,
-        message: State | LinkStats | Event | None = None,
-    ) -> None:
-        """Writes one message."""
-
-    def flush(self) -> None:
-        """Hands everything so far to the operating system."""
-
-    def finish(self, accounts: Mapping[str, str]) -> None:
-        """Writes the accounts and the end mark."""
-
-
 class Recording:
     """One log and its accounts.
-
-    Args:
-        writer: the log, begun.
-        scenario: the scenario of the session.
-        session: the session's name.
-        epoch: its tick 0 and its members.
-        bus: the connection, for requests of missing messages.
-        publisher: the recorder's own events; it keeps them in the same queue as other messages.
 
     Attributes:
         dropped: messages that do not belong to the session, by reason.
         accounts: messages of every channel, by its key.
+        epoch: tick 0 of the session, and its members.
+        publisher: the recorder's own events; it keeps them in the same queue as other messages.
     """
 
     def __init__(
         self,
-        writer: MessageWriter,
+        writer: LogWriter | LogParts,
         scenario: Scenario,
         session: str,
         epoch: Epoch,
@@ -81,7 +55,7 @@ class Recording:
     ) -> None:
         self.dropped: Counter[str] = Counter()
         self._writer = writer
-        self._session, self._epoch, self._publisher = session, epoch, publisher
+        self.session, self.epoch, self.publisher = session, epoch, publisher
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {name: SiteReception(scenario, name, epoch.boots.get(name)) for name in scenario.names}
         self._repairs = {
@@ -107,15 +81,15 @@ class Recording:
 
     def join_late(self, now_ns: int) -> None:
         """Reports that the recorder joins a running session, and requests everything from every site."""
-        at_ns = now_ns - self._epoch.mono_ns
+        at_ns = now_ns - self.epoch.mono_ns
         sites = ", ".join(name for name in self._sites if name not in self._gone)
-        self._publisher.publish(
+        self.publisher.publish(
             "late",
             f"the recorder joins at t = {at_ns / 1e9:.3f} s; what was before is asked of {sites}",
             t_ns=at_ns,
         )
         for name in self._gone:
-            self._publisher.publish("lost", f"{name} is gone", about=name, t_ns=at_ns)
+            self.publisher.publish("lost", f"{name} is gone", about=name, t_ns=at_ns)
         for repair in self._repairs.values():
             repair.probe()
 
@@ -126,10 +100,10 @@ class Recording:
     def write(self, queue: InboundQueue, now_ns: int) -> None:
         """Writes the queue, requests missing messages, and sends `stored` to sites that are complete."""
         self._drain(queue, now_ns)
-        log_time_ns = self._epoch.unix_ns + now_ns - self._epoch.mono_ns
+        log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in self._repairs.items():
             for repaired in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
-                key = topics.key(self._session, name, repaired.channel)
+                key = topics.key(self.session, name, repaired.channel)
                 sent_ns = max(repaired.message.t_ns, 0)  # an event before the epoch has no time
                 self._add(key, repaired.payload, repaired.message, sent_ns, log_time_ns)
         for name, site in self._sites.items():
@@ -139,8 +113,8 @@ class Recording:
             text = f"every record of {name} is stored"
             if shortage := site.shortage():
                 text = f"all that can be had of {name} is stored; missing for good: {shortage}"
-            t_ns = now_ns - self._epoch.mono_ns
-            self._publisher.publish("stored", text, t_ns=t_ns, about=name, ticks=site.made)
+            t_ns = now_ns - self.epoch.mono_ns
+            self.publisher.publish("stored", text, t_ns=t_ns, about=name, ticks=site.made)
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
         for arrived in queue.drain(until_ns):
@@ -150,8 +124,8 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _take(self, arrived: InboundMessage) -> None:
-        since_ns = arrived.mono_ns - self._epoch.mono_ns
-        log_time_ns = self._epoch.unix_ns + since_ns
+        since_ns = arrived.mono_ns - self.epoch.mono_ns
+        log_time_ns = self.epoch.unix_ns + since_ns
         if arrived.key in self._own:
             self._take_own(arrived, since_ns, log_time_ns)
             return
@@ -174,7 +148,7 @@ class Recording:
             if event.member != topics.RECORDER:
                 raise WireError("stranger", arrived.key)
             boot, number, content = event.boot, event.n, event
-        if boot != self._publisher.info.boot:
+        if boot != self.publisher.info.boot:
             raise WireError("another recorder", arrived.key)
         if number >= 0 and account.take(number, arrived.mono_ns):
             self._writer.add(arrived.key, arrived.payload, since_ns, log_time_ns, number, content)
@@ -185,7 +159,7 @@ class Recording:
     def presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""
         parts = topics.parse_key(key)
-        if parts is not None and str(self._epoch.boots.get(parts.member)) == parts.boot:
+        if parts is not None and str(self.epoch.boots.get(parts.member)) == parts.boot:
             (self._gone.discard if alive else self._gone.add)(parts.member)
 
     def _silent_since_ns(self, site: str, now_ns: int) -> int | None:
@@ -278,33 +252,13 @@ _ALL_GAPS = 600
 
 
 class RecorderReport:
-    """The statistics of one recording.
-
-    Args:
-        bus: the connection.
-        clock: the time.
-        session: the session's name.
-        boot: the recorder's.
-        epoch: tick 0.
-        recording: the recording.
-        queue: its inbound queue, which takes the statistics too.
-        size: returns the size of the log in bytes.
-    """
+    """The statistics of one recording; `size` returns the bytes of its log."""
 
     def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        session: str,
-        boot: int,
-        epoch: Epoch,
-        recording: Recording,
-        queue: InboundQueue,
-        size: Callable[[], int],
+        self, bus: Bus, clock: Clock, recording: Recording, queue: InboundQueue, size: Callable[[], int]
     ) -> None:
-        self._clock, self._boot, self._epoch = clock, boot, epoch
-        self._recording, self._queue, self._size = recording, queue, size
-        self._key = topics.key(session, topics.RECORDER, topics.STATS)
+        self._clock, self._recording, self._queue, self._size = clock, recording, queue, size
+        self._key = topics.key(recording.session, topics.RECORDER, topics.STATS)
         self._publish = bus.publisher(self._key)
         self._flush_max_ns = 0
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
@@ -329,28 +283,25 @@ class RecorderReport:
         self._publish(payload)
 
     def _stats(self) -> RecorderStats:
-        def short(key: str) -> str:  # member and channel, as in "m1/state"
-            return "/".join(key.split("/")[2:])
-
-        accounts = {short(key): account for key, account in self._recording.accounts.items()}
+        accounts = {  # by member and channel, as in "m1/state"
+            "/".join(key.split("/")[2:]): account for key, account in self._recording.accounts.items()
+        }
         most = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(accounts)))
         now_ns = self._clock.monotonic_ns()
-
-        def counted(field: Callable[[Account], int]) -> dict[str, int]:
-            return {name: field(account) for name, account in accounts.items()}
-
+        counts: dict[str, Any] = {
+            field: {name: getattr(account, field) for name, account in accounts.items()}
+            for field in ("expected", "received", "missing", "duplicate", "reordered", "refilled")
+        }
         return RecorderStats(
-            boot=self._boot,
-            t_ns=now_ns - self._epoch.mono_ns,
-            expected=counted(lambda account: account.expected),
-            received=counted(lambda account: account.received),
-            missing=counted(lambda account: account.missing),
+            boot=self._recording.publisher.info.boot,
+            t_ns=now_ns - self._recording.epoch.mono_ns,
+            **counts,
             gaps={name: account.gap_texts(most) for name, account in accounts.items() if account.missing},
-            duplicate=counted(lambda account: account.duplicate),
-            reordered=counted(lambda account: account.reordered),
-            refilled=counted(lambda account: account.refilled),
-            overflowed={short(key): self._queue.overflowed[key] for key in self._recording.accounts},
-            silence_us=counted(lambda account: account.silence_ns // 1000),
+            overflowed={
+                name: self._queue.overflowed[key]
+                for name, key in zip(accounts, self._recording.accounts, strict=True)
+            },
+            silence_us={name: account.silence_ns // 1000 for name, account in accounts.items()},
             dropped=dict(self._recording.dropped),
             queued=len(self._queue),
             written_bytes=self._size(),

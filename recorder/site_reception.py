@@ -7,10 +7,9 @@ scenario allows; each such message may imply that others exist.
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account
+from trilat_net.log.accounting import Account, count_messages, number_message
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
-from trilat_net.net.loop_stats import ticks_per_stats
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.wire import decode
@@ -39,11 +38,6 @@ class SiteMessage(NamedTuple):
 class SiteReception:
     """The messages received from one start of one site, and those missing.
 
-    Args:
-        scenario: the session's.
-        name: the site.
-        boot: the start of it that is a member; None if none is.
-
     Attributes:
         name: the site.
         accounts: its messages by channel.
@@ -58,13 +52,10 @@ class SiteReception:
         self.heard_ns: int | None = None
         self._boot = boot
         self._rate_hz = scenario.sites[name].rate_hz
-        self._every = ticks_per_stats(self._rate_hz)
         self._ticks = scenario.ticks(name)
         self._most = {
-            topics.STATE: self._ticks,
-            topics.LINK: self._count_stats(self._ticks),
-            topics.EVENT: _MANY,
-        }
+            channel: count_messages(channel, self._ticks, self._rate_hz) for channel in SITE_CHANNELS
+        } | {topics.EVENT: _MANY}
 
     @property
     def period_ns(self) -> int:
@@ -77,22 +68,20 @@ class SiteReception:
         Raises:
             WireError: it is no message of this site's channel.
         """
-        if channel == topics.STATE:
-            state = decode(payload, State)
-            message = SiteMessage(state.tick, state.tick, state.sent_ns, state)
-            sender, boot = state.site, state.boot
-        elif channel == topics.LINK:
-            stats = decode(payload, LinkStats)
-            message = SiteMessage(stats.tick // self._every, stats.tick, stats.t_ns, stats)
-            sender, boot = stats.site, stats.boot
-        else:
+        if channel == topics.EVENT:
             event = decode(payload, Event)
             message = SiteMessage(event.n, event.n, event.t_ns, event)
-            sender, boot = event.member, event.boot
+            sender = event.member
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError("out of range", f"{self.name} says it made {event.ticks} ticks")
-        if sender != self.name or boot != self._boot:
-            raise WireError("stranger", f"{sender}, start {boot}, on a key of {self.name}")
+        else:
+            tick = decode(payload, State) if channel == topics.STATE else decode(payload, LinkStats)
+            number = number_message(channel, tick.tick, self._rate_hz)
+            t_ns = tick.sent_ns if isinstance(tick, State) else tick.t_ns
+            message = SiteMessage(number, tick.tick, t_ns, tick)
+            sender = tick.site
+        if sender != self.name or message.content.boot != self._boot:
+            raise WireError("stranger", f"{sender}, start {message.content.boot}, on a key of {self.name}")
         if message.number >= self._most[channel]:
             raise WireError("out of range", f"{self.name}/{channel} number {message.number}")
         return message
@@ -129,12 +118,8 @@ class SiteReception:
             self.expect(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "end":
             self.made = content.ticks
-            self.expect(topics.STATE, content.ticks)
-            self.expect(topics.LINK, self._count_stats(content.ticks))
-
-    def _count_stats(self, ticks: int) -> int:
-        """Returns the number of statistics messages of so many ticks."""
-        return -(-ticks // self._every)
+            for channel in (topics.STATE, topics.LINK):
+                self.expect(channel, count_messages(channel, content.ticks, self._rate_hz))
 
     @property
     def full(self) -> bool:

@@ -88,18 +88,7 @@ class PlaybackSummary(NamedTuple):
 
 
 class Playback:
-    """One playback in a session of its own.
-
-    Args:
-        bus: the connection.
-        clock: the time.
-        header: the session in the log.
-        source: its messages.
-        options: how it is played.
-        stopped: True once it should end.
-        say: prints a line for the user.
-        show: shows the progress now and then.
-    """
+    """One playback in a session of its own."""
 
     def __init__(
         self,
@@ -204,17 +193,6 @@ def play_log(
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
     """Plays a log over Zenoh; None if it was stopped before it began.
-
-    Args:
-        loaded: result of `preload_messages` for `paths` and `selection`.
-        paths: the files.
-        selection: the messages to play.
-        options: how to play them.
-        connection: the network.
-        clock: the time.
-        stopped: True once the playback should end.
-        say: prints a line for the user.
-        show: shows the progress now and then.
 
     Raises:
         SessionError: there is a session of that name.

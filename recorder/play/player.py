@@ -39,16 +39,7 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """One play of a log.
-
-    Args:
-        source: the messages.
-        history: receives what is played.
-        clock: the time.
-        publisher: returns the publisher of a channel.
-        attend: does a little other work; called again and again.
-        stopped: True once the play should end.
-        low_cpu: sleep to the deadline instead of polling the clock before it.
+    """One play of a log: `publisher` returns the publisher of a channel, `attend` does a little other work.
 
     Attributes:
         counts: messages published, by channel.

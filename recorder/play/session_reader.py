@@ -75,14 +75,6 @@ def parse_selection(
 ) -> PlaySelection:
     """Returns the selection that a user's options describe.
 
-    Args:
-        include: key expressions of the only channels that are played; a leading slash is allowed.
-        exclude: key expressions of channels that are not played.
-        start_s: beginning, s since the epoch.
-        stop_s: end, s since the epoch.
-        duration_s: length in place of `stop_s`, s from `start_s`, or from the epoch.
-        time: the time that orders messages.
-
     Raises:
         UsageError: the options contradict each other, or one is not valid.
     """

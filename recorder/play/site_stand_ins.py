@@ -105,13 +105,6 @@ REFRESH_NS = 500_000_000
 class SiteStandIns:
     """The stand-ins for all sites of a session, and the recorders that listen.
 
-    Args:
-        bus: the connection.
-        clock: the time.
-        session: the session's name here.
-        header: the session in the log.
-        history: the played messages.
-
     Attributes:
         recorders: boots of the recorders that are present.
         refilled: number of messages given to recorders that had missed them.

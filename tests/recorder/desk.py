@@ -136,9 +136,7 @@ class Desk:
         publisher = EventPublisher(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
         writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
         self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, publisher)
-        self.report = RecorderReport(
-            self.bus, self.clock, SESSION, info.boot, epoch, self.recording, self.tap, self.stream.tell
-        )
+        self.report = RecorderReport(self.bus, self.clock, self.recording, self.tap, self.stream.tell)
 
     def wait(self, for_ns: int) -> None:
         self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)
