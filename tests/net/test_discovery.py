@@ -9,7 +9,7 @@ import pytest
 
 from sites.change_server import ChangeServer
 from trilat_net.errors import SessionError
-from trilat_net.net import topics
+from trilat_net.net import discovery, topics
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock, SystemClock
 from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
@@ -35,16 +35,7 @@ class Answering:
         (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
         scenario = load_scenario("paper")
-        info = Info(
-            member="s",
-            boot=1,
-            scenario_sha256=scenario.sha256,
-            scenario=scenario.text,
-            host="h",
-            clock="c",
-            fingerprint="f",
-            running=running,
-        )
+        info = told("s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running)
         self._publisher = EventPublisher(self._bus, SESSION, info)
         questions = self._bus.questions(topics.key(SESSION, "s" if not deaf else "x", topics.SET))
         self._changes = ChangeServer(scenario, "s", questions)
@@ -68,6 +59,11 @@ class Answering:
         return request_change(
             connection, CLOCK, SESSION, site, wanted, lambda text: parse_scenario(text).names
         )
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discovery, "REPLY_TIMEOUT_S", 0.8)
 
 
 @pytest.fixture
@@ -128,20 +124,16 @@ def test_answers_of_another_version_alone_are_an_error_that_names_the_member() -
 def test_a_recorder_announces_itself_while_it_asks_the_first_site_for_the_others() -> None:
     session = f"discovery-{CLOCK.monotonic_ns()}"
     first = ZenohBus([default_endpoint(session, 0)])
-    presence = first.presence(topics.key(session, "*", topics.ALIVE) + "/*")
+    presence = first.presence(topics.presence_key(session, "*"))
     scenario = load_scenario("two_sites")
     info = told("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
     first.respond(topics.key(session, "m", topics.INFO), lambda _: encode(info))
+    patience = {"stopped": lambda: False, "timeout_s": 10.0, "recorder_boot": 7}
+    nowhere = Connection(connect=None)
     with (
         closing(first),
         connect_to_session(
-            Connection(connect=None),
-            CLOCK,
-            session,
-            lambda text: parse_scenario(text).names,
-            stopped=lambda: False,
-            timeout_s=10.0,
-            recorder_boot=7,
+            nowhere, CLOCK, session, lambda text: parse_scenario(text).names, **patience
         ) as bus,
     ):
         assert bus is not None

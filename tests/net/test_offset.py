@@ -30,7 +30,7 @@ messages = st.lists(
 
 
 @given(others, messages, st.integers(0, 100 * S))
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_the_true_offset_and_drift_are_inside_whatever_the_delays_were(
     other: Other, crossings: list[tuple[int, bool, int]], silence_ns: int
 ) -> None:
@@ -77,7 +77,7 @@ def test_one_exchange_gives_the_classical_offset_and_half_its_round_trip(
     assert trip_ns / 2 - spread_ns <= bound_ns <= trip_ns / 2 + spread_ns
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 5))])
 @pytest.mark.parametrize(("offset_ns", "drift_ppb"), [(3 * S, 100_000), (-2 * DAY, -100_000), (5, 0)])
 def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: int) -> None:
     """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, of ways as they are on one busy machine."""
@@ -128,7 +128,7 @@ def test_a_bad_minute_among_good_ones_does_not_move_the_drift() -> None:
 
 
 @given(st.floats(1.0, 100.0), st.floats(0.0, 2 * math.pi), st.integers(0, 2**32))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_drift_that_wanders_as_far_as_it_may_stays_inside(period_s: float, phase: float, seed: int) -> None:
     """The offset's rate swings by a quarter of a part per million, so over any stretch within WANDER."""
     size = 250.0 * period_s / (2 * math.pi)
@@ -229,7 +229,7 @@ def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstim
 
 
 @given(st.integers(0, 2**32), st.integers(-(10**12), 10**12), st.floats(-150_000, 150_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_the_truth_is_inside_its_bound_at_every_instant(seed: int, offset_ns: int, drift_ppb: float) -> None:
     """From the first exchange on, with estimates that come late, and through a silence of a minute."""
     other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()

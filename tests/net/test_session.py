@@ -41,7 +41,7 @@ def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
 
 
 @given(lives())
-@settings(max_examples=150)
+@settings(max_examples=50)
 def test_one_epoch_whatever_the_order_of_starts_deaths_and_polls(
     life: tuple[list[str], list[tuple[str, str]]],
 ) -> None:
@@ -291,7 +291,7 @@ def round_of_all(session: Party, *elsewhere: ManualClock) -> None:
     ),
     unix_ns=st.integers(0, 2**60),
 )
-@settings(max_examples=50)
+@settings(max_examples=15)
 def test_members_on_other_clocks_get_the_same_instant_whatever_their_wall_clocks_say(
     ahead_ns: dict[str, int], unix_ns: int
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.core.ticks import Arrival, Mode, TickRecord
@@ -71,6 +71,7 @@ def payload(**changes: Any) -> bytes:
     return msgpack.packb({**record, **changes})
 
 
+@settings(max_examples=40)
 @given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
 def test_a_record_comes_back_bit_for_bit(
     output: TickRecord, came: list[Arrival], boot: int, late_us: int
@@ -94,6 +95,7 @@ def test_a_record_comes_back_bit_for_bit(
 instants = st.integers(-(2**59), 2**59 - 1)
 
 
+@settings(max_examples=30)
 @given(output=outputs, sent_ns=instants, echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)))
 def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
     output: TickRecord, sent_ns: int, echo: list[tuple[int, int, int]]
@@ -117,6 +119,7 @@ def test_a_record_of_the_first_version_is_read_in_files_and_refused_live() -> No
     assert VERSION in READABLE
 
 
+@settings(max_examples=30)
 @given(output=outputs, came=arrivals)
 def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
@@ -126,12 +129,8 @@ def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arri
     assert again.rx == state.rx
 
 
-@given(
-    output=outputs,
-    name=st.sampled_from(sorted(STATE_VECTORS)),
-    value=not_finite,
-    entry=st.integers(0, 1),
-)
+@settings(max_examples=40)
+@given(outputs, st.sampled_from(sorted(STATE_VECTORS)), not_finite, st.integers(0, 1))
 def test_what_is_not_finite_is_refused_at_both_ends(
     output: TickRecord, name: str, value: float, entry: int
 ) -> None:
@@ -243,12 +242,7 @@ def test_deep_nesting_is_refused(opening: bytes) -> None:
 
 
 def test_lengths_that_promise_more_than_there_is_are_refused() -> None:
-    for head in (
-        b"\xdf\xff\xff\xff\xff",
-        b"\xdd\xff\xff\xff\xff",
-        b"\xdb\xff\xff\xff\xff",
-        b"\xc6\xff\xff\xff\xff",
-    ):
+    for head in (kind + b"\xff" * 4 for kind in (b"\xdf", b"\xdd", b"\xdb", b"\xc6")):
         only_wire_errors(head)
         only_wire_errors(payload(q=0)[:-1] + head)
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from trilat_net.net.bus import Inbox
+from trilat_net.net.bus import Inbox, PolledRing
 from trilat_net.net.clock import Clock, SystemClock
 
 T = TypeVar("T")
@@ -21,12 +21,9 @@ def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | No
     return result
 
 
-def drained(inbox: Inbox) -> list[tuple[str, bytes]]:
+def drained(ring: PolledRing[T]) -> list[T]:
     """Everything that waits in a ring, oldest first."""
-    messages = []
-    while (message := inbox.poll()) is not None:
-        messages.append(message)
-    return messages
+    return list(iter(ring.poll, None))
 
 
 def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:
