@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.virtual_runs import trajectories
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory.effective_delay import compute_effective_delay
+from trilat_net.theory.operating_point import compute_effective_delay
 
 
 def scenario(**link: object) -> Scenario:

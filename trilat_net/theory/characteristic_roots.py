@@ -296,16 +296,11 @@ def refine_roots(
     tries: int | None = None,
     period_rad_s: float = math.inf,
 ) -> tuple[list[CharacteristicRoot], int]:
-    """Returns the rightmost roots near some candidates, and the number of candidates dropped.
+    """Returns the rightmost `wanted` roots near some candidates, and the number of candidates dropped.
 
-    Args:
-        pencil: the problem.
-        candidates: guesses of nonzero roots, shape (K,), by falling real part.
-        names: of the states.
-        wanted: number of roots.
-        tries: number of roots after which the other candidates are skipped; by default two more than
-            wanted, because Newton's method may change their order.
-        period_rad_s: imaginary parts that differ by it are the same, as those of sampled loops are.
+    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after `tries` roots the others
+    are skipped, by default two more than wanted, because Newton's method may change their order. Imaginary
+    parts that differ by `period_rad_s` are the same, as those of sampled loops are.
     """
     found: list[CharacteristicRoot] = []
     dropped = 0

@@ -64,11 +64,9 @@ def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> b
 
 
 def discretise_generator(pencil: Pencil, order: int) -> Array:
-    """Returns the discretised generator: the state, and the history of its delayed part at Chebyshev nodes.
+    """Returns the discretised generator of a pencil with delays, by polynomials of degree `order`.
 
-    Args:
-        pencil: the characteristic equation, with at least one delay.
-        order: the degree M of the polynomial.
+    Its states are the loop's, and the history of their delayed part at Chebyshev nodes.
     """
     delayed, longest_s, n = pencil.delayed_states, float(pencil.delays.max()), len(pencil.A)
     c = len(delayed)

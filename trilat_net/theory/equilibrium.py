@@ -114,8 +114,9 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     The derivatives of the angles are zero.
     """
     x = gather_site_arguments(conditions, rest)
-    rates = [conditions.rates(i, own) for i, own in enumerate(x)]
-    states = np.array([np.concatenate([np.zeros(JOINTS), one.qdd, one.estimate]) for one in rates])
+    states = np.array(
+        [np.concatenate([np.zeros(JOINTS), one.qdd, one.estimate]) for one in conditions.rates(x)]
+    )
     return states[find_loop_states(conditions)]
 
 
@@ -196,11 +197,7 @@ def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, float] | None = None) -> Equilibrium:
-    """Returns the equilibrium of a scenario.
-
-    Args:
-        scenario: the experiment.
-        pose: a pose for all sites, rad, with true estimates; None: the end of a run.
+    """Returns the equilibrium of a scenario: at the end of a run, or at a pose, rad, with true estimates.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its run.
@@ -306,11 +303,11 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
             "roots are those of equations frozen at it"
         )
     x = gather_site_arguments(conditions, rest)
-    for i, site in enumerate(conditions.sites):
-        torque_nm = float(np.abs(conditions.rates(i, x[i]).tau).max())
+    for site, own, rates in zip(conditions.sites, x, conditions.rates(x), strict=True):
+        torque_nm = float(np.abs(rates.tau).max())
         if torque_nm >= site.tau_limit_nm:
             yield (
                 f"{site.name} needs {torque_nm:.4g} N m at rest, and its clamp is {site.tau_limit_nm:g}: "
                 "the clamp is left out"
             )
-        yield from describe_switching_points(site, x[i])
+        yield from describe_switching_points(site, own)

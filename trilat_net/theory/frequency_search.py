@@ -125,13 +125,9 @@ def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
 def find_minima(
     curve: FrequencyCurve, w_rad_s: Array, level: float = 0.0, tolerance: FrequencyCurve | None = None
 ) -> Minima:
-    """Returns the curve with its minima resolved, and the bands below a level.
+    """Returns the curve with its minima resolved, and the bands below a level, from first frequencies on.
 
-    Args:
-        curve: the curve.
-        w_rad_s: first frequencies, shape (F,).
-        level: the level.
-        tolerance: least depth below the level, and of a minimum below its neighbours; None: zero.
+    `tolerance` is the least depth below the level, and of a minimum below its neighbours; None: zero.
     """
     allowed = tolerance or (lambda w: np.zeros(len(w)))
     w_rad_s, both = _refine(

@@ -91,13 +91,10 @@ def analyse_linear_loop(
     pose: tuple[float, float] | None = None,
     roots: int = DEFAULT_ROOTS,
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario.
+    """Returns the linear analysis of a scenario, by name, by path, or itself, changed by texts KEY=VALUE.
 
-    Args:
-        source: the name of a shipped scenario, a path, or a scenario.
-        overrides: changes of it, as texts KEY=VALUE.
-        pose: a pose for all sites, rad, with true estimates; None: the end of a run.
-        roots: number of roots, rightmost first.
+    Its equilibrium is the end of a run, or all sites at `pose`, rad, with true estimates; its roots are the
+    rightmost ones.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.

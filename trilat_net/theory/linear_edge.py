@@ -43,10 +43,7 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the rightmost root about an equilibrium; None if there are only those at zero.
 
-    Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        sampled: use the sampled loop; if the sites have several rates the continuous one is used.
+    It is of the sampled loop if asked for, and if the sites have one rate.
     """
     continuous = compute_delay_spectrum(
         linearise_loop(conditions, rest), _CONTINUOUS_GUESSES if sampled else 1
@@ -97,16 +94,10 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields all edges that a scan of a key finds, by rising value.
+    """Yields all edges that a scan of a key such as "control.d" finds, by rising value.
 
-    Args:
-        scenario: the experiment.
-        key: as in "control.d" or "link.delay_ms".
-        low: the least value.
-        high: the largest value.
-        rest: its equilibrium, if known; it is followed along the key.
-        points: number of values that are scanned.
-        sampled: use the sampled loop; None: if the scheme is `digital`.
+    The equilibrium `rest` is that of the scenario, if known; it is followed along the key. The loop is the
+    sampled one if asked for, by default if the scheme is `digital`.
 
     Raises:
         ScenarioError: a value is not valid for that key, or the scenario has no linear loop.

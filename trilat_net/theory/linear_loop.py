@@ -96,8 +96,7 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     x = np.zeros((len(conditions.sites), ARGUMENT_COUNT))
     x[:, Q], x[:, ESTIMATE] = rest.q, rest.theta_hat
     x[:, Q_DES] = conditions.alpha @ rest.q
-    rates = [conditions.rates(i, x[i]) for i in range(len(conditions.sites))]
-    x[:, PEER_TORQUE] = conditions.alpha @ np.array([site.external + site.held for site in rates])
+    x[:, PEER_TORQUE] = conditions.alpha @ np.array([one.external + one.held for one in conditions.rates(x)])
     return x
 
 

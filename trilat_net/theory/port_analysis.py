@@ -63,8 +63,7 @@ def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) 
     """Returns the conditions with the torque of operators and environments constant as at the equilibrium."""
     x = gather_site_arguments(conditions, rest)
     sites = []
-    for i, site in enumerate(conditions.sites):
-        rates = conditions.rates(i, x[i])
+    for site, rates in zip(conditions.sites, conditions.rates(x), strict=True):
         torque = tuple((rates.external + rates.held).tolist())
         constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
         sites.append(site._replace(actors=constant))
@@ -163,13 +162,9 @@ def analyse_ports(
     of: str | None = None,
     band_hz: tuple[float, float] = (LOW_HZ, HIGH_HZ),
 ) -> PortAnalysis:
-    """Returns the analysis of a scenario's ports at an equilibrium.
+    """Returns the analysis of a scenario's ports at an equilibrium, over a band, Hz.
 
-    Args:
-        scenario: the experiment.
-        rest: the equilibrium.
-        of: the site that is free and clamped for the others' transparency; None: the slave, or the last.
-        band_hz: the analysed band, Hz.
+    The site `of` is free and clamped for the others' transparency; None: the slave, or the last site.
 
     Raises:
         ScenarioError: the scenario has no linear loop.

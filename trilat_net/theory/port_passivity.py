@@ -61,9 +61,7 @@ class Passivity(NamedTuple):
 def weight_response(Y: Complex, weights: Array) -> Complex:
     """Returns D^1/2 Y D^-1/2 with D = diag(weights): its Hermitian part has the signs of D Y + Y^H D.
 
-    Args:
-        Y: shape (F, p, p).
-        weights: of the ports, positive, shape (p,) or (F, p).
+    Y has shape (F, p, p); the weights of the ports are positive, shape (p,) or (F, p).
     """
     root = np.sqrt(weights)
     scaled: Complex = root[..., :, np.newaxis] * Y / root[..., np.newaxis, :]
@@ -82,10 +80,7 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
     A damper b at every port adds b to the impedance Z = Y^-1, and Z + Z^H + 2 b >= 0 is the same condition.
     An integrator in the law can make Z ~ -K / w^2, a negative damping without bound: then no b suffices,
     and the result is inf.
-
-    Args:
-        Y: shape (F, p, p), rad/s per N m.
-        w_rad_s: rising frequencies, shape (F,).
+    Y has shape (F, p, p), rad/s per N m; frequencies rise, shape (F,).
     """
     lacking = -0.5 * find_least_eigenvalue(np.linalg.inv(Y).astype(np.complex128))
     further = float(np.interp(_LOW_BAND * w_rad_s[0], w_rad_s, lacking))
@@ -95,12 +90,10 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
 
 
 def check_passivity(response: PortResponse, w_rad_s: Array, weights: Array | None = None) -> Passivity:
-    """Returns the passivity at some ports, as far as a grid of frequencies shows.
+    """Returns the passivity at some ports, as far as a grid of frequencies, refined at minima, shows.
 
-    Args:
-        response: velocities per torque, or another output of as many entries.
-        w_rad_s: first frequencies, shape (F,).
-        weights: of the ports, positive, shape (p,); None: all one, which makes it energy.
+    The response is velocities per torque, or another output of as many entries; weights of the ports are
+    positive, shape (p,); None: all one, which makes it energy.
     """
 
     def weighted(w: Array) -> Complex:
@@ -118,13 +111,10 @@ def check_passivity(response: PortResponse, w_rad_s: Array, weights: Array | Non
 
 
 def llewellyn_parameter(Y: Complex) -> Array:
-    """Returns Llewellyn's stability parameter, shape (F,); at least 1 where the criterion holds.
+    """Returns Llewellyn's parameter of two scalar ports, shape (F,); at least 1 where his criterion holds.
 
     2 Re y11 Re y22 - Re(y12 y21) over abs(y12 y21), but at most `MAX_LLEWELLYN`, which stands for a two-port
     without transmission, and at most -1 where Re y11 or Re y22 is negative.
-
-    Args:
-        Y: admittance of two scalar ports, shape (F, 2, 2).
     """
     y11, y22, through = Y[:, 0, 0].real, Y[:, 1, 1].real, Y[:, 0, 1] * Y[:, 1, 0]
     norm = np.linalg.norm(Y, axis=(1, 2))
@@ -169,10 +159,7 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
 
     The least eigenvalue of D^1/2 Y D^-1/2 + its Hermitian is concave in ln D (a limit of what Sezginer and
     Overton show for norms, IEEE Trans. Automatic Control 35 (1990)), so that the ellipsoid method finds it.
-
-    Args:
-        Y: admittance, shape (F, p, p).
-        owner: the site of each port, from 0 on, shape (p,).
+    Y has shape (F, p, p); `owner` is the site of each port, from 0 on, shape (p,).
     """
     scaled = _scale_sites(Y, owner)
     count, free = len(Y), int(owner.max())

@@ -75,10 +75,7 @@ class PoleAtZero(NamedTuple):
 def evaluate_transfer(loop: LinearLoop, s: Complex, output: LoopOutput | None = None) -> Complex:
     """Returns C(s) (s - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}), shape (F, p, m).
 
-    Args:
-        loop: the linearised loop.
-        s: shape (F,), 1/s.
-        output: the output; None: the loop's own, its joint velocities, which makes this Y(s), rad/s per N m.
+    Without an output C(s) is the loop's own, its joint velocities, which makes this Y(s), rad/s per N m.
     """
     output = LoopOutput(loop.C) if output is None else output
     response = np.zeros((len(s), len(output.C), loop.B.shape[1]), np.complex128)

@@ -56,11 +56,9 @@ class SiteRates(NamedTuple):
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Returns the rates of a site: Eq. (8)-(13), (15), or those of the laws that know gravity.
+    """Returns the rates of a site, with the actors in force: Eq. (8)-(13), (15), or those of known gravity.
 
-    Args:
-        site: the site, with the actors in force.
-        x: q, qd, theta_hat, q_id, its derivative, peer torque, external torque: shape (ARGUMENT_COUNT, ...).
+    x is q, qd, theta_hat, q_id, its derivative, peer torque, external torque, shape (ARGUMENT_COUNT, ...).
     """
     q, qd = x[Q], x[QD]
     tau, estimate = _evaluate_law(site, x)

@@ -131,11 +131,7 @@ def compute_sampled_spectrum(
 ) -> Spectrum | None:
     """Returns the rightmost roots s = ln(z) / h of the sampled loop; None if the sites have several rates.
 
-    Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        near: roots of the continuous loop, from which Newton's method starts if the delays are long.
-        wanted: number of roots.
+    If delays are long Newton's method starts `near` the roots of the continuous loop.
     """
     if find_common_rate_hz(conditions) is None:
         return None
