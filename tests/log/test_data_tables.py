@@ -198,38 +198,24 @@ def test_columns_are_of_their_kinds() -> None:
     assert (schema["t_s"], schema["q1_rad"], schema["age_s_ms"]) == (pl.Float64,) * 3
 
 
-def test_one_figures_worth_of_a_frame() -> None:
-    """As a person would use it: how old were the samples of the slave, once there was one?"""
-    frame = opened(recorded("paper")).frame("m1")
-    ages = frame.select(pl.col("age_s_ms").drop_nulls())
-    assert ages.height == 100
-    assert ages["age_s_ms"].unique().to_list() == pytest.approx([20.0])
-
-
 def test_without_polars_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "polars", None)
     with pytest.raises(UsageError, match=r"data frames need polars: pip install 'trilat-net\[frames\]'"):
         opened(recorded("paper")).frame("m1")
 
 
-KINDS = (State, LinkStats, Event, RecorderStats)
+ENDINGS = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_field_has_a_meaning(kind: type[msgspec.Struct]) -> None:
+@pytest.mark.parametrize("kind", [State, LinkStats, Event, RecorderStats])
+def test_every_field_has_a_meaning_and_the_unit_in_which_its_name_ends(kind: type[msgspec.Struct]) -> None:
     said = read_field_docs(kind)
     assert list(said) == list(kind.__struct_fields__)
-    for field, (_, text, json_type) in said.items():
+    for field, (unit, text, json_type) in said.items():
         assert len(text) > 5, field
         assert "  " not in text
         assert json_type in ("integer", "string", "array", "object")
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_name_that_ends_in_a_unit_has_that_unit(kind: type[msgspec.Struct]) -> None:
-    units = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
-    for field, (unit, _, _) in read_field_docs(kind).items():
-        if ending := units.get(field.rpartition("_")[2]):
+        if ending := ENDINGS.get(field.rpartition("_")[2]):
             assert unit == ending, field
 
 

@@ -35,7 +35,7 @@ MEMORY_MIB = 256
 
 
 @pytest.mark.parametrize("change", dict.fromkeys(CHANGES), ids=lambda change: change.__name__)
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 2**32), whole=st.booleans())
 def test_whatever_is_changed_everybody_answers_in_a_sentence(
     change: Callable[[bytes, Any], bytes], seed: int, whole: bool
@@ -48,7 +48,7 @@ def test_whatever_is_changed_everybody_answers_in_a_sentence(
             assert "Traceback" not in complaint
 
 
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(st.integers(0, 2**32))
 def test_several_changes_at_once(seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,9 @@ HUGE: dict[str, Callable[[], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("kind", HUGE)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.long if "records" in kind else ()) for kind in HUGE]
+)
 def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None:
     """Peak resident memory of a process that reads such a file in every way, the interpreter and all."""
     path = tmp_path / "huge.mcap"

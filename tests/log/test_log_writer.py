@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.log import log_file
 from trilat_net.log.log_file import LogFile
 from trilat_net.log.log_layout import find_parts, part_path
 from trilat_net.log.log_reader import open_log
@@ -27,10 +26,7 @@ Message = tuple[str, bytes, int, int]
 """Key, payload, log time, sequence."""
 
 
-@pytest.fixture(autouse=True)
-def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
-    monkeypatch.setattr(os, "fsync", lambda _: None)
+pytestmark = pytest.mark.usefixtures("unsynced")
 
 
 def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
@@ -73,7 +69,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     steps=STEPS,
     size=st.none() | st.integers(10_000, 120_000),
@@ -225,7 +221,7 @@ def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]
 def test_a_disk_that_is_full_at_a_seam_keeps_the_parts_before(tmp_path: Path) -> None:
     """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
-    for room in range(80_000, 200_000, 2900):
+    for room in range(80_000, 200_000, 7900):
         path = cleared(tmp_path)
         taken = recorded_on(room, path, messages)
         found = [message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]]

@@ -60,7 +60,7 @@ def test_messages_come_with_their_times_and_their_numbers() -> None:
     assert {channel.encoding for channel in WALK.channels.values()} == {"msgpack"}
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.integers(0, len(DATA) - 1))
 def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
     """Wherever it is cut, what lies in whole chunks before is read, and the cut is told."""
@@ -76,7 +76,7 @@ def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
     assert items == ITEMS[: len(items)]
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.integers(0, len(CHUNKS) - 1), st.data())
 def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObject) -> None:
     """A bit that is wrong in the data of a chunk costs that chunk, and no other."""
@@ -96,7 +96,7 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
     assert [item for item in ITEMS if item not in items] == in_chunk(frame)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.sampled_from(FRAMES), st.integers(0, (1 << 64) - 1))
 def test_a_record_that_lies_about_its_length_hides_no_more_than_a_chunk_or_two(
     frame: RecordFrame, length: int
@@ -142,15 +142,16 @@ def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
         unpack_chunk(head + lz4_)
 
 
-def test_a_file_that_holds_absurdly_much_is_refused_with_the_place() -> None:
+def test_a_file_that_holds_absurdly_much_is_refused_with_the_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
+    monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
     message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
-    bombs = chunk(message * 500_000) * 3
+    bombs = chunk(message * 80_000) * 3
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"):
         walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)
-    assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 1_500_000
+    assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 240_000
 
 
 def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.MonkeyPatch) -> None:

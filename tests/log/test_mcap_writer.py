@@ -76,7 +76,7 @@ def read(data: bytes) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(calls=CALLS, chunk_bytes=st.sampled_from([1, 200, 1 << 20]))
 def test_every_reader_finds_what_it_finds_in_a_file_of_mcaps_own(
     calls: list[tuple[Any, ...]], chunk_bytes: int
@@ -85,7 +85,7 @@ def test_every_reader_finds_what_it_finds_in_a_file_of_mcaps_own(
     assert found == expected
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(calls=CALLS)
 def test_the_same_calls_give_the_same_bytes_and_a_stream_reads_them_in_order(
     calls: list[tuple[Any, ...]],

@@ -196,7 +196,10 @@ def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
         )
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "bag"])
+LONG = [pytest.param(kind, marks=pytest.mark.long) for kind in ("virtual", "first part", "last part")]
+
+
+@pytest.mark.parametrize("kind", ["live", "recovered", "bag", *LONG])
 def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     assert rerun_faults(files[kind], "--full") == []
 
@@ -214,7 +217,9 @@ def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_p
     assert "SeriesLines:names" in text
 
 
-@pytest.mark.parametrize("kind", ["live", "recovered", "bag"])
+@pytest.mark.parametrize(
+    "kind", ["live", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("recovered", "bag"))]
+)
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     """A program of others under another license: run, never imported."""
     assert "passed" in printed(*PYMCAP, "doctor", "--strict-message-order", str(files[kind]))

@@ -22,20 +22,16 @@ from tests.cli.running import trilat
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError, NothingSaved, UsageError
 from trilat_net.execution.verify import verify
-from trilat_net.log import log_file
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_writer import McapWriter
 from trilat_net.log.recover import Recovery, recover_log, recovered_path
 
-anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12)
 positions = st.floats(0, 1, exclude_max=True)
 
 
-@pytest.fixture(autouse=True)
-def _unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
-    monkeypatch.setattr(os, "fsync", lambda _: None)
+pytestmark = pytest.mark.usefixtures("unsynced")
 
 
 class Message(NamedTuple):

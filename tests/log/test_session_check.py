@@ -45,8 +45,8 @@ def failed(found: LogCheckResult) -> set[str]:
     return {finding.check for finding in found.findings if not finding.passed}
 
 
-def frames(data: bytes, opcode: int) -> list[RecordFrame]:
-    return [frame for frame in RecordScanner(io.BytesIO(data)).frames() if frame.opcode == opcode]
+def first(opcode: int) -> RecordFrame:
+    return next(frame for frame in RecordScanner(io.BytesIO(DATA)).frames() if frame.opcode == opcode)
 
 
 def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
@@ -55,8 +55,9 @@ def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
     return bytes(changed)
 
 
-def cut_out(data: bytes, frame: RecordFrame) -> bytes:
-    return data[: frame.offset] + data[frame.end :]
+def within(opcode: int, place: int = 0) -> bytes:
+    """The log with a bit flipped in the content of its first record of a kind."""
+    return poked(DATA, first(opcode).offset + RECORD_HEAD_BYTES + place)
 
 
 @pytest.mark.parametrize("data", [WHOLE, DATA, recorded("jitter", {"duration_s": 0.1})])
@@ -67,44 +68,24 @@ def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
     assert {finding.check for finding in found.findings} == BUILT | OURS
 
 
-def first(opcode: int) -> RecordFrame:
-    return frames(DATA, opcode)[0]
-
-
 ZSTD = bytes.fromhex("28b52ffd")
 """How what Zstandard has packed begins."""
-STATISTICS, FOOTER = first(Opcode.STATISTICS), first(Opcode.FOOTER)
-CHUNK, CHUNK_INDEX = first(Opcode.CHUNK), first(Opcode.CHUNK_INDEX)
+CHUNK = first(Opcode.CHUNK)
 WRONG: dict[str, tuple[bytes, set[str]]] = {
     "cut off": (DATA[:-3000], {"whole"}),
     "without its last mark": (DATA[:-8], {"whole"}),
     "more behind the end": (DATA + b"more", {"whole"}),
-    "a byte of a chunk": (poked(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records", "sequence"}),
-    "the checksum of a chunk": (
-        poked(DATA, CHUNK.offset + RECORD_HEAD_BYTES + 24),
-        {"checksums", "sequence"},
-    ),
+    "a byte of a chunk": (poked(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records"}),
+    "the checksum of a chunk": (within(Opcode.CHUNK, 24), {"checksums"}),
     "a byte of the scenario": (poked(DATA, first(Opcode.ATTACHMENT).end - 99), {"checksums"}),
-    "a number in the statistics": (
-        poked(DATA, STATISTICS.offset + RECORD_HEAD_BYTES),
-        {"index", "checksums"},
-    ),
-    "the place of a chunk": (
-        poked(DATA, CHUNK_INDEX.offset + RECORD_HEAD_BYTES + 16),
-        {"index", "checksums"},
-    ),
-    "the length of a chunk": (
-        poked(DATA, CHUNK_INDEX.offset + RECORD_HEAD_BYTES + 24),
-        {"index", "checksums"},
-    ),
-    "the place of metadata": (
-        poked(DATA, first(Opcode.METADATA_INDEX).offset + RECORD_HEAD_BYTES),
-        {"index", "checksums"},
-    ),
-    "where the index begins": (poked(DATA, FOOTER.offset + RECORD_HEAD_BYTES), {"checksums"}),
-    "the checksum of the index": (poked(DATA, FOOTER.end - 1), {"checksums"}),
+    "a number in the statistics": (within(Opcode.STATISTICS), {"index", "checksums"}),
+    "the place of a chunk": (within(Opcode.CHUNK_INDEX, 16), {"index", "checksums"}),
+    "the length of a chunk": (within(Opcode.CHUNK_INDEX, 24), {"index", "checksums"}),
+    "the place of metadata": (within(Opcode.METADATA_INDEX), {"index", "checksums"}),
+    "where the index begins": (within(Opcode.FOOTER), {"checksums"}),
+    "the checksum of the index": (poked(DATA, first(Opcode.FOOTER).end - 1), {"checksums"}),
     "an entry of a message index": (poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1), {"index"}),
-    "the times of a chunk": (poked(DATA, CHUNK.offset + RECORD_HEAD_BYTES + 8), {"index"}),
+    "the times of a chunk": (within(Opcode.CHUNK, 8), {"index"}),
 }
 
 
@@ -113,12 +94,12 @@ def test_what_is_wrong_with_the_file_fails_its_check(kind: str, tmp_path: Path) 
     data, checks = WRONG[kind]
     found = judged(tmp_path, data)
     built = failed(found) & BUILT
-    assert built == checks & BUILT, found.findings
+    assert built == checks, found.findings
     named = [finding for finding in found.findings if finding.check in built]
     assert all(finding.places[0].offset is not None for finding in named)
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(st.integers(0, len(WHOLE) - 1), st.integers(0, 7))
 def test_no_bit_of_a_file_can_be_changed_unseen(place: int, bit: int) -> None:
     """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
