@@ -72,12 +72,8 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
     """
     setup = next(link for link in log.scenario.setup(site).links if link.peer == peer)
     index = log[site].peers.index(peer)
-    ordered = [
-        command.model
-        for commands in log.commands(site).values()
-        for command in commands
-        if command.peer == index and command.model is not None
-    ]
+    commands = (command for batch in log.commands(site).values() for command in batch)
+    ordered = [one.model for one in commands if one.peer == index and one.model is not None]
     models, points = _list_models(setup, ordered)
     due_ns, copies = _schedule(setup, models, points, count)
     alone = models.copy()

@@ -121,10 +121,8 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     stats = log.link_stats(site)[-1:]
     counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
     one_way_us = np.zeros(0, dtype=np.int64)  # none is measured in virtual time
-    if (
-        log.driver == "live"
-        and (_number(log.session.get("schema_version", "")) or 0) >= ONE_WAY_SCHEMA_VERSION
-    ):
+    version = _number(log.session.get("schema_version", "")) or 0
+    if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
         came = log[site].arrivals[1]
         one_way_us = came[came[:, 0] == log[site].peers.index(peer), 2]
     return {

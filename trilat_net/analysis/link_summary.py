@@ -1,10 +1,7 @@
 """Statistics of every directed link: stated and effective delay, loss, bursts and sample counts.
 
-The effective delay is the age of the sample in use at each tick: Delta(t_k) = t_k - u(t_k), where u is the
-stamp of that sample: the "age of information" of Kaul, Yates and Gruteser, "Real-time status: How often
-should one update?", IEEE INFOCOM 2012, at the ticks. docs/definitions.md defines every quantity.
-
-Invariant: a quantity that the log does not determine is None.
+Invariant: a quantity that the log does not determine is None. docs/definitions.md defines each: the effective
+delay is the age of the sample in use at a tick (age of information, Kaul, Yates and Gruteser 2012).
 """
 
 from typing import NamedTuple

@@ -21,18 +21,14 @@ class LyapunovWeights(NamedTuple):
 
     Attributes:
         beta: per site, sum N, so that equal shares give the paper's ones, shape (N,).
-        groups: the closed groups of sites, each a tuple of indices: none in it follows a site outside.
+        groups: the closed groups of sites, each a tuple of indices: none in it follows a site outside. Of one
+            group pi is unique, though some of its entries may be 0.
         scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ in shape.
     """
 
     beta: Array
     groups: tuple[tuple[int, ...], ...]
     scales: Array | None
-
-    @property
-    def unique(self) -> bool:
-        """True if there is one closed group: then pi is unique, though some of its entries may be 0."""
-        return len(self.groups) == 1
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
@@ -57,8 +53,7 @@ def left_perron_vector(alpha: Array) -> Array:
     groups = find_closed_groups(alpha)
     total = sum(map(len, groups))
     for group in groups:
-        own = np.ix_(group, group)
-        pi[list(group)] = perron_vector(alpha[own]) * len(group) / total
+        pi[list(group)] = perron_vector(alpha[np.ix_(group, group)]) * len(group) / total
     return pi
 
 

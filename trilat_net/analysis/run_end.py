@@ -177,11 +177,9 @@ def classify_log_end(log: Log) -> RunEnd:
 def classify_run_end(maxima: Sequence[Array], span_s: float, diverged_at_s: float | None = None) -> RunEnd:
     """Returns the end of a run of `span_s` from the maxima of the buckets of all of its sites, or of some.
 
-    Args:
-        maxima: per site the largest |e|, rad, and |qd|, rad/s, of every bucket since the epoch, shape (K, 2);
-            -1 if a bucket has no record. A site's last one may be incomplete: it enters no trend.
-        span_s: duration of the run, s.
-        diverged_at_s: when the first site left its limits, s.
+    The maxima are per site the largest |e|, rad, and |qd|, rad/s, of every bucket since the epoch, shape
+    (K, 2); -1 if a bucket has no record. A site's last one may be incomplete: it enters no trend. The first
+    site left its limits at `diverged_at_s`.
     """
     end_error_rad, end_speed_rad_s = find_end_maxima(maxima)
     count = max(min(map(len, maxima)) - 1, 0)

@@ -33,14 +33,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "sites": sites,
         "links": {use.name: _describe_link(log, use) for use in summarise_links(log)},
         "changes": [
-            {
-                "at_s": changed.change.at_s,
-                "about": changed.about,
-                "to": changed.text,
-                "site": changed.site,
-                "taken_at_tick": changed.taken_at_tick,
-            }
-            for changed in list_changes(log)
+            {"at_s": one.change.at_s, "about": one.about, "to": one.text}
+            | {"site": one.site, "taken_at_tick": one.taken_at_tick}
+            for one in list_changes(log)
         ],
     }
 
@@ -107,8 +102,7 @@ def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
         "samples": counts._asdict() if counts else None,
         "late_samples": counts.late if counts else None,
         "duplicate_samples": counts.duplicate if counts else None,
-        "loss": use.loss,
-        "burst": use.burst,
+        **{key: getattr(use, key) for key in ("loss", "burst")},
         "one_way_us": use.one_way_us._asdict() if use.one_way_us else None,
         "clock": clock._asdict() if clock else None,
     }

@@ -71,17 +71,9 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far operators moved a site, at the ticks that both logs have.
+    """Returns how far operators moved a site: q of the log minus q of its twin without them, (K, 2), rad.
 
-    Args:
-        log: the log.
-        twin: the same experiment without operators.
-        site: the site.
-
-    Returns:
-        tick: shape (K,).
-        t_s: shape (K,), s.
-        moved: q of the log minus q of the twin, shape (K, 2), rad.
+    Before it stand the ticks that both logs have, and their times, s.
     """
     part, other = log[site], twin[site]
     tick, ours, theirs = np.intersect1d(part.tick, other.tick, assume_unique=True, return_indices=True)

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 import trilat_net
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
@@ -168,3 +170,8 @@ def _certified(name: str, overrides: tuple[tuple[str, Any], ...]) -> Certificate
 def certified(name: str, overrides: Mapping[str, Any] | None = None) -> Certificate:
     """Its certificate."""
     return _certified(name, _frozen(overrides))
+
+
+def relative(balance: EnergyBalance) -> float:
+    """Its largest residual as a share of its largest energy."""
+    return float(np.abs(balance.residual).max()) / max(balance.scale, 1e-12)

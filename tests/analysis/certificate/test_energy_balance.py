@@ -102,13 +102,13 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
 ) -> None:
     b = runs.balanced(name, runs.JITTER if name == "free" else None)
     terms = {**getattr(b, group), term: factor * getattr(b, group)[term]}
-    assert replace(b, **{group: terms}).relative > CAUGHT > 5 * b.relative
+    assert runs.relative(replace(b, **{group: terms})) > CAUGHT > 5 * runs.relative(b)
 
 
 def test_ones_for_beta_is_caught_and_named() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
     ones = compute_energy_balance(runs.booked("asymmetric", {"duration_s": 3.0, "rate_hz": 1000}), ones=True)
-    assert ones.relative > 10 * CAUGHT
+    assert runs.relative(ones) > 10 * CAUGHT
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
@@ -204,5 +204,5 @@ def test_a_closed_group_is_balanced_by_itself() -> None:
     energies = runs.booked("free", {**pair, "duration_s": 3.0, "rate_hz": 500})
     group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
-    assert group.relative <= 1e-4
+    assert runs.relative(group) <= 1e-4
     assert group.transfer == pytest.approx(np.zeros(len(group.t_s)), abs=1e-9 * group.scale)

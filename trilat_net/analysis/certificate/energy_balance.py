@@ -34,11 +34,9 @@ class SiteEnergy:
     """Energies of a site over its K rows and K - 1 periods.
 
     Attributes:
-        motion: what they are computed from.
-        parts: its functional.
-        dissipation: by kind.
+        motion, parts: what they are computed from, and its functional.
+        dissipation, work: by kind, and by source.
         transfer: to the sites that follow it, less what it gets from those that it follows.
-        work: by source.
         sampling: the work of the scheme that samples the continuous law.
         judged: True if a period follows from records alone, shape (K - 1,).
     """
@@ -72,8 +70,8 @@ class SiteEnergy:
     @property
     def begin_s(self) -> float:
         """The first tick at which everything in transit follows from records, s; infinite without one."""
-        views = self.motion.peers
-        seen = [views[peer].seen.known & views[peer].now.known for peer in views if peer in self.followed]
+        followed = [view for peer, view in self.motion.peers.items() if peer in self.followed]
+        seen = [view.seen.known & view.now.known for view in followed]
         rows = np.flatnonzero(np.logical_and.reduce(seen))
         return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
 
@@ -156,10 +154,8 @@ class EnergyBalance:
     Attributes:
         t_s: the ticks, s.
         beta: the weights over time, shape (T, N).
-        sites: per site beta_i V_i.
-        parts: of all sites: kinetic, parameter, position, delay.
-        dissipation: by kind.
-        work: by source.
+        sites, parts: beta_i V_i per site; of all sites by its parts.
+        dissipation, work: by kind, and by source.
         sampling: the work of the scheme; no part of the balance, see `unexplained`.
         transfer: what the weights did not cancel, 0 if they are right.
         judged: True if the period before a tick follows from records alone, shape (T - 1,).
@@ -213,11 +209,6 @@ class EnergyBalance:
     def scale(self) -> float:
         """The energy that residuals are compared with: the largest V, or the largest work if more, J."""
         return max(float(np.abs(x).max()) for x in (self.V, *self.work.values()))
-
-    @property
-    def relative(self) -> float:
-        """Largest residual as a share of the scale; 0 if there is no energy but of rounding."""
-        return float(np.abs(self.residual).max()) / self.scale if self.scale > ZERO_ENERGY_J else 0.0
 
     def _over_judged(self, values: Array) -> Array:
         return _accumulate(np.diff(values), self.judged)

@@ -113,10 +113,7 @@ class SiteMotion:
     """Motion of a site and all that acts on it, over K rows: what its energies are computed from.
 
     Attributes:
-        records: of the site.
-        constants: of the site.
-        dominance: its factors for its peers.
-        peers: these as the site sees them, in the same order.
+        dominance, peers: its factors for its peers, and these as the site sees them, in the same order.
         torque: ON its arm.
         digital: True if the scheme holds tau_k, False if it extrapolates the torque.
     """

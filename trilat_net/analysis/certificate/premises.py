@@ -97,7 +97,7 @@ def _check_dominance(log: Log, energies: Mapping[str, SiteEnergy]) -> Premise:
         return Premise("shares", False, f"the shares of {_list(changing)} change")
     Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(alpha, Kd)
-    if not weights.unique:
+    if len(weights.groups) > 1:
         groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
         return Premise("shares", False, describe_closed_groups(groups))
     outside = [site for n, site in enumerate(names) if n not in weights.groups[0]]
@@ -138,8 +138,8 @@ def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
 def _check_following(log: Log) -> Premise:
     found = {site: find_mode_intervals(log[site]) for site in log.sites}
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
-    text = "every site follows its peers all the time"
-    return Premise("following", not away, f"hold, brake or return: {_list(away)}" if away else text)
+    text = f"hold, brake or return: {_list(away)}" if away else "every site follows its peers all the time"
+    return Premise("following", not away, text)
 
 
 def _check_torque_limits(energies: Mapping[str, SiteEnergy]) -> Premise:

@@ -50,8 +50,6 @@ FALSE_RECORDS_TEXT = "these records were not made by the equations that the log 
 _PERIOD_OR_FALSE = (
     f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
 )
-_OUTSIDE = "does not move as its theta says, or somebody pushes it"
-_TOO_COARSE = "the period is too long for these gains, so that its energies are known only to"
 
 
 class StabilityFinding(StrEnum):
@@ -97,9 +95,7 @@ class Certificate(NamedTuple):
     """Stability certificate of a log.
 
     Attributes:
-        premises: of the theorem.
-        verdict: on V.
-        end: of the run, from e and qd alone.
+        premises, verdict, end: of the theorem, on V, and of the run from e and qd alone.
         energies: of every site; {} without a functional.
         balance: of all sites; None without a functional, or if beta is not unique.
         ones: the same with the paper's weights; None if those are right, or without a balance.
@@ -196,7 +192,8 @@ def _judge_stability(
     tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
     broken = _judge_balance(energies, balance)
     if broken is None and tolerance > COARSE_TOLERANCE_SHARE * balance.scale + 2.0 * ZERO_ENERGY_J:
-        broken = _undecided(f"{_TOO_COARSE} {tolerance:.3g} J of {balance.scale:.4g} J")
+        known = f"its energies are known only to {tolerance:.3g} J of {balance.scale:.4g} J"
+        broken = _undecided(f"the period is too long for these gains, so that {known}")
     if broken is not None:
         return broken._replace(tolerance=tolerance)
     rise = _find_largest_rise(balance, tolerance)
@@ -238,7 +235,8 @@ def _judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -
     text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
     if not ours:
         arms = ", ".join(name for name in energies if name in outside)
-        return _undecided(f"{text}: the arm of {arms}, outside of the program, {_OUTSIDE}")
+        why = f"the arm of {arms}, outside of the program, does not move as its theta says"
+        return _undecided(f"{text}: {why}, or somebody pushes it")
     clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
     certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * balance.scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE

@@ -78,10 +78,9 @@ class LogMetrics(NamedTuple):
     Attributes:
         run, sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first of s).
         estimates: per site with records, its parameter estimates.
-        static_windows: their number.
+        static_windows, stiffness: their number, and the stiffness from one of them to the next.
         joint_loads: the loaded joints in them, with the torques of all loaded sites.
         sharing_ratios: the force sharing of those at which two sites are loaded.
-        stiffness: the stiffness from one of them to the next.
         responses: impedances and reflections over frequency.
     """
 
@@ -261,12 +260,7 @@ class ComparisonRow(NamedTuple):
 
 
 class MetricComparison(NamedTuple):
-    """Runs side by side.
-
-    Attributes:
-        columns: the names of the runs.
-        rows: the quantities that at least one run could have, in the order of the catalogue.
-    """
+    """Runs side by side, by name: the quantities that one could have, in the order of the catalogue."""
 
     columns: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]

@@ -27,8 +27,7 @@ class Metric(NamedTuple):
     """A number, or the reason why there is none.
 
     Attributes:
-        value: the number, finite; None without one.
-        why: the reason; "" with a number.
+        value, why: the number, finite, or None; the reason, or "".
         applies: False if no log of this experiment could have one: then nothing is unknown.
     """
 

@@ -70,12 +70,13 @@ def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
     controller = total(held_work(held_control_torque(records, scenario), q))
     operator = total(trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q))
     walls = total(trapezoid_work(torque.environment_now, q) + held_work(torque.environment_held, q))
+    no_walls = Metric(None, "the scenario has no environment here", applies=False)
     found = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(operator[-1]),
         "hands_most_j": metric(max(0.0, float(operator.max()))),
-        "walls_j": metric(walls[-1]) if spec.environment else NO_WALLS,
-        "walls_most_j": metric(max(0.0, float(walls.max()))) if spec.environment else NO_WALLS,
+        "walls_j": metric(walls[-1]) if spec.environment else no_walls,
+        "walls_most_j": metric(max(0.0, float(walls.max()))) if spec.environment else no_walls,
     }
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
@@ -83,9 +84,6 @@ def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
     change = total(np.diff(mechanical_energy(spec, records)))
     unaccounted = np.abs(change - controller - operator - walls)
     return {**found, "mechanical_j": metric(change[-1]), "unaccounted_j": metric(float(unaccounted.max()))}
-
-
-NO_WALLS = Metric(None, "the scenario has no environment here", applies=False)
 
 
 def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
