@@ -204,8 +204,6 @@ def measure_parameter_error(spec: SiteSpec, records: AlignedRecords | None) -> M
         energy = (0.5 * (off**2 / np.array(gains.Gamma)[rows]).sum(axis=1)).tolist()
     why = "it is no finite number" if gains.law is Law.ADAPTIVE else "the gains of learning are not known"
     for n, end in enumerate(("first", "last")):
-        metrics |= {
-            f"theta_error_{end}": metric(distance[n]),
-            f"theta_energy_{end}_j": metric(energy[n], why),
-        }
+        metrics[f"theta_error_{end}"] = metric(distance[n])
+        metrics[f"theta_energy_{end}_j"] = metric(energy[n], why)
     return metrics
