@@ -23,18 +23,9 @@ CLOCK = ManualClock().identity()
 def told(name: str, boot: int, **facts: object) -> Info:
     """What a member answers when asked who it is; `facts` override."""
     recorder = name == topics.RECORDER
-    return Info(
-        **{
-            "member": name,
-            "boot": boot,
-            "scenario_sha256": "" if recorder else HASH,
-            "scenario": "" if recorder else "the scenario",
-            "host": "h",
-            "clock": CLOCK,
-            "fingerprint": "f",
-            **facts,
-        }
-    )
+    own = {"scenario_sha256": "" if recorder else HASH, "scenario": "" if recorder else "the scenario"}
+    own |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
+    return Info(**{"member": name, "boot": boot, **own, **facts})
 
 
 class Member:

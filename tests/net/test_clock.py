@@ -23,47 +23,26 @@ def clock(request: pytest.FixtureRequest) -> Clock:
     return CLOCKS[request.param]()
 
 
-def test_it_never_goes_back(clock: Clock) -> None:
+def test_it_never_goes_back_and_the_wall_clock_goes_with_it(clock: Clock) -> None:
     readings = [clock.monotonic_ns() for _ in range(100)]
     assert readings == sorted(readings)
+    unix_ns = clock.unix_ns()
+    clock.sleep_until(readings[-1] - 10_000_000_000)  # it has passed: no sleep, and no step back
+    assert clock.monotonic_ns() >= readings[-1]
+    clock.sleep_until(readings[-1] + 5_000_000)
+    assert clock.unix_ns() > unix_ns
 
 
-def test_readings_are_whole_nanoseconds(clock: Clock) -> None:
-    assert type(clock.monotonic_ns()) is int
-    assert type(clock.unix_ns()) is int
-
-
-@pytest.mark.parametrize("ahead_ns", [1, 1_000, 1_000_000, 20_000_000])
+@pytest.mark.parametrize("ahead_ns", [1, 1_000_000])
 def test_sleeping_never_ends_early(clock: Clock, ahead_ns: int) -> None:
     deadline_ns = clock.monotonic_ns() + ahead_ns
     clock.sleep_until(deadline_ns)
     assert clock.monotonic_ns() >= deadline_ns
 
 
-def test_a_deadline_that_has_passed_is_no_sleep_and_no_step_back(clock: Clock) -> None:
-    now_ns = clock.monotonic_ns()
-    clock.sleep_until(now_ns - 10_000_000_000)
-    assert clock.monotonic_ns() >= now_ns
-
-
-def test_both_clocks_move_together(clock: Clock) -> None:
-    mono_ns, unix_ns = clock.monotonic_ns(), clock.unix_ns()
-    clock.sleep_until(mono_ns + 5_000_000)
-    assert clock.unix_ns() > unix_ns
-
-
-def test_the_wall_clock_shows_the_present(clock: Clock) -> None:
-    assert clock.unix_ns() > 1_600_000_000_000_000_000  # after September 2020
-
-
 def test_identity_is_the_same_every_time(clock: Clock) -> None:
     assert clock.identity()
     assert clock.identity() == clock.identity()
-
-
-@pytest.mark.parametrize("kind", [SystemClock, ManualClock])
-def test_equal_identities_are_one_clock(kind: type[SystemClock] | type[ManualClock]) -> None:
-    assert kind().identity() == kind().identity()
 
 
 def test_a_manual_clock_moves_only_by_sleeping() -> None:

@@ -71,23 +71,9 @@ def test_one_epoch_whatever_the_order_of_starts_deaths_and_polls(
     assert announced.boots == epoch.boots
 
 
-@given(st.permutations([*SITES, RECORDER]), st.integers(0, 60))
-def test_any_start_order_with_pauses_agrees(order: list[str], pause: int) -> None:
-    session = Party(SITES)
-    for name in order[:-1]:
-        session.start(name)
-        session.rounds(pause)
-    begun = "start" in session.kinds()
-    assert not begun or order[-1] == RECORDER
-    if not begun:  # else nobody knew of the recorder, and the session began without
-        session.start(order[-1])
-    session.agreed()
-
-
 def test_the_epoch_lies_ahead_of_everybody() -> None:
     session = party(*SITES)
     epoch = session.agreed()
-    assert EPOCH_AHEAD_NS >= 500_000_000
     assert epoch.mono_ns - session.clock.monotonic_ns() >= DECIDE_NS - STEP_NS
 
 
@@ -454,5 +440,4 @@ def test_what_another_version_answers_is_remembered_for_the_error() -> None:
 def test_boots_are_random_64_bit_numbers() -> None:
     boots = {new_boot() for _ in range(1000)}
     assert len(boots) == 1000
-    assert all(0 <= boot < 2**64 for boot in boots)
-    assert max(boots) > 2**60
+    assert 2**60 < max(boots) < 2**64

@@ -55,10 +55,6 @@ WRONG = {
 }
 
 
-def test_there_is_a_wrong_value_for_every_need() -> None:
-    assert set(WRONG) == set(REQUIREMENTS)
-
-
 @pytest.mark.parametrize("path", REQUIREMENTS)
 def test_what_contradicts_a_need_is_refused_with_key_value_and_what_it_must_be(path: str) -> None:
     with pytest.raises(UsageError) as refused:
@@ -233,9 +229,3 @@ def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
             }
         path.write_text(str(settings).replace("True", "true").replace("False", "false"))
         assert read_zenoh_file(path).mode == mode
-
-
-def test_nothing_is_found_that_was_not_named() -> None:
-    settings = make_zenoh_config(["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
-    assert settings["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-    assert settings["transport"]["shared_memory"] == {"enabled": False}

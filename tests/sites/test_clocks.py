@@ -44,7 +44,7 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
 
 
 @pytest.mark.usefixtures("unprepared")
-@pytest.mark.parametrize("names", [("m2",), ("m1", "recorder")])
+@pytest.mark.parametrize("names", [("m2",), pytest.param(("m1", "recorder"), marks=pytest.mark.long)])
 def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Path) -> None:
     skews = {**SKEWS, "m1": (7 * S, 60_000)}
     session, log = run(tmp_path, {name: skews[name] for name in names}, 0.3)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sites.law_watchdog import HICCUP_NS, MOST_NS, SHARE, LawWatchdog, read_thread_usage
+from sites.law_watchdog import HICCUP_NS, MOST_NS, SHARE, LawWatchdog
 from tests.core.sites import setup
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
@@ -112,10 +112,3 @@ def test_a_law_that_does_not_come_back_is_stopped() -> None:
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
     assert signal.getsignal(signal.SIGALRM) is before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
-def test_the_use_of_a_thread_only_grows() -> None:
-    before = read_thread_usage()
-    sum(range(20_000))
-    after = read_thread_usage()
-    assert after >= before
