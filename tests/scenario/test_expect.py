@@ -43,6 +43,7 @@ def test_every_other_key_asks_something_also_where_its_value_is_nothing(keys: di
         ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
         ("late_samples_max", 1.5, ["expect.late_samples_max"]),
         ("end_pose_rad", {"x": [0.0, 0.0]}, ["expect.end_pose_rad.x", "m1, m2, s"]),
+        ("end_pose_rad", {"m1": [0.0, 0.0], "s": [0.0]}, ["expect.end_pose_rad.s: expected list of length"]),
         ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
     ],
 )

@@ -182,6 +182,16 @@ Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
+def _density(x: float) -> float:
+    """The standard normal density."""
+    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
+
+
+def _probability(x: float) -> float:
+    """The standard normal distribution function."""
+    return 0.5 * math.erfc(-x / math.sqrt(2.0))
+
+
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
     """Uniform about a mean.
 
@@ -213,7 +223,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     """Normal, drawn again where it falls below zero.
 
     Attributes:
-        delay_ms: mean of the normal distribution before it is truncated, ms.
+        delay_ms: mean of the normal distribution before it is cut at zero, ms.
         deviation_ms: its standard deviation, ms.
     """
 
@@ -305,26 +315,17 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         return self.floor_ms + above, math.sqrt(square - above * above)
 
 
-class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
-    """Normal, each sample's delay correlated with the one before, cut off at zero.
+class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
+    """Normal, each sample's delay correlated with the one before, cut off at zero instead of drawn again.
 
     Attributes:
-        delay_ms: mean of the normal distribution before it is cut off, ms.
-        deviation_ms: its standard deviation, ms.
         correlation: of a sample's delay with that of the sample before.
     """
 
-    delay_ms: Milliseconds
-    deviation_ms: Deviation
     correlation: Correlation
 
     def _delay(self) -> LinkModel:
-        return LinkModel(
-            kind=DelayKind.AR1,
-            location=1e3 * self.delay_ms,
-            scale=1e3 * self.deviation_ms,
-            weight=self.correlation,
-        )
+        return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
         """Of max(0, x) for a normal x, in a form in which nothing large cancels."""
@@ -333,16 +334,6 @@ class CorrelatedDelay(LinkBase, frozen=True, kw_only=True, tag="ar1"):
         above, below, density = _probability(a), _probability(-a), _density(a)
         variance = above + a * above * a * below + a * density * (below - above) - density * density
         return m * above + s * density, s * math.sqrt(max(variance, 0.0))
-
-
-def _density(x: float) -> float:
-    """The standard normal density."""
-    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
-
-
-def _probability(x: float) -> float:
-    """The standard normal distribution function."""
-    return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):

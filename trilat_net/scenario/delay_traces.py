@@ -63,11 +63,7 @@ def _is_number(cell: str) -> bool:
 
 
 def read_trace(path: Path, link: str) -> str:
-    """Returns the text of the trace in a file.
-
-    Args:
-        path: a table `t_s,delay_ms`, or a log, whose name ends in .mcap.
-        link: the link of a log, as in "m1->s".
+    """Returns the text of the trace in a file: a table `t_s,delay_ms`, or a log's link such as "m1->s".
 
     Raises:
         ScenarioError: the file cannot be read, or holds no trace.

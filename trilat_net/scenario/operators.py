@@ -233,13 +233,9 @@ _SHOWN = 60
 def resolve_operators(
     written: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str
 ) -> list[TomlTable]:
-    """Returns a site's operators or environments, complete.
+    """Returns a site's operators or environments, complete, of the kinds that it may hold.
 
-    Args:
-        written: a list of tables, each with its kind.
-        kinds: the kinds that it may hold.
-        site: the site's own tables, complete but for this.
-        path: its name in errors.
+    `site` is the site's own tables, complete but for this; errors call the list `path`.
     """
     if not isinstance(written, list):
         raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)

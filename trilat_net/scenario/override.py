@@ -119,13 +119,10 @@ def _model(scenario: Scenario, link: str, given: Mapping[str, Any]) -> Any:
 
 
 def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-    """Writes overrides into the tables of a scenario, in place.
+    """Writes overrides into the tables of a scenario as read from TOML, in place.
 
-    Args:
-        tables: as read from TOML.
-        overrides: a mapping from dotted keys, or texts KEY=VALUE whose value is TOML or a bare word. A number
-            means the entry of a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. One that
-            names a kind (a link's model or preset, a law) replaces the table's other keys.
+    A number in a key means the entry of a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. A
+    key that names a kind (a link's model or preset, a law) replaces the table's other keys.
     """
     pairs = parse_overrides(overrides)
     overridden = {key for key, _ in pairs}
@@ -169,8 +166,8 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
     return int(name)
 
 
-def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[tuple[str, Any]]:
-    """Returns overrides as keys and values; a text is `KEY=VALUE` with a TOML value."""
+def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
+    """Returns overrides as keys and values; a text is KEY=VALUE, whose value is TOML or a bare word."""
     if isinstance(overrides, Mapping):
         return list(overrides.items())
     pairs = []

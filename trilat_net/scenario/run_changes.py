@@ -24,13 +24,9 @@ def initial_link_tables(scenario: Scenario) -> LinkTables:
 
 
 def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int) -> Change:
-    """Returns a requested change, complete and checked.
+    """Returns a requested change, complete and checked, that holds from `from_ns` on, ns since the epoch.
 
-    Args:
-        scenario: the experiment.
-        present: every link as it is now.
-        written: `link` or `dominance`, and its new value `to`, as in a scenario's timeline.
-        from_ns: when it takes effect, ns since the epoch.
+    It is written as in a scenario's timeline, upon every link as it is at present.
 
     Raises:
         ScenarioError: there is no such link or site, or the value is not valid.

@@ -50,11 +50,10 @@ def read_template() -> str:
 def load_scenario(
     source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[str] = ()
 ) -> Scenario:
-    """Returns a scenario by the name of a shipped one or by path, with overrides applied.
+    """Returns a scenario by the name of a shipped one or by path, or a scenario with overrides applied.
 
-    Args:
-        source: a shipped name, a path, or a scenario, in which a key of a group applies to all (`override`).
-        overrides: `{"control.Kd": 5}` or `["control.Kd=5"]`.
+    Overrides are `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a group applies to all
+    (`override`).
 
     Raises:
         ScenarioError: the source cannot be read or is not a valid scenario.
@@ -105,13 +104,9 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Returns the scenario that a TOML text describes.
+    """Returns the scenario that a TOML text describes; errors call it `source`.
 
-    Args:
-        text: the TOML text.
-        source: its name in errors.
-        overrides: see `load_scenario`.
-        folder: the folder of the files that it names; None: it may name none.
+    The files that it names are in `folder`; None: it may name none.
 
     Raises:
         ScenarioError: with the path of the offending key.

@@ -4,17 +4,18 @@ Invariant: what a law needs and a scenario does not give (knowledge of the arm, 
 refused before anything runs, with the reason.
 """
 
+import functools
 import math
-import re
+import operator
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 
 from ..core.two_link_arm import is_positive_definite
 from ..errors import ScenarioError
-from .delay_models import ConstantDelay, Link, LinkBase, TraceDelay
+from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .expect import find_expect_problem
 from .fields import TomlTable
 from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
@@ -81,7 +82,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at ")
-        dotted = _dotted_path(resolved, path.strip("`"))
+        dotted = _name_key(resolved, path.strip("`$."))
         raise ScenarioError(_reword(problem, dotted), path=dotted) from None
     for name, site in scenario.sites.items():
         if not is_positive_definite(site.arm.theta):
@@ -171,35 +172,18 @@ def _reword(problem: str, path: str) -> str:
     return problem
 
 
-def _dotted_path(resolved: TomlTable, path: str) -> str:
-    """Returns the dotted path of the first value that `$.sites[...].control.Kp[0]` can mean."""
-    parts = re.findall(r"\.?([^.\[\]]+|\[[^\]]*\])", path.removeprefix("$"))
-    return _follow_path(resolved, [p for p in parts if p], "") or path.removeprefix("$.")
-
-
-def _follow_path(value: Any, parts: list[str], path: str) -> str:
-    """Follows the parts; for `[...]`, any key, takes the entry whose value is not valid."""
-    if not parts:
+def _name_key(resolved: TomlTable, path: str) -> str:
+    """Returns `sites[...].q0_rad[0]` with the first key whose entry alone is refused at that path."""
+    before, any_key, after = path.partition("[...]")
+    if not any_key:
         return path
-    head, rest = parts[0], parts[1:]
-    if head == "[...]":
-        found = ""
-        for key in value:
-            found = _follow_path(value[key], rest, f"{path}.{key}")
-            if found and not _is_valid_entry(path, value[key]):
-                return found
-        return found
-    if head.startswith("["):
-        return _follow_path(value[int(head[1:-1])], rest, f"{path}{head}")
-    if isinstance(value, dict) and head in value:
-        return _follow_path(value[head], rest, f"{path}.{head}" if path else head)
-    return f"{path}.{head}" if path else head
-
-
-def _is_valid_entry(folder: str, entry: Any) -> bool:
-    kind: Any = {"sites": SiteSpec, "links": Link}.get(folder)
-    try:
-        msgspec.convert(entry, kind)
-    except msgspec.ValidationError:
-        return False
-    return True
+    *folders, last = before.split(".")
+    parent = functools.reduce(operator.getitem, folders, resolved)
+    for key, entry in parent[last].items():
+        parent[last] = {key: entry}
+        try:
+            msgspec.convert(resolved, Scenario)
+        except msgspec.ValidationError as error:
+            if str(error).endswith(f"`$.{path}`"):
+                return f"{before}.{key}{after}"
+    return before
