@@ -12,7 +12,7 @@ run. If the machine preempted the thread, the thread's computing time counts ins
 import signal
 import threading
 from collections.abc import Callable
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 from trilat_net.core.site_step import Site
@@ -116,9 +116,7 @@ class LawWatchdog:
             signal.setitimer(signal.ITIMER_REAL, CHECK_S, CHECK_S)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._handler_before is not None:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, self._handler_before)

@@ -55,11 +55,7 @@ def _largest_ratio(scenario: Scenario) -> int:
 
 
 class FusedRun:
-    """A run of all sites of a scenario.
-
-    Args:
-        scenario: the experiment.
-        apart_rad: smallest |e| that counts as not settled, see `settled_s`.
+    """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
     Raises:
         ScenarioError: see `check_fusable`.
@@ -130,11 +126,6 @@ class FusedRun:
     def q(self) -> Array:
         """Joint angles after the last tick, shape (N, 2), rad."""
         return np.array(self._tables.site["q"][:, 0])
-
-    @property
-    def qd(self) -> Array:
-        """Joint velocities after the last tick, shape (N, 2), rad/s."""
-        return np.array(self._tables.site["qd"][:, 0])
 
     @property
     def theta_hat(self) -> Array:

@@ -85,7 +85,8 @@ def check_log_files(sources: Sequence[str]) -> list[CheckLine]:
 def _checks(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None = None
 ) -> Iterator[CheckLine]:
-    recorded = _describe_recorded_sites(log)
+    others = [name for name in log.sites if name not in find_executed_sites(log)]  # of an open-loop rerun
+    recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
     yield _records_line(log)
     yield from (CheckLine("user law", str(law), True) for law in find_user_laws(log.scenario))
     yield _verify_line(result, recorded)
@@ -120,12 +121,6 @@ def _records_line(log: Log) -> CheckLine:
     elif not log.complete:
         text += "; the file was not finished"
     return CheckLine(RECORDS_LABEL, text, not silent and have == want and log.complete)
-
-
-def _describe_recorded_sites(log: Log) -> str:
-    """Names the sites that an open-loop rerun did not execute, with their verb; "" if there are none."""
-    others = [name for name in log.sites if name not in find_executed_sites(log)]
-    return f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
 
 
 def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:

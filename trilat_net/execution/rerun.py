@@ -38,7 +38,7 @@ from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
-from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry
+from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry, describe_accounts
 from .verify import EXECUTED_SITES_KEY, find_executed_sites, find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
@@ -223,9 +223,7 @@ class Rerun:
                 entries.append(_encode_executed([tick for tick in self.ticks if tick.site == name], own))
         for entry in merge(*entries, key=lambda entry: entry.t_ns):
             channels[entry.site].write(entry, writer, epoch_unix_ns)
-        writer.finish(
-            {key: text for each in channels.values() for key, text in each.describe_accounts().items()}
-        )
+        writer.finish(describe_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
         """Writes the rerun as a log with standard channels into a file; `force` lets it replace one.

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, TickInput, TickRecord
+from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, Mode, TickInput, TickRecord
 from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
@@ -23,7 +23,7 @@ from ..scenario import Scenario
 from .difference import RecordDifference, equal_bits, equal_record, find_first_difference
 from .rerun_request import RerunRequest
 from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, read_output
-from .verify import find_last_ticks
+from .verify import PROGRESS_EVERY, find_last_ticks
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
 
@@ -154,17 +154,8 @@ class RerunSite:
         return RerunTick(self.name, output.tick, output.t_ns, output.mode, payload, False, True, None)
 
 
-_PROGRESS_EVERY = 1000
 MEMORY_S = 120
 """Longest time that a computed sample may be under way, s: longer than any queue holds one."""
-
-
-class RerunSample(NamedTuple):
-    """The part of a computed tick that other sites receive."""
-
-    q: list[float]
-    qd: list[float]
-    tau_x: list[float]
 
 
 class RerunExecution:
@@ -177,7 +168,7 @@ class RerunExecution:
     def __init__(self, log: Log, request: RerunRequest) -> None:
         self._log, self._request = log, request
         self._ends = find_last_ticks(log)
-        self._recent: dict[str, dict[int, RerunSample]] = {name: {} for name in request.replaced}
+        self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}
         samples: dict[str, Mapping[int, ReceivedMotion]] = {
             name: log[name].by_tick for name in request.recorded
         }
@@ -225,7 +216,7 @@ class RerunExecution:
             t_ns, _, site = pending.pop(place)
             made = site.advance()
             output, recent = site.output, self._recent[site.name]
-            recent[output.tick] = RerunSample(output.q, output.qd, output.tau_x)
+            recent[output.tick] = Arrival(0, output.tick, output.q, output.qd, 0, output.tau_x)
             if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
                 del recent[next(iter(recent))]
             yield made
@@ -234,7 +225,7 @@ class RerunExecution:
             if not site.done:
                 bisect.insort(pending, (site.t_ns, order[site.name], site))
             done += 1
-            if progress is not None and done % _PROGRESS_EVERY == 0:
+            if progress is not None and done % PROGRESS_EVERY == 0:
                 progress(done, total)
 
     def _is_ready(self, site: RerunSite) -> bool:

@@ -70,7 +70,13 @@ def resolve_rerun_request(
     for name in replace:
         find_site(original, name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
-    _check_arms(original, replaced)
+    for name in [name for name in original.external if name in replaced]:
+        others = [other for other in names if other not in original.external]
+        raise ScenarioError(
+            "is external: how that arm would have moved otherwise is not known; execute other sites"
+            + (f", as in --replace {others[0]}" if others else ""),
+            path=f"sites.{name}.plant",
+        )
     recorded = tuple(name for name in names if name not in replaced)
     for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
         key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
@@ -83,40 +89,19 @@ def resolve_rerun_request(
     return RerunRequest(original, scenario, replaced, recorded, changes, without)
 
 
-def _check_arms(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to execute a site whose arm is external."""
-    for name in original.external:
-        if name in replaced:
-            others = ", ".join(other for other in original.names if other not in original.external)
-            raise ScenarioError(
-                "is external: how that arm would have moved otherwise is not known; execute other sites"
-                + (f", as in --replace {others.split(', ')[0]}" if others else ""),
-                path=f"sites.{name}.plant",
-            )
-
-
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
     """Refuses a key that has no effect in a rerun, or that belongs to a recorded site."""
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
         raise ScenarioError("is nothing that is executed: it has no effect in a rerun", path=key)
     if group == "rate_hz" or rest.endswith(".rate_hz"):
-        if recorded:
-            raise ScenarioError(
-                "cannot change in an open loop: samples come at the ticks of the log; use --closed-loop",
-                path=key,
-            )
-        return
+        return  # `_check_frame` judges what comes of it
     member = rest.partition(".")[0]
     concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(group, "")
     if concerned in recorded:
-        why = f"{concerned} stays as recorded" + (
-            ", and a link belongs to its receiver" if group == "links" else ""
-        )
-        only = ", ".join(replaced)
-        raise ScenarioError(
-            f"has no effect: {why}; only {only} is executed: add --replace {concerned}", path=key
-        )
+        why = f"{concerned} stays as recorded{', and a link belongs to its receiver' * (group == 'links')}"
+        only = f"only {', '.join(replaced)} is executed"
+        raise ScenarioError(f"has no effect: {why}; {only}: add --replace {concerned}", path=key)
 
 
 def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
@@ -132,7 +117,8 @@ def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) 
     for name in original.names if recorded else ():
         if wanted.sites[name].rate_hz != original.sites[name].rate_hz:
             raise ScenarioError(
-                "cannot change in an open loop; use --closed-loop", path=f"sites.{name}.rate_hz"
+                "cannot change in an open loop: samples come at the ticks of the log; use --closed-loop",
+                path=f"sites.{name}.rate_hz",
             )
 
 

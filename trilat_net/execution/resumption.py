@@ -65,12 +65,6 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
 class RecordedInputs(Generic[Change]):
     """Arrivals, changes and resumption of one site, from its records and those of its peers.
 
-    Args:
-        part: the site's records.
-        samples: per site its samples by tick.
-        ends: per site the last tick that it made.
-        changes: per tick the changes that the site took in.
-
     Attributes:
         samples: per peer, in scenario order, its samples by tick.
         ends: per peer the last tick that it made.
@@ -174,7 +168,7 @@ class RecordedInputs(Generic[Change]):
         # a waiting sample was sent within the longest delay there is
         oldest = (states[n].t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
         for tick in range(max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1):
-            listed = self._first_listed[peer].get(tick)
+            listed = self._listed[peer].get(tick)
             if listed is None and tick <= newest:
                 probable.add(tick)
             elif listed is not None and listed < n:
@@ -182,7 +176,7 @@ class RecordedInputs(Generic[Change]):
         return certain, probable
 
     @cached_property
-    def _first_listed(self) -> list[dict[int, int]]:
+    def _listed(self) -> list[dict[int, int]]:
         """Per peer and sample, the first record (by its place) that lists it."""
         listed: list[dict[int, int]] = [{} for _ in self.samples]
         for m, state in enumerate(self._part.states):

@@ -4,7 +4,7 @@ Invariant: messages of older schema versions are written in the present one; a m
 keeps its bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -53,7 +53,7 @@ class SiteChannels:
         self.peers = peers
         self._site, self._boot = site, boot
         self._every = ticks_per_stats(rate_hz)
-        self._keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
+        self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self._mode = Mode.RUN
         self._events = 0
@@ -119,12 +119,14 @@ class SiteChannels:
         """Writes an entry into a log."""
         self.accounts[entry.channel].take(entry.number)
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), LAST_LOG_NS)
-        key = self._keys[entry.channel]
+        key = self.keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
 
-    def describe_accounts(self) -> dict[str, str]:
-        """Returns the accounts of its channels, by topic."""
-        return {
-            f"/{self._keys[channel]}": f"{account.as_text()}, overflowed 0"
-            for channel, account in self.accounts.items()
-        }
+
+def describe_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
+    """Returns the accounts of all channels, by topic."""
+    return {
+        f"/{site.keys[channel]}": f"{account.as_text()}, overflowed 0"
+        for site in sites
+        for channel, account in site.accounts.items()
+    }

@@ -25,7 +25,7 @@ from ..net.loop_stats import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
-from .site_channels import SiteChannels, SiteEntry
+from .site_channels import SiteChannels, SiteEntry, describe_accounts
 from .virtual_network import Network, PromptNetwork
 
 
@@ -189,13 +189,7 @@ def write_virtual_log(
                 if not writer.ended:
                     member.write(member.channels.end(t_ns))
         finally:
-            writer.finish(
-                {
-                    key: text
-                    for member in members.values()
-                    for key, text in member.channels.describe_accounts().items()
-                }
-            )
+            writer.finish(describe_accounts(member.channels for member in members.values()))
     return within
 
 

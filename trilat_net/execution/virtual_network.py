@@ -38,18 +38,15 @@ class PromptNetwork:
 
     def __init__(self, rates: Mapping[str, int]) -> None:
         self._rates = rates
-        self._under_way: dict[str, list[deque[TickRecord]]] = {
-            i: [deque() for j in rates if j != i] for i in rates
-        }
-        self._outgoing = {
-            j: [self._under_way[i][[p for p in rates if p != i].index(j)] for i in rates if i != j]
-            for j in rates
+        self._under_way: dict[str, dict[str, deque[TickRecord]]] = {
+            i: {j: deque() for j in rates if j != i} for i in rates
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
         """See `Network`."""
-        for queue in self._outgoing[sender]:
-            queue.append(output)
+        for receiver, queues in self._under_way.items():
+            if receiver != sender:
+                queues[sender].append(output)
 
     def ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
         """See `Network`: in order of time, always true."""
@@ -59,7 +56,7 @@ class PromptNetwork:
         """See `Network`."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
-        for index, queue in enumerate(self._under_way[receiver]):
+        for index, queue in enumerate(self._under_way[receiver].values()):
             while queue and queue[0].t_ns < now_ns:
                 sample = queue.popleft()
                 latency_us = (now_ns - sample.t_ns) // 1000
@@ -68,12 +65,7 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Samples arrive where a log says that they did; their content comes from the running sites.
-
-    Args:
-        schedule: per site and tick the arrivals, as in a record's `rx`.
-        peers: per site its peers in scenario order.
-    """
+    """Samples arrive where a log says that they did, per site and tick; running sites make their content."""
 
     def __init__(
         self,
@@ -136,12 +128,7 @@ def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[i
 
     At ticks without a record those samples arrive that no record lists and that can have arrived there: after
     they were sent, after the last earlier sample that a record lists, before the first later one, as near as
-    possible to the median delay of their link.
-
-    Args:
-        part: the site's records.
-        rates_hz: per peer the tick rate.
-        ends: per peer the last tick that it made.
+    possible to the median delay of their link. `ends` are the last ticks that the peers made.
 
     Raises:
         LogError: fewer than half of those ticks have a record.

@@ -13,7 +13,6 @@ site publishes at every tick, so the arm receives exactly what the log holds. Wi
 """
 
 from collections.abc import Sequence
-from types import TracebackType
 
 from ..errors import WireError
 from . import topics
@@ -65,9 +64,7 @@ class ArmPort:
     def __enter__(self) -> "ArmPort":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bus.close()
 
     def send(self, q: Sequence[float], qd: Sequence[float]) -> None:

@@ -63,9 +63,7 @@ class Bus(Protocol):
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
         """Returns a function that publishes a payload under a key and drops it rather than wait.
 
-        Args:
-            key: without wildcards.
-            patient: wait for room, some seconds at most: for a sender without ticks that must lose nothing.
+        A patient one waits for room, some seconds at most: for a sender without ticks that must lose nothing.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
@@ -81,12 +79,9 @@ class Bus(Protocol):
         """Returns a ring of the queries of others under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Answers queries under a key at once, in a thread of the bus.
+        """Answers queries under a key at once, in a thread of the bus; None is no answer.
 
-        Args:
-            key: without wildcards.
-            answer: returns the answer to a query's payload, or None for no answer; short, because messages
-                wait meanwhile, and without exceptions.
+        `answer` is short, because messages wait meanwhile, and raises nothing.
         """
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:

@@ -59,12 +59,8 @@ class SkewedClock:
     """Another clock with an offset and a drift: test injection of another machine's clock.
 
     It reads start + offset + (other - start) (1 + drift), where start is the other's reading when this one
-    was made. Its identity states all of it and is unique, so that a reader of a log can undo it.
-
-    Args:
-        clock: the other one; its wall clock stays.
-        offset_ns: offset at the start.
-        drift_ppb: drift, ns/s.
+    was made. Its identity states all of it and is unique, so that a reader of a log can undo it. The wall
+    clock stays; the drift is in ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:

@@ -111,11 +111,7 @@ class MemberQuery:
 
 
 class Membership:
-    """The other members of a session, as one member knows them.
-
-    Args:
-        publisher: the member's own events and identity.
-        sites: the sites of the scenario, in order; empty for a recorder, which learns them.
+    """The other members of a session, as one member knows them; a recorder, without sites, learns these.
 
     Attributes:
         met: identities of the others, by name.
@@ -168,8 +164,7 @@ class Membership:
     def poll(self, *, invited: bool) -> None:
         """Takes answers, repeats the query, and forgets members that are gone.
 
-        Args:
-            invited: whether this member has sent `ready`: then others may begin before it knows.
+        Once this member is invited, has sent `ready`, others may begin before it knows.
 
         Raises:
             SessionError: this member cannot be part of the session.

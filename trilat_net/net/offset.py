@@ -46,17 +46,7 @@ class OffsetLimit(NamedTuple):
 
 
 class OffsetEstimate(NamedTuple):
-    """An offset and its drift at an instant, with their limits.
-
-    Attributes:
-        at_ns: the instant, on the own clock.
-        offset_ns: the other clock minus the own one.
-        drift: its growth, ns/s.
-        low_ns: lower limit of the offset.
-        high_ns: upper limit of the offset.
-        drift_low: lower limit of the drift, ns/s.
-        drift_high: upper limit of the drift, ns/s.
-    """
+    """Another clock minus the own one at an instant of the own, and its growth, ns/s, with their limits."""
 
     at_ns: int
     offset_ns: int

@@ -92,8 +92,6 @@ class RoundTrips:
 
     Attributes:
         rtts_ns: the latest round trips, without the time that the member held them.
-        shortest_ns: the shortest of all.
-        estimator: the limits of its clock's offset.
         latest: the latest estimate, None before the first.
     """
 
@@ -137,11 +135,7 @@ class RoundTrips:
 
 
 class Pinger:
-    """Pings every member of a session; call `poll` again and again.
-
-    Attributes:
-        trips: round trips by the boot of the member.
-    """
+    """Pings every member of a session, by its boot; call `poll` again and again."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, enough: int = PINGS) -> None:
         self.trips: dict[int, RoundTrips] = {}

@@ -24,13 +24,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Pong(Request, frozen=True, kw_only=True):
-    """A member's answer to a ping.
-
-    Attributes:
-        clock: identity of the member's monotonic clock.
-        came_ns: reading of that clock on arrival of the ping.
-        left_ns: its reading when the answer was sent.
-    """
+    """A member's answer to a ping: when that came and the answer left, on a clock of this identity."""
 
     member: str
     boot: U64
@@ -42,11 +36,7 @@ class Pong(Request, frozen=True, kw_only=True):
 class ChangeRequest(Request, frozen=True, kw_only=True):
     """A change requested from a site, as in a scenario's timeline, from the earliest possible tick on.
 
-    Attributes:
-        link: the link to change, as in "m1->s", or "".
-        dominance: the site whose dominance row to change, or "".
-        to: new values of the link or the row.
-        ramp_s: duration of a change of the row, s.
+    It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`.
     """
 
     link: str = ""

@@ -27,13 +27,7 @@ DECIDE_NS = 150_000_000
 
 
 class SessionJoin:
-    """One member's way into a session; call `poll` until it returns the epoch.
-
-    Args:
-        bus: the member's connection, with its subscriptions declared.
-        publisher: the member's own events and identity.
-        sites: the sites of the scenario, in order; empty for a recorder, which learns them.
-    """
+    """The way of a member, whose subscriptions are declared, into a session; call `poll` for the epoch."""
 
     def __init__(
         self, bus: Bus, clock: Clock, session: str, publisher: EventPublisher, sites: Sequence[str]

@@ -43,10 +43,7 @@ class TickSchedule:
     def steer(self, k: int, error_ns: int, drift: float) -> None:
         """Slews towards the leader's schedule from a tick on, at or after the last one it was steered from.
 
-        Args:
-            k: that tick.
-            error_ns: its lateness against the leader's schedule.
-            drift: drift of the leader's clock against the own one, ns/s.
+        The tick is late by `error_ns` against that schedule; `drift`, ns/s, is that of the leader's clock.
         """
         self._base_ns = self.deadline(k)
         self._from_ns = k * NS_PER_S // self._rate_hz
@@ -206,12 +203,7 @@ ClockNotice = dict[str, Any]
 
 
 class SiteTiming:
-    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's.
-
-    Attributes:
-        schedule: deadlines of the own ticks.
-        meters: timing of the links, in scenario order of the peers.
-    """
+    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's."""
 
     def __init__(self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str) -> None:
         self.schedule = TickSchedule(epoch_ns, rate_hz)

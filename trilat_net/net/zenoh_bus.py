@@ -64,15 +64,11 @@ class _ZenohQuery(NamedTuple):
 
 
 class ZenohBus:
-    """A `Bus` over a Zenoh session of its own.
+    """A `Bus` over a Zenoh session of its own, with the settings of a user's file.
 
-    Args:
-        listen: endpoints to listen at, as in "tcp/127.0.0.1:7447".
-        connect: endpoints to connect to, again and again until they answer; a client connects to the first
-            that answers now, and again if it loses it.
-        mode: the Zenoh mode; peers reach those that they connect to, clients and routers all that a router
-            reaches.
-        own: settings of a user's file, as `read_zenoh_file` returns them.
+    It connects again and again until all endpoints answer; a client connects to the first that answers now,
+    and again if it loses it. Peers reach those that they connect to, clients and routers all that a router
+    reaches.
 
     Raises:
         UsageError: an endpoint is malformed, or cannot be listened at.

@@ -144,13 +144,7 @@ _FILES = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/diction
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """A user's Zenoh configuration, checked; made by `check_zenoh_file`.
-
-    Attributes:
-        source: the file.
-        mode: its mode, or "".
-        settings: its settings without mode and endpoints.
-    """
+    """A user's Zenoh configuration, checked: its mode, or "", its endpoints, and its other settings."""
 
     source: str
     mode: str = ""
