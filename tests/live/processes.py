@@ -123,28 +123,27 @@ class Session:
         *self.endpoints, self.recorder_endpoint = find_free_endpoints(len(sites) + 1)
         self.log = stage.folder / "run.mcap"
         self.processes: dict[str, Process] = {}
+        self.before: dict[str, Sequence[str]] = {}  # words before the command of a member
 
-    def site(self, name: str, *more: str, called: str = "", listen: str = "") -> Process:
+    def ways(self, name: str) -> list[str]:
+        """The options by which a member meets the others: each listens, and connects to those before it."""
+        place = self.sites.index(name) if name in self.sites else len(self.sites)
+        own = [*self.endpoints, self.recorder_endpoint][place]
+        return ["--listen", own, *connections(self.endpoints[:place])]
+
+    def site(self, name: str, *more: str, called: str = "") -> Process:
         """Starts a site."""
-        index = self.sites.index(name)
-        process = self._stage.start(
-            called or name,
-            *("site", name, "--scenario", self._scenario, "--session", "t", *self._options),
-            *("--listen", listen or self.endpoints[index], *connections(self.endpoints[:index])),
-            *more,
-        )
-        self.processes[called or name] = process
-        return process
+        words = ("site", name, "--scenario", self._scenario, *self._options)
+        return self._start(name, words, more, called or name)
 
-    def recorder(self, *more: str) -> Process:
-        """Starts the recorder."""
-        process = self._stage.start(
-            "recorder",
-            *("record", "--session", "t", "-o", str(self.log), "--listen", self.recorder_endpoint),
-            *(*connections(self.endpoints), *more),
-        )
-        self.processes["recorder"] = process
-        return process
+    def recorder(self, *more: str, called: str = "recorder", log: Path | None = None) -> Process:
+        """Starts the recorder, or one more of them."""
+        return self._start("recorder", ("record", "-o", str(log or self.log)), more, called)
+
+    def _start(self, name: str, words: Sequence[str], more: Sequence[str], called: str) -> Process:
+        words = (*words, "--session", "t", *self.ways(name), *more)
+        self.processes[called] = self._stage.start(called, *words, before=self.before.get(name, ()))
+        return self.processes[called]
 
     def all(self, *order: str) -> None:
         """Starts every member, in an order."""
@@ -153,6 +152,18 @@ class Session:
                 self.recorder()
             else:
                 self.site(name, "--needs-recorder")
+
+    def ends_well(self) -> None:
+        """Returns once every member has ended, each with 0."""
+        assert self.codes() == dict.fromkeys(self.processes, 0)
+
+    def is_reproduced(self) -> Log:
+        """Runs it to its end; its log, which is whole and executed again, equal to virtual time."""
+        self.ends_well()
+        log = whole(self.log)
+        executed_again(log)
+        equal_to_virtual_time(log)
+        return log
 
     def begun(self) -> None:
         """Returns once every member is in the session."""

@@ -11,7 +11,7 @@ import pytest
 from tests.cli.running import trilat
 from tests.truth import judged, offset_errors
 
-from .processes import Session, Stage, connections, equal_to_virtual_time, executed_again, whole
+from .processes import Session, Stage, connections
 
 PAPER = ("m1", "m2", "s")
 SKEWS = {
@@ -31,10 +31,7 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
         session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
     session.begun()
     seen = trilat("ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder)
-    assert set(session.codes().values()) == {0}
-    log = whole(session.log)
-    executed_again(log)
-    equal_to_virtual_time(log)
+    log = session.is_reproduced()
     for site in PAPER:
         for peer in log.scenario.peers(site):
             samples = judged(log, site, peer)
@@ -58,6 +55,7 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
     }
 
 
+@pytest.mark.long
 def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     waiting = session.site("s")
@@ -68,7 +66,7 @@ def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage
     assert "the same clock" in seen
     assert "between the sites" not in seen
     session.site("m")
-    assert session.codes() == {"s": 0, "m": 0}
+    session.ends_well()
 
 
 def test_a_ping_that_nobody_answers_says_where_it_looked(stage: Stage) -> None:

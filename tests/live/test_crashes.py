@@ -12,7 +12,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.log.recover import recover_log
 
 from .killing import SITES, killed
-from .processes import Session, Stage, connections, executed_again
+from .processes import Session, Stage, executed_again
 from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 
@@ -48,8 +48,7 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
     path = disk.folder / "run.mcap"
     small = stage.start(
         "on a small disk",
-        *("record", "--session", "t", "-o", str(path), "--listen", session.recorder_endpoint),
-        *(word for endpoint in session.endpoints for word in ("--connect", endpoint)),
+        *("record", "--session", "t", "-o", str(path), *session.ways("recorder")),
         before=disk.before,
     )
     for name in SITES:
@@ -57,7 +56,7 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
     assert small.code() == 5
     assert f"error: {path}: the disk is full; the log ends there, finished, with" in small.text()
     assert not disk.seen(path.with_name("run.mcap.active")).exists()
-    assert session.codes() == dict.fromkeys(SITES, 0)
+    session.ends_well()
     with disk.seen(path).open("rb") as stream:
         assert list(make_reader(stream, validate_crcs=True).iter_messages())
     log = open_log(disk.seen(path))
@@ -78,11 +77,7 @@ def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(
     first = session.processes["recorder"]
     first.signal(signal.SIGKILL)
     assert first.code() == -signal.SIGKILL
-    again = stage.start(
-        "recorder again",
-        *("record", "--session", "t", "-o", str(session.log), "--continue"),
-        *("--listen", session.recorder_endpoint, *connections(session.endpoints)),
-    )
+    again = session.recorder("--continue", called="recorder again")
     again.prints("joins the session")
     for name in SITES:
         session.processes[name].signal(signal.SIGINT)

@@ -12,11 +12,10 @@ from trilat_net.log.log_reader import Log
 from trilat_net.net.clock import SystemClock
 
 from .namespaces import Machines, NoNamespaces, bridged, machines, pairs, reaches, starred
-from .processes import BEGUN, Stage, equal_to_virtual_time, executed_again, whole
+from .processes import Session, Stage, connections, executed_again, whole
 
 SITES = ("m1", "m2", "s")
 ALL = (*SITES, "recorder")
-WELL = dict.fromkeys(ALL, 0)
 PORT = "tcp/0.0.0.0:7447"
 CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
 """How far each clock is ahead, s, and by how much it runs faster, ppm."""
@@ -32,40 +31,22 @@ def apart() -> Iterator[Machines]:
         pytest.skip(str(reason))
 
 
-class Session:
-    """Three sites and a recorder, each on its machine.
-
-    Args:
-        stage: where they run.
-        apart: the machines.
-        options: what every site is given.
-    """
+class Apart(Session):
+    """Three sites and a recorder, each on its machine with its clock."""
 
     def __init__(self, stage: Stage, apart: Machines, *options: str) -> None:
-        self._stage, self._apart, self._options = stage, apart, options
-        self.log = stage.folder / "run.mcap"
-        self.processes = {}
+        super().__init__(stage, "paper", SITES, *options)
+        self._apart, self.before = apart, {name: apart.on(name) for name in ALL}
 
-    def start(self, name: str) -> None:
-        offset_s, drift_ppm = CLOCKS[name]
-        clock = ("--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm))
-        if name == "recorder":
-            words = ("record", "--session", "paper", "-o", str(self.log), *self._ways(name, SITES))
-        else:
-            ways = self._ways(name, SITES[: SITES.index(name)])
-            words = ("site", name, "--scenario", "paper", "--needs-recorder", *self._options, *ways)
-        self.processes[name] = self._stage.start(name, *words, *clock, before=self._apart.on(name))
-
-    def _ways(self, name: str, others: tuple[str, ...]) -> tuple[str, ...]:
+    def ways(self, name: str) -> list[str]:
         """How the README says it: through a router, or by who listens where the others reach it."""
+        offset_s, drift_ppm = CLOCKS[name]
+        clock = ["--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm)]
         if name in self._apart.centre:
-            return ("--router", f"tcp/{self._apart.centre[name]}:7447")
-        ends = [f"tcp/{self._apart.address[other]}:7447" for other in others]
+            return [*clock, "--router", f"tcp/{self._apart.centre[name]}:7447"]
+        others = SITES if name == "recorder" else SITES[: SITES.index(name)]
         listen = () if name == "recorder" else ("--listen", PORT)
-        return (*listen, *(word for end in ends for word in ("--connect", end)))
-
-    def codes(self) -> dict[str, int]:
-        return {name: process.code() for name, process in self.processes.items()}
+        return [*clock, *listen, *connections([f"tcp/{self._apart.address[other]}:7447" for other in others])]
 
 
 def clocks_as_injected(log: Log) -> None:
@@ -95,13 +76,9 @@ def clocks_as_injected(log: Log) -> None:
 )
 def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: Stage, apart: Machines) -> None:
     bridged(apart, ALL)
-    session = Session(stage, apart, "--duration", "3")
-    for name in order:
-        session.start(name)
-    assert session.codes() == WELL
-    log = whole(session.log)
-    executed_again(log)
-    equal_to_virtual_time(log)
+    session = Apart(stage, apart, "--duration", "3")
+    session.all(*order)
+    log = session.is_reproduced()
     clocks_as_injected(log)
 
 
@@ -110,21 +87,17 @@ def test_machines_that_cannot_reach_each_other_meet_at_a_router(stage: Stage, ap
     starred(apart, "centre", ALL)
     assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
     assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
-    session = Session(stage, apart, "--duration", "3")
+    session = Apart(stage, apart, "--duration", "3")
     for name in ("m1", "recorder"):
-        session.start(name)
+        session.all(name)
         session.processes[name].prints("no router answers at tcp/10.77.")
     router = stage.start("router", "router", "--listen", PORT, "--until-idle", "1", before=apart.on("centre"))
-    for name in ("s", "m2"):
-        session.start(name)
-    assert session.codes() == WELL
+    session.all("s", "m2")
+    log = session.is_reproduced()
     assert router.code() == 0
     for name in ALL:
-        assert f"router: session paper: {name} is here" in router.text()
-        assert f"router: session paper: {name} has left" in router.text()
-    log = whole(session.log)
-    executed_again(log)
-    equal_to_virtual_time(log)
+        assert f"router: session t: {name} is here" in router.text()
+        assert f"router: session t: {name} has left" in router.text()
     clocks_as_injected(log)
 
 
@@ -158,11 +131,9 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
     One direction measures, the other delays by 200 ms.
     """
     bridged(apart, ALL)
-    session = Session(stage, apart, "--duration", "13", "--set", 'links.m2->m1.model="measured"')
-    for name in ALL:
-        session.start(name)
-    for name in SITES:
-        session.processes[name].prints(BEGUN)
+    session = Apart(stage, apart, "--duration", "13", "--set", 'links.m2->m1.model="measured"')
+    session.all()
+    session.begun()
     clock = SystemClock()
     begun_ns = clock.monotonic_ns()
     for begins_s, ends_s in ((1.0, 2.1), (5.0, 10.7)):
@@ -170,7 +141,7 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
         apart.part("m1", "m2")
         clock.sleep_until(begun_ns + round(ends_s * 1e9))
         apart.mend("m1", "m2")
-    assert session.codes() == WELL
+    session.ends_well()
     log = whole(session.log)
     executed_again(log)
     fed = compare_with_virtual(log).fed

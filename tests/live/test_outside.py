@@ -19,7 +19,9 @@ from tests.laws import Adaptive
 class Law(Adaptive):
     def torque(self, now):
         if now.k > 400:
-            time.sleep(0.02)
+            begun_s = time.thread_time()
+            while time.thread_time() - begun_s < 0.02:
+                pass  # it computes
         return super().torque(now)
 """
 
@@ -51,7 +53,7 @@ def test_a_law_that_is_too_slow_ends_the_session_in_order(
 
 def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -> None:
     """One of them with a law that is none of ours either."""
-    options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "3")
+    options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "2")
     options = (*options, "--set", "sites.m1.control.law=tests.laws:Adaptive")
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
     session.all()
@@ -66,8 +68,8 @@ def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -
         check=True,
     )
     assert done.stdout.startswith("over: the arm is at ")
-    assert session.codes() == dict.fromkeys(("recorder", "m1", "m2", "s"), 0)
+    session.ends_well()
     log = whole(session.log)
     executed_again(log)
-    assert compare_with_virtual(log).fed.identical == 9000
+    assert compare_with_virtual(log).fed.identical == 6000
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations

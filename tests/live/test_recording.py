@@ -10,16 +10,9 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
+from trilat_net.net.connection import find_free_endpoints
 
-from .processes import (
-    Process,
-    Session,
-    Stage,
-    connections,
-    equal_to_virtual_time,
-    executed_again,
-    whole,
-)
+from .processes import Process, Session, Stage, executed_again
 
 S = 1_000_000_000
 
@@ -29,11 +22,10 @@ def pause(for_ns: int) -> None:
     clock.sleep_until(clock.monotonic_ns() + for_ns)
 
 
-def another_recorder(stage: Stage, session: Session, log: Path) -> Process:
+def one_more(session: Session, log: Path) -> Process:
     """One more recorder of a session, with a file of its own, once it is in."""
-    recorder = stage.start(
-        log.stem, "record", "--session", "t", "-o", str(log), *connections(session.endpoints)
-    )
+    session.recorder_endpoint = find_free_endpoints(1)[0]
+    recorder = session.recorder(called=log.stem, log=log)
     recorder.prints("joins the session")
     return recorder
 
@@ -70,10 +62,7 @@ def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_e
     recorder.signal(signal.SIGSTOP)
     pause(4 * S)
     recorder.signal(signal.SIGCONT)
-    assert session.codes() == {"recorder": 0, "m": 0, "s": 0}
-    log = whole(session.log)
-    executed_again(log)
-    equal_to_virtual_time(log)
+    session.is_reproduced()
     assert recorder.text().count(" from its memory") == 2
 
 
@@ -84,7 +73,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_
     killed = session.processes["recorder"]
     killed.signal(signal.SIGKILL)
     until(killed.ended, 10.0)
-    later = another_recorder(stage, session, stage.folder / "later.mcap")
+    later = one_more(session, stage.folder / "later.mcap")
     assert interrupted(session) == {"m": 130, "s": 130}
     assert later.code() == 0
     log = from_the_start(stage.folder / "later.mcap")
@@ -102,7 +91,7 @@ def test_two_recorders_at_once_have_the_same_records(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
     session.all()
     session.begun()
-    twin = another_recorder(stage, session, stage.folder / "twin.mcap")
+    twin = one_more(session, stage.folder / "twin.mcap")
     assert interrupted(session) == {"m": 130, "s": 130}
     assert (session.processes["recorder"].code(), twin.code()) == (0, 0)
     logs = [from_the_start(path) for path in (session.log, stage.folder / "twin.mcap")]
