@@ -6,7 +6,6 @@ from pathlib import Path
 import msgpack
 import msgspec
 import pytest
-from mcap.reader import make_reader
 
 from recorder import inbound_queue as tap_module
 from recorder.record_process import Recorder
@@ -14,7 +13,6 @@ from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
-from trilat_net.errors import UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
@@ -28,6 +26,7 @@ from .desk import (
     BOOTS,
     EPOCH,
     MONO_NS,
+    MS,
     SCENARIO,
     SESSION,
     TICKS,
@@ -41,72 +40,53 @@ from .desk import (
 )
 
 
-def test_payloads_stand_in_the_file_byte_for_byte() -> None:
-    desk = Desk()
-    desk.whole("m", "s")
-    desk.take("m", topics.LINK, statistics("m"))
-    desk.log()
-    written: dict[str, list[bytes]] = {}
-    for _, channel, message in make_reader(io.BytesIO(desk.stream.getvalue())).iter_messages():
-        written.setdefault(channel.topic, []).append(message.data)
-    assert written["/trilat/t/m/state"] == states("m")
-    assert written["/trilat/t/s/state"] == states("s")
-    assert written["/trilat/t/m/link"] == [statistics("m")]
-    assert written["/trilat/t/s/event"] == [end("s")]
+def after_the_end() -> bytes:
+    site = Site(SCENARIO.setup("m"))
+    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=TICKS), [], 0, 0)
 
 
-def test_log_time_is_arrival_and_publish_time_is_nominal() -> None:
-    desk = Desk()
-    desk.take("m", topics.STATE, *states("m"))
-    desk.log()
-    messages = [m for _, _, m in make_reader(io.BytesIO(desk.stream.getvalue())).iter_messages()]
-    assert [m.log_time - UNIX_NS for m in messages] == [1_000_000 * (k + 1) for k in range(TICKS)]
-    assert [m.publish_time - UNIX_NS for m in messages] == [1_000_000 * k for k in range(TICKS)]
-    assert [m.sequence for m in messages] == list(range(TICKS))
-
-
-def test_what_was_recorded_can_be_executed_again() -> None:
-    desk = Desk()
-    desk.whole("m", "s")
-    log = desk.log()
-    assert log.complete
-    assert (log.driver, log.session["session"]) == ("live", SESSION)
-    verdict = verify(log)
-    assert (verdict.identical, verdict.records) == (2 * TICKS, 2 * TICKS)
-
-
-STRANGERS = {
-    "another start of the site": ("m", topics.STATE, states("m", boot=99)[3]),
-    "another site's record": ("m", topics.STATE, states("s")[3]),
-    "an unknown site": ("nobody", topics.STATE, states("m")[3]),
-    "an unknown member's event": ("nobody", topics.EVENT, end("m")),
-    "an end of another start": ("m", topics.EVENT, end("m", boot=99)),
-    "an end in the recorder's name": (topics.RECORDER, topics.EVENT, end("m")),
-    "another site's statistics": ("m", topics.LINK, statistics("s")),
+OTHERS_WORD = encode(Event(member=topics.RECORDER, boot=99, n=0, kind="stored", text=""))
+REFUSED = {
+    "another start of the site": ("stranger", "m", topics.STATE, states("m", boot=99)[3]),
+    "another site's record": ("stranger", "m", topics.STATE, states("s")[3]),
+    "an unknown site": ("stranger", "nobody", topics.STATE, states("m")[3]),
+    "an unknown member's event": ("stranger", "nobody", topics.EVENT, end("m")),
+    "an end of another start": ("stranger", "m", topics.EVENT, end("m", boot=99)),
+    "an end in the recorder's name": ("stranger", topics.RECORDER, topics.EVENT, end("m")),
+    "another site's statistics": ("stranger", "m", topics.LINK, statistics("s")),
+    "a word of another recorder": ("another recorder", topics.RECORDER, topics.EVENT, OTHERS_WORD),
+    "a record after the end": ("out of range", "m", topics.STATE, after_the_end()),
+    "statistics after the end": ("out of range", "m", topics.LINK, statistics("m", 100)),
+    "an end after the end": ("out of range", "m", topics.EVENT, end("m", TICKS + 1)),
+    "an end before the beginning": ("out of range", "m", topics.EVENT, end("m", -1)),
+    "nothing": ("malformed", "m", topics.STATE, b""),
+    "no message": ("malformed", "m", topics.LINK, b"\xc1"),
+    "no fields": ("malformed", "m", topics.EVENT, b"\x80"),
+    "too much": ("oversized", "m", topics.EVENT, bytes(70_000)),
 }
 
 
-@pytest.mark.parametrize(("name", "channel", "payload"), STRANGERS.values(), ids=STRANGERS.keys())
-def test_strangers_are_counted_and_dropped(name: str, channel: str, payload: bytes) -> None:
+@pytest.mark.parametrize(("reason", "name", "channel", "payload"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_does_not_belong_is_counted_and_dropped_and_the_rest_is_written_byte_for_byte(
+    reason: str, name: str, channel: str, payload: bytes
+) -> None:
     desk = Desk()
     desk.take(name, channel, payload)
-    assert desk.recording.dropped == {"stranger": 1}
+    assert desk.recording.dropped == {reason: 1}
     assert desk.stored() == []
-    desk.whole("m", "s")
-    log = desk.log()
-    assert verify(log).identical == 2 * TICKS
-    assert log.accounts["dropped: stranger"] == "1"
-
-
-@pytest.mark.parametrize("channel", [topics.STATE, topics.LINK, topics.EVENT])
-def test_malformed_payloads_are_counted_and_dropped(channel: str) -> None:
-    desk = Desk()
-    desk.take("m", channel, b"", b"\xc1", b"\x80", bytes(70_000))
-    desk.whole("m", "s")
-    assert desk.recording.dropped == {"malformed": 3, "oversized": 1}
-    accounts = desk.log().accounts
-    assert (accounts["dropped: malformed"], accounts["dropped: oversized"]) == ("3", "1")
+    assert not desk.over()
+    desk.whole("m")
+    assert not desk.over()
+    desk.whole("s")
+    assert desk.over()
     assert desk.recording.problem() is None
+    written = [message for topic, message in desk.messages() if topic == "m/state"]
+    log = open_log(io.BytesIO(desk.stream.getvalue()))
+    assert verify(log).identical == 2 * TICKS
+    assert (log.complete, log.driver, log.session["session"]) == (True, "live", SESSION)
+    assert log.accounts[f"dropped: {reason}"] == "1"
+    assert [message.data for message in written] == states("m")
+    assert [message.publish_time - UNIX_NS for message in written] == [MS * k for k in range(TICKS)]
 
 
 @pytest.mark.parametrize("t_ns", [-(2**63), 2**64 - 1])
@@ -118,14 +98,6 @@ def test_no_time_stamp_of_any_size_ends_the_recording(kind: str, t_ns: int) -> N
     desk.take("m", kind, msgpack.packb({**fields, "t_ns": t_ns}))
     desk.whole("s")
     assert len(desk.log()["s"]) == TICKS
-
-
-def test_duplicates_are_written_once_and_counted() -> None:
-    desk = Desk()
-    desk.take("m", topics.STATE, *states("m"), *states("m")[:7])
-    log = desk.log()
-    assert len(log["m"]) == TICKS
-    assert "duplicate 7" in log.account("m")
 
 
 def test_gaps_are_counted_named_and_a_problem() -> None:
@@ -141,18 +113,6 @@ def test_gaps_are_counted_named_and_a_problem() -> None:
     assert "largest gap 3" in log.account("m")
     assert f"(10-12 30-30 {TICKS - 2}-{TICKS - 1})" in log.account("m")
     assert any("m: 44 of 50 records, 6 missing" in line for line in desk.recording.summary())
-
-
-def test_reordered_records_are_no_gap() -> None:
-    desk = Desk()
-    records = states("m")
-    desk.take("m", topics.STATE, *records[:5], records[6], records[5], *records[7:])
-    desk.take("m", topics.LINK, statistics("m"))
-    desk.take("m", topics.EVENT, end("m"))
-    desk.whole("s")
-    assert desk.stored() == [("m", TICKS), ("s", TICKS)]
-    assert desk.recording.problem() is None
-    assert verify(desk.log()).identical == 2 * TICKS
 
 
 def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,16 +140,6 @@ def test_stored_is_said_only_when_every_record_is_in() -> None:
     desk.write()
     assert desk.stored() == []
     assert [e.about for e in desk.log().events if e.kind == "stored"] == ["m"]
-
-
-def test_a_recording_is_over_when_every_site_has_ended_with_all_its_records() -> None:
-    desk = Desk()
-    assert not desk.over()
-    desk.whole("m")
-    assert not desk.over()
-    desk.whole("s")
-    assert desk.over()
-    assert desk.recording.problem() is None
 
 
 def alive(name: str, boot: int | str) -> str:
@@ -325,41 +275,12 @@ def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) 
     assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256
 
 
-def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(b"precious")
-    with pytest.raises(UsageError, match=r"run\.mcap: exists; choose another name"):
-        recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
-    assert (tmp_path / "run.mcap").read_bytes() == b"precious"
-
-
-def after_the_end() -> bytes:
-    site = Site(SCENARIO.setup("m"))
-    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=TICKS), [], 0, 0)
-
-
 OUT_OF_RANGE = {
     "a record after the end": ("state", after_the_end()),
     "statistics after the end": ("link", statistics("m", 100)),
     "an end after the end": ("event", end("m", TICKS + 1)),
     "an end before the beginning": ("event", end("m", -1)),
 }
-
-
-@pytest.mark.parametrize(("channel", "payload"), OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
-def test_what_cannot_be_of_this_session_opens_no_gap(channel: str, payload: bytes) -> None:
-    desk = Desk()
-    desk.take("m", channel, payload)
-    assert desk.recording.dropped == {"out of range": 1}
-    desk.whole("m", "s")
-    assert desk.recording.problem() is None
-
-
-def test_what_another_recorder_says_is_none_of_ours_and_named() -> None:
-    desk = Desk()
-    other = encode(Event(member=topics.RECORDER, boot=99, n=0, kind="stored", text=""))
-    desk.take(topics.RECORDER, topics.EVENT, other)
-    assert desk.recording.dropped == {"another recorder": 1}
-    assert "recorder/event" not in desk.written()
 
 
 def test_what_it_says_itself_stands_in_its_log_from_its_first_word() -> None:

@@ -6,7 +6,7 @@ from trilat_net.net.messages import RecorderStats
 from trilat_net.net.wire import MAX_BYTES, decode, encode
 from trilat_net.scenario import load_scenario
 
-from .desk import MS, SESSION, TICKS, Desk, Memory, S, end, states, statistics
+from .desk import MS, SESSION, TICKS, Desk, Memory, S, states, statistics
 
 
 def heard(desk: Desk) -> list[RecorderStats]:
@@ -86,13 +86,3 @@ def test_it_fits_a_message_however_much_is_missing() -> None:
     (stats,) = heard(desk)
     assert sum(map(len, stats.gaps.values())) <= 600
     assert len(encode(stats)) < MAX_BYTES
-
-
-def test_a_whole_run_is_whole_in_its_last_words() -> None:
-    desk = Desk()
-    desk.whole("m", "s")
-    desk.take("m", topics.EVENT, end("m"))
-    desk.report.publish()
-    (stats,) = heard(desk)
-    assert set(stats.missing.values()) == {0}
-    assert stats.gaps == {}

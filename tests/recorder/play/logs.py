@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from mcap.reader import make_reader
 
+from recorder.play.batch import MessageBatch
+from recorder.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.messages import Event
@@ -54,3 +57,10 @@ def write(path: Path, messages: Iterable[tuple[str, int, int, int]], session: st
             writer.add(key, event(site, n), sent_ms * 1_000_000, came_ns, n)
         writer.finish({})
     return path
+
+
+def loaded(*paths: Path, **selection: Any) -> tuple[SessionHeader, MessageBatch]:
+    """What is preloaded of files."""
+    header, batch = preload_messages(paths, PlaySelection(**selection), 1 << 28)
+    assert batch is not None
+    return header, batch

@@ -15,9 +15,8 @@ from recorder.play.session_reader import PlayedMessage, PlaySelection, SessionHe
 from tests.net.waiting import until
 from trilat_net.errors import LogError, RuntimeFault
 
-from .logs import write
+from .logs import loaded, write
 
-LARGE = 1 << 28
 Message = tuple[int, int, int, bytes]
 
 
@@ -99,11 +98,10 @@ def rounds(source: MessageSource, count: int) -> Iterator[list[Message]]:
 
 
 def test_a_process_of_its_own_gives_round_after_round_what_would_have_been_loaded(log_file: Path) -> None:
-    loaded, block = preload_messages([log_file], PlaySelection(), LARGE)
-    assert block is not None
+    preloaded, block = loaded(log_file)
     with reading(log_file, loop=True) as (source, header):
         assert list(rounds(source, 3)) == [list(block.messages())] * 3
-        assert header.topics == loaded.topics
+        assert header.topics == preloaded.topics
         assert (source.strays, header.torn) == (0, {})
 
 

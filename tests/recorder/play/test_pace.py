@@ -91,7 +91,3 @@ def test_what_is_very_late_is_still_known_at_its_worst() -> None:
         3 * LATENESS_LIMIT_US,
         3 * LATENESS_LIMIT_US,
     )
-
-
-def test_where_nothing_was_published_nothing_was_late() -> None:
-    assert LatenessHistogram().summary() is None

@@ -66,15 +66,13 @@ class Hall:
         return self.watcher.ask(topics.key(self.options.session, member, channel), payload)
 
     def play(self) -> PlaybackSummary:
-        facts, block = preload_messages([self.log], self.selection, 1 << 28)
-        assert block is not None
-        self.facts = facts
+        self.facts, block = preload_messages([self.log], self.selection, 1 << 28)
         bus = self.network.join()
         replay = Playback(
             bus,
             self.clock,
-            facts,
-            MessageSource(facts, block),
+            self.facts,
+            MessageSource(self.facts, block),
             self.options,
             lambda: self.count >= self.stop_at,
             lambda _: None,

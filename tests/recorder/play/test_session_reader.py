@@ -12,7 +12,7 @@ from trilat_net.errors import LogError, UsageError
 from trilat_net.execution.virtual import virtual_boot
 from trilat_net.log.log_layout import ChannelFilter
 
-from .logs import BOOT, event, payloads, write
+from .logs import BOOT, event, loaded, payloads, write
 
 TmpFactory = pytest.TempPathFactory
 GOLDEN = Path(test_golden.__file__).parent
@@ -20,8 +20,7 @@ LARGE = 1 << 28
 
 
 def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -> None:
-    facts, block = preload_messages([log_file], PlaySelection(), LARGE)
-    assert block is not None
+    facts, block = loaded(log_file)
     played: dict[str, list[bytes]] = {topic: [] for topic in facts.topics}
     for _, channel, _, payload in block.messages():
         played[facts.topics[channel]].append(payload)
@@ -33,8 +32,7 @@ def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -
 
 
 def test_numbers_are_ticks_of_records_and_places_of_the_rest(log_file: Path) -> None:
-    facts, block = preload_messages([log_file], PlaySelection(), LARGE)
-    assert block is not None
+    facts, block = loaded(log_file)
     for channel, topic in enumerate(facts.topics):
         numbers = block.numbers[block.channels == channel].tolist()
         assert numbers == list(range(len(numbers))), topic
@@ -43,8 +41,7 @@ def test_numbers_are_ticks_of_records_and_places_of_the_rest(log_file: Path) -> 
 @pytest.mark.parametrize("version", [1, 2])
 def test_logs_of_older_versions_are_read_too(version: int) -> None:
     path = GOLDEN / f"v{version}.mcap"
-    facts, block = preload_messages([path], PlaySelection(), LARGE)
-    assert block is not None
+    facts, block = loaded(path)
     assert facts.version == version
     assert set(facts.boots) == {"m1", "m2", "s"}
     read = sorted(payload for _, _, _, payload in block.messages())
@@ -59,8 +56,7 @@ def test_a_window_is_read_and_nothing_else(
     if not path.exists():
         write(path, [("m1", n, n, n) for n in range(300)])
     start_ns, stop_ns = start_ms * 1_000_000, (start_ms + length_ms) * 1_000_000
-    _, block = preload_messages([path], PlaySelection(start_ns=start_ns, stop_ns=stop_ns), LARGE)
-    assert block is not None
+    _, block = loaded(path, start_ns=start_ns, stop_ns=stop_ns)
     first, last = max(0, start_ms), min(299, start_ms + length_ms)
     assert block.numbers.tolist() == list(range(first, last + 1))
 
@@ -68,16 +64,14 @@ def test_a_window_is_read_and_nothing_else(
 def test_times_are_those_of_sending_or_of_coming(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", [("m1", 0, -20, 5), ("s", 0, 1, 6), ("m1", 1, 3, 90)])
     for time, expected in (("publish", [-20, 1, 3]), ("log", [5, 6, 90])):
-        _, block = preload_messages([path], PlaySelection(time=time), LARGE)  # type: ignore[arg-type]
-        assert block is not None
+        _, block = loaded(path, time=time)
         assert block.times_ns.tolist() == [t * 1_000_000 for t in expected]
 
 
 def test_parts_of_one_session_are_one_log_and_other_sessions_are_refused(tmp_path: Path) -> None:
     one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
     two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
-    facts, block = preload_messages([one, two], PlaySelection(), LARGE)
-    assert block is not None
+    facts, block = loaded(one, two)
     assert [payload for _, _, _, payload in block.messages()] == [event("m1", n) for n in range(4)]
     assert facts.boots == {"m1": BOOT}
     other = write(tmp_path / "3.mcap", [("m1", 0, 0, 0)], "other")
@@ -88,8 +82,7 @@ def test_parts_of_one_session_are_one_log_and_other_sessions_are_refused(tmp_pat
 def test_a_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Path) -> None:
     path = tmp_path / "torn.mcap"
     path.write_bytes(short_log[: len(short_log) * 95 // 100])
-    facts, block = preload_messages([path], PlaySelection(), LARGE)
-    assert block is not None
+    facts, block = loaded(path)
     assert len(block) > 100
     assert facts.torn == {path: "the file was not finished"}
 
@@ -125,8 +118,7 @@ def test_where_nothing_is_to_be_played_it_is_said_what_there_is(
 
 def test_a_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)])
-    _, block = preload_messages([path], PlaySelection(), LARGE)
-    assert block is not None
+    _, block = loaded(path)
     assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]
 
 
