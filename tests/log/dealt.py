@@ -2,26 +2,43 @@
 
 import io
 from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
 
 import msgpack
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-Message = tuple[str, bytes, int, int, int]
-"""Topic, payload, log time, publish time, sequence."""
+
+class Message(NamedTuple):
+    topic: str
+    payload: bytes
+    log_ns: int
+    publish_ns: int
+    sequence: int
 
 
 def messages(data: bytes) -> list[Message]:
-    reader = make_reader(io.BytesIO(data))
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
     return [
-        (channel.topic, m.data, m.log_time, m.publish_time, m.sequence)
+        Message(channel.topic, m.data, m.log_time, m.publish_time, m.sequence)
         for _, channel, m in reader.iter_messages(log_time_order=False)
     ]
 
 
 def changed(message: Message, **fields: object) -> Message:
-    topic, payload, *rest = message
-    return (topic, msgpack.packb({**msgpack.unpackb(payload), **fields}), *rest)
+    return message._replace(payload=msgpack.packb({**msgpack.unpackb(message.payload), **fields}))
+
+
+def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
+    """A file of another program, with these messages on one channel."""
+    stream = io.BytesIO()
+    writer = Writer(stream, **options)
+    writer.start()
+    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    for n, payload in enumerate(payloads):
+        writer.add_message(channel, n, payload, n, n)
+    writer.finish()
+    return stream.getvalue()
 
 
 def a_file(

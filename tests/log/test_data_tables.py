@@ -6,7 +6,6 @@ from functools import cache
 
 import msgspec
 import numpy as np
-import polars as pl
 import pytest
 
 from tests.analysis import logs
@@ -191,13 +190,6 @@ def test_a_frame_is_its_table(name: str, kind: str) -> None:
         assert frame[column.name].to_list() == column.rows(0, len(table))
 
 
-def test_columns_are_of_their_kinds() -> None:
-    schema = opened(recorded("paper")).frame("m1").schema
-    assert schema["mode"] == pl.String
-    assert (schema["tick"], schema["log_time_ns"], schema["used_s_tick"]) == (pl.Int64,) * 3
-    assert (schema["t_s"], schema["q1_rad"], schema["age_s_ms"]) == (pl.Float64,) * 3
-
-
 def test_without_polars_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "polars", None)
     with pytest.raises(UsageError, match=r"data frames need polars: pip install 'trilat-net\[frames\]'"):
@@ -217,11 +209,3 @@ def test_every_field_has_a_meaning_and_the_unit_in_which_its_name_ends(kind: typ
         assert json_type in ("integer", "string", "array", "object")
         if ending := ENDINGS.get(field.rpartition("_")[2]):
             assert unit == ending, field
-
-
-def test_units_are_the_schemas() -> None:
-    said = read_field_docs(State)
-    assert [said[field].unit for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x")] == [
-        "rad", "rad/s", "rad", "rad/s", "N m", "N m",
-    ]  # fmt: skip
-    assert said["q_des"].text == "reference, Eq. (6)"

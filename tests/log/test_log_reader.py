@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from tests.log.dealt import foreign
 from tests.log_editing import edited, opened, recorded
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
@@ -195,14 +196,8 @@ def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
 
 
 def test_an_mcap_file_of_others_is_refused() -> None:
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    schema = writer.register_schema("s", "jsonschema", b"{}")
-    writer.add_message(writer.register_channel("/t", "json", schema), 1, b"{}", 1)
-    writer.finish()
     with pytest.raises(LogError, match=r"no log of trilat-net"):
-        opened(stream.getvalue())
+        opened(foreign())
 
 
 def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:

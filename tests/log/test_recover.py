@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import zstandard
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -19,12 +18,14 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tests.cli.running import trilat
-from tests.log_editing import edited, recorded, without
+from tests.log.dealt import Message, foreign, messages
+from tests.log.hostility import chunk as packed_chunk
+from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError, NothingSaved, UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.mcap_writer import McapWriter
+from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.recover import Recovery, recover_log, recovered_path
 
 anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12)
@@ -34,28 +35,12 @@ positions = st.floats(0, 1, exclude_max=True)
 pytestmark = pytest.mark.usefixtures("unsynced")
 
 
-class Message(NamedTuple):
-    topic: str
-    log_time: int
-    publish_time: int
-    sequence: int
-    data: bytes
-
-
 class Chunk(NamedTuple):
     """A chunk of a whole file: where it lies, and its messages."""
 
     begin: int
     end: int
     messages: list[Message]
-
-
-def messages(data: bytes) -> list[Message]:
-    reader = make_reader(io.BytesIO(data), validate_crcs=True)
-    return [
-        Message(c.topic, m.log_time, m.publish_time, m.sequence, m.data)
-        for _, c, m in reader.iter_messages(log_time_order=False)
-    ]
 
 
 def chunks(data: bytes) -> list[Chunk]:
@@ -79,34 +64,14 @@ def chunks(data: bytes) -> list[Chunk]:
 @cache
 def log() -> bytes:
     """A log of twenty chunks, as it is written today."""
-    data = recorded("paper")
-    reader = make_reader(io.BytesIO(data))
-    stream = io.BytesIO()
-    file = McapWriter(stream, "lib", chunk_bytes=8000)
-    channels: dict[str, int] = {}
-    schemas: dict[str, int] = {}
-    for entry in reader.iter_metadata():
-        if entry.name == "trilat.session":
-            file.add_metadata(entry.name, entry.metadata)
-    for attachment in reader.iter_attachments():
-        file.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
-    summary = reader.get_summary()
-    assert summary is not None
-    for schema in summary.schemas.values():
-        schemas[schema.name] = file.register_schema(schema.name, schema.encoding, schema.data)
-    for channel in summary.channels.values():
-        name = summary.schemas[channel.schema_id].name
-        channels[channel.topic] = file.register_channel(
-            channel.topic, channel.message_encoding, schemas[name], channel.metadata
-        )
-    for message in messages(data):
-        file.add_message(
-            channels[message.topic], message.log_time, message.data, message.publish_time, message.sequence
-        )
-    for entry in reader.iter_metadata():
-        if entry.name == "trilat.accounts":
-            file.add_metadata(entry.name, entry.metadata)
-    file.finish()
+    whole, stream = opened(recorded("paper")), io.BytesIO()
+    writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0)
+    for n, message in enumerate(messages(recorded("paper"))):
+        topic, payload, log_ns, publish_ns, sequence = message
+        writer.add(topic[1:], payload, publish_ns, log_ns, sequence)
+        if n % 18 == 17:
+            writer.flush()
+    writer.finish(whole.accounts)
     return stream.getvalue()
 
 
@@ -247,7 +212,7 @@ def test_a_chunk_that_is_lost_is_told_with_the_ticks_that_were_in_it(tmp_path: P
     assert len(messages(saved)) == len(messages(log())) - len(chunk.messages)
 
 
-def foreign(compression: CompressionType, chunked: bool) -> bytes:
+def of_others(compression: CompressionType, chunked: bool) -> bytes:
     """A file of another program."""
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=500, compression=compression, use_chunking=chunked)
@@ -268,7 +233,7 @@ def foreign(compression: CompressionType, chunked: bool) -> bytes:
 def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
     compression: CompressionType, chunked: bool, tmp_path: Path
 ) -> None:
-    data = foreign(compression, chunked)
+    data = of_others(compression, chunked)
     everything = messages(data)
     before = 0
     for end in [*range(20, len(data), 41), len(data)]:
@@ -294,14 +259,7 @@ def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_the_complete_records_of_a_cut_chunk_are_kept(compression: CompressionType, tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    writer = Writer(stream, compression=compression)
-    writer.start()
-    channel = writer.register_channel("/a", "raw", writer.register_schema("S", "jsonschema", b"{}"))
-    for k in range(2000):
-        writer.add_message(channel, k, os.urandom(300), k, k)
-    writer.finish()
-    data = stream.getvalue()
+    data = foreign([os.urandom(300) for _ in range(2000)], compression=compression)
     (chunk,) = chunks(data)
     result, saved = made(data[: (chunk.begin + chunk.end) // 2], tmp_path)
     found = messages(saved)
@@ -318,12 +276,7 @@ def record(opcode: int, content: bytes, length: int | None = None) -> bytes:
     return struct.pack("<BQ", opcode, len(content) if length is None else length) + content
 
 
-def bomb() -> bytes:
-    packed = zstandard.compress(bytes(1 << 28))
-    head = struct.pack("<QQQII", 0, 1, 1 << 28, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
-    return record(6, head + packed)
-
-
+BOMB = packed_chunk(bytes(1 << 28))
 HEAD = b"\x89MCAP0\r\n" + record(1, bytes(8))
 META = record(12, struct.pack("<I", 1) + b"m" + bytes(4))
 
@@ -333,8 +286,8 @@ META = record(12, struct.pack("<I", 1) + b"m" + bytes(4))
     [
         HEAD + META + record(6, bytes(100), 1 << 62),
         HEAD + META + record(9, bytes(100), 1 << 40),
-        HEAD + META + bomb(),
-        HEAD + META + bomb()[:-100],
+        HEAD + META + BOMB,
+        HEAD + META + BOMB[:-100],
         HEAD + META + record(6, bytes(16) + struct.pack("<QII", 1 << 60, 0, 1 << 31) + b"zstd"),
         HEAD + META + record(4, struct.pack("<HHI", 1, 1, 1 << 31)) * 100,
     ],

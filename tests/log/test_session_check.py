@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
-from mcap.writer import Writer
 
+from tests.log.dealt import foreign
 from tests.log.hostility import chunk
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError
@@ -253,13 +253,7 @@ def test_files_of_different_sessions_are_not_judged_as_one(tmp_path: Path) -> No
 
 
 def test_a_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
-    writer.add_message(channel, 1, b"{}", 1)
-    writer.finish()
-    found = judged(tmp_path, stream.getvalue())
+    found = judged(tmp_path, foreign())
     assert found.passed
     assert not found.ours
     assert {finding.check for finding in found.findings} == BUILT
@@ -306,13 +300,6 @@ def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
 
 def test_the_checksum_of_the_data_is_compared_where_there_is_one(tmp_path: Path) -> None:
     """Our writer makes none; of a file that has one it is told when a byte of the data changed."""
-    stream = io.BytesIO()
-    writer = Writer(stream, enable_data_crcs=True)
-    writer.start()
-    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
-    for n in range(100):
-        writer.add_message(channel, n, b"{}", n)
-    writer.finish()
-    data = stream.getvalue()
+    data = foreign([b"{}"] * 100, enable_data_crcs=True)
     assert judged(tmp_path, data).passed
     assert failed(judged(tmp_path, poked(data, data.index(b"mcap") + 2))) == {"checksums"}

@@ -210,30 +210,6 @@ def test_disorder_within_a_bucket_does_not_show(records: list[TickRecord], chanc
     assert Counter(first) == Counter(second)
 
 
-@pytest.mark.parametrize("tick", [0, 7, 219, 399])
-def test_a_spike_of_one_tick_survives(tick: int) -> None:
-    """In each number of a record, by itself."""
-    for number in range(17):
-        records = []
-        for k in range(400):
-            numbers = [math.sin(k / 50 + n) for n in range(17)]
-            numbers[number] += 5.0 * (k == tick)
-            records.append(record(k, numbers))
-        desk = Desk(100.0)
-        desk.take(records)
-        desk.finish()
-        for arrays_of, row_of, most in (
-            (joint_arrays, joint_row, 40),
-            (error_arrays, error_row, 40),
-            (slow_arrays, slow_row, 4),
-        ):
-            whole = np.array([row_of(one) for one in records])
-            shown = np.array([row for _, row in arrays_of(desk)])
-            assert np.array_equal(shown.max(axis=0), whole.max(axis=0))
-            assert np.array_equal(shown.min(axis=0), whole.min(axis=0))
-            assert len(shown) <= most
-
-
 def test_a_live_recorder_sees_one_message_every_ten_ms_on_either_clock() -> None:
     """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
     desk = Desk(100.0)
