@@ -2,7 +2,8 @@
 
 Invariant: every number is the record's own, or follows from it exactly (an age is a difference of
 stamps). A column's name ends in its unit; a missing value is null, never a number in its place. Units
-come from the schema, meanings from the docstrings of the message types: there is no second list.
+come from the schema, meanings from the docstrings of the message types: there is no second list. A number out
+of range, or an arrival of a peer that a site does not have, is a `LogError` that names the file (`source`).
 """
 
 import dataclasses
@@ -166,11 +167,7 @@ def add_unit_suffix(stem: str, unit: str) -> str:
 
 
 def to_int_array(values: Iterable[int], source: str, field: str, kind: Any = np.int64) -> NDArray[Any]:
-    """Returns whole numbers as an array of type `kind`.
-
-    Raises:
-        LogError: one of them is out of range; names the file `source` and the field.
-    """
+    """Returns whole numbers as an array of type `kind`."""
     try:
         return np.fromiter(values, kind)
     except OverflowError:
@@ -216,11 +213,7 @@ def build_state_table(site: SiteLog, peer_rates_hz: Mapping[str, int]) -> Table:
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Returns the samples that came to a site, a row each, in the order in which it accepted them.
-
-    Raises:
-        LogError: a record names a peer that the site does not have; names the file `source`.
-    """
+    """Returns the samples that came to a site, a row each, in the order in which it accepted them."""
     counts, entries = site.arrivals
     index = entries[:, 0]
     if ((index < 0) | (index >= len(site.peers))).any():
@@ -240,11 +233,7 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Returns the statistics of a site's loop and links, a row each, in order of their ticks.
-
-    Raises:
-        LogError: a number is out of range; names the file `source`.
-    """
+    """Returns the statistics of a site's loop and links, a row each, in order of their ticks."""
     stats = timed.messages
     tick = to_int_array((s.tick for s in stats), source, "tick")
     t_s = to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
@@ -289,11 +278,7 @@ def _make_entry_column(source: str, field: str, name: str, values: Sequence[Mapp
 
 
 def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
-    """Returns the events, a row each, in the order in which they came to the recorder.
-
-    Raises:
-        LogError: a number is out of range; names the file `source`.
-    """
+    """Returns the events, a row each, in the order in which they came to the recorder."""
     events = timed.messages
     t_ns = to_int_array((event.t_ns for event in events), source, "t_ns")
     t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)

@@ -2,7 +2,7 @@
 
 Invariant: no number in a file is trusted. Nothing outside the file is read, a chunk is unpacked to at
 most what its size allows, and only if its head agrees with its data. Where the file makes no sense, the
-scan resumes at the next chunk that does.
+scan resumes at the next chunk that does. What makes no sense is an `UnreadableRecord` to every function.
 
 A record is an opcode (1 byte), the length of its content (8 bytes) and the content; see the specification
 at mcap.dev. A chunk is a record that holds packed records.
@@ -76,11 +76,7 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Returns the head of a chunk of `length` bytes; its first `MAX_HEAD_BYTES` suffice as content.
-
-    Raises:
-        UnreadableRecord: it contradicts itself.
-    """
+    """Returns the head of a chunk of `length` bytes; its first `MAX_HEAD_BYTES` suffice as content."""
     try:
         start_ns, end_ns, size, crc, letters = _FIXED_HEAD.unpack_from(content)
         (packed,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + letters)
@@ -94,11 +90,7 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Returns the records in a chunk.
-
-    Raises:
-        UnreadableRecord: it is damaged, or unpacks to more than it may.
-    """
+    """Returns the records in a chunk."""
     head = parse_chunk_head(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
@@ -131,11 +123,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Yields the records in an unpacked chunk: opcode, where the content begins, where it ends.
-
-    Raises:
-        UnreadableRecord: the last one reaches beyond the data.
-    """
+    """Yields the records in an unpacked chunk: opcode, where the content begins, where it ends."""
     unpack, size = RECORD_HEAD.unpack_from, len(data)
     end = 0
     while end + RECORD_HEAD_BYTES <= size:
@@ -268,11 +256,7 @@ class RecordScanner:
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Returns the head of a chunk.
-
-        Raises:
-            UnreadableRecord: it contradicts itself.
-        """
+        """Returns the head of a chunk."""
         content = self.read(frame.offset + RECORD_HEAD_BYTES, min(frame.length, MAX_HEAD_BYTES))
         return parse_chunk_head(content, frame.length)
 
@@ -321,11 +305,7 @@ def has_right_crc(attachment: bytes) -> bool:
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """Returns a record of the `mcap` package: any but a message, a message index or a chunk.
-
-    Raises:
-        UnreadableRecord: the content is none of that kind.
-    """
+    """Returns a record of the `mcap` package: any but a message, a message index or a chunk."""
     try:
         return _KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:

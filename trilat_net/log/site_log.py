@@ -5,9 +5,8 @@ stays bounded for a log of any length: long sequences of records are decoded in 
 """
 
 from bisect import bisect_right
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -43,11 +42,11 @@ class LazyRecords(Sequence[State]):
     """Records decoded a block at a time; the blocks used last are held, fewer of heavy records."""
 
     def __init__(self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False) -> None:
-        self._size, self._held = (
-            (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS // BLOCK_RECORDS)
+        self._size, held = (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS)
+        self._payloads, size = payloads, self._size
+        self._block = lru_cache(maxsize=held if heavy else held // size)(
+            lambda number: decode_block(payloads[number * size : (number + 1) * size])
         )
-        self._payloads, self._decode_block = payloads, decode_block
-        self._blocks: OrderedDict[int, list[State]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._payloads)
@@ -67,17 +66,6 @@ class LazyRecords(Sequence[State]):
         if not 0 <= index < len(self):
             raise IndexError(f"record {place} of {len(self)}")
         return self._block(index // self._size)[index % self._size]
-
-    def _block(self, number: int) -> list[State]:
-        block = self._blocks.get(number)
-        if block is None:
-            block = self._decode_block(self._payloads[number * self._size : (number + 1) * self._size])
-            self._blocks[number] = block
-            if len(self._blocks) > self._held:
-                self._blocks.popitem(last=False)
-        else:
-            self._blocks.move_to_end(number)
-        return block
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:

@@ -55,27 +55,14 @@ ROS2_SCHEMAS: dict[str, bytes] = {
 """Complete definitions of the types that are packed here, by name."""
 
 
-class _Fields:
-    """Packed fields of a message, from an offset on."""
-
-    def __init__(self, offset: int = 0) -> None:
-        self._offset = offset
-        self.data = b""
-
-    def add_number(self, value: int) -> None:
-        """Adds an unsigned number of 32 bits."""
-        self.data += b"\0" * (-self.end % 4) + struct.pack("<I", value)
-
-    def add_text(self, text: str) -> None:
-        """Adds a string."""
-        data = text.encode()
-        self.add_number(len(data) + 1)
-        self.data += data + b"\0"
-
-    @property
-    def end(self) -> int:
-        """The offset after them."""
-        return self._offset + len(self.data)
+def _pack_fields(offset: int, *values: int | str) -> bytes:
+    """Packs unsigned numbers of 32 bits and strings, from an offset on."""
+    data = b""
+    for value in values:
+        text = value.encode() + b"\0" if isinstance(value, str) else b""
+        number = value if isinstance(value, int) else len(text)
+        data += b"\0" * (-(offset + len(data)) % 4) + struct.pack("<I", number) + text
+    return data
 
 
 def _split_stamp(stamp_ns: int) -> tuple[int, int]:
@@ -98,17 +85,12 @@ class JointStatePacker:
     def __init__(
         self, names: Sequence[str], frame_id: str = "", *, velocity: bool = True, effort: bool = True
     ) -> None:
-        fields = _Fields(8)  # after the stamp
-        fields.add_text(frame_id)
-        fields.add_number(len(names))
-        for name in names:
-            fields.add_text(name)
+        self._names = _pack_fields(8, frame_id, len(names), *names)  # after the stamp
         self._counts = [len(names) * present for present in (True, velocity, effort)]
-        form, offset = f"<4siI{len(fields.data)}s", fields.end
+        form, offset = f"<4siI{len(self._names)}s", 8 + len(self._names)
         for count in self._counts:
             part, offset = _format_floats(offset, count)
             form += part
-        self._names = fields.data
         self._pack = struct.Struct(form).pack
 
     def pack(
@@ -132,24 +114,19 @@ class ArrayDimension(NamedTuple):
 
 def make_float_array_packer(*dimensions: ArrayDimension) -> Callable[..., bytes]:
     """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers row by row."""
-    fields = _Fields()
-    fields.add_number(len(dimensions))
     sizes = [dimension.size for dimension in dimensions]
+    layout: list[int | str] = []
     for n, (label, size) in enumerate(dimensions):
-        fields.add_text(label)
-        fields.add_number(size)
-        fields.add_number(math.prod(sizes[n:]))
-    fields.add_number(0)  # data_offset
-    form, _ = _format_floats(fields.end, count := math.prod(sizes))
-    pack, shape = struct.Struct(f"<4s{len(fields.data)}s{form}").pack, fields.data
+        layout += label, size, math.prod(sizes[n:])
+    shape = _pack_fields(0, len(dimensions), *layout, 0)  # the last is data_offset
+    form, _ = _format_floats(len(shape), count := math.prod(sizes))
+    pack = struct.Struct(f"<4s{len(shape)}s{form}").pack
     return lambda *numbers: pack(_HEAD, shape, count, *numbers)
 
 
 def pack_string(text: str) -> bytes:
     """Returns a `std_msgs/msg/String`."""
-    fields = _Fields()
-    fields.add_text(text)
-    return _HEAD + fields.data
+    return _HEAD + _pack_fields(0, text)
 
 
 class RosLogLevel(IntEnum):
@@ -162,8 +139,5 @@ class RosLogLevel(IntEnum):
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
     """Returns an `rcl_interfaces/msg/Log` of a member at a time (Unix ns, not below 0)."""
-    fields = _Fields(9)  # after stamp and level
-    for part in (name, text, "", ""):  # no file, no function
-        fields.add_text(part)
-    fields.add_number(0)  # of no line
-    return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields.data
+    fields = _pack_fields(9, name, text, "", "", 0)  # after stamp and level; of no file, function and line
+    return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields
