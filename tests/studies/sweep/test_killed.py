@@ -1,18 +1,17 @@
-"""A sweep that is killed, again and again, comes to the same end, and makes no run twice."""
+"""A sweep that is killed and interrupted comes to the same end, and makes no run twice."""
 
-import random
+import os
 import re
 import signal
+import subprocess
 from pathlib import Path
 
 import msgspec
-import pytest
 
-from tests.cli.running import trilat
-from trilat_net.studies.sweep import open_sweep_folder, read_results
+from tests.cli.running import COMMAND, PLAIN, trilat
+from tests.net.waiting import until
 from trilat_net.studies.sweep.sweep_folder import JOURNAL_FILE
 
-from .killing import begun, ended_at, lines
 from .quick import SHORT
 
 OPTIONS = ("--over", "control.Kd=1:4:0.1", "--over", "link.loss=0,0.1", "--seeds", "2", "--longest", "8")
@@ -20,13 +19,30 @@ RUNS = 31 * 3
 LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace("duration_s = 0.5", "duration_s = 8.0")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the scenario, and the results of a sweep that nothing interrupted, in one process."""
-    path = tmp_path_factory.mktemp("killed")
-    (path / "trio.toml").write_text(LONGER)
-    trilat("sweep", "trio.toml", *OPTIONS, "-o", "whole", "--jobs", "1", cwd=path).succeeds()
-    return path
+def lines(results: Path) -> int:
+    """How many runs the journal has."""
+    journal = results / JOURNAL_FILE
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
+def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int, str]:
+    """Runs `trilat sweep` until its journal has so many runs; returns how a signal ended it.
+
+    SIGKILL goes to all of its processes, as when a machine is switched off.
+    """
+    process = subprocess.Popen(
+        [*COMMAND, "sweep", *arguments, "--jobs", "2"],
+        cwd=folder,
+        env=PLAIN,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until(lambda: lines(folder / "parts") >= count or process.poll() is not None, 120.0)
+    (os.killpg if number == signal.SIGKILL else os.kill)(process.pid, number)
+    err = process.communicate(timeout=120)[1]
+    return process.returncode, err
 
 
 def keys(journal: Path) -> list[tuple[int, int]]:
@@ -36,40 +52,26 @@ def keys(journal: Path) -> list[tuple[int, int]]:
     return [(one["cell"], one["seed"]) for one in found]
 
 
-def test_killed_at_random_and_resumed_it_comes_to_the_same_bytes(folder: Path) -> None:
-    """SIGKILL to all its processes; two of them, where the whole one had one."""
-    chance = random.Random(6)
-    killed = 0
-    done = 0
-    for _ in range(3):
-        resumed = ("--resume", "parts") if (folder / "parts").exists() else ()
-        process = begun(folder, *(resumed or ("trio.toml", *OPTIONS, "-o", "parts")), "--jobs", "2")
-        err = ended_at(process, folder / "parts", done + chance.randint(1, 18), signal.SIGKILL)
-        killed += process.returncode == -signal.SIGKILL
-        assert "Traceback" not in err
-        before, done = done, lines(folder / "parts")
-        assert done >= before
-    assert killed >= 2
-    assert not (folder / "parts" / "results.parquet").exists()
-    text = trilat("sweep", "--resume", "parts", "--jobs", "2", cwd=folder).succeeds()
-    assert f"{done} runs are done already" in text
-    whole = (folder / "whole" / "results.parquet").read_bytes()
-    assert (folder / "parts" / "results.parquet").read_bytes() == whole
-    made = keys(folder / "parts" / JOURNAL_FILE)
-    assert len(made) == len(set(made)) == RUNS
-
-
-def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(folder: Path) -> None:
-    process = begun(folder, "trio.toml", *OPTIONS, "-o", "stopped", "--jobs", "2")
-    err = ended_at(process, folder / "stopped", 12, signal.SIGINT)
-    assert process.returncode == 130, err
-    with open_sweep_folder(folder / "stopped").journal() as journal:
-        kept = len(journal.done)
+def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Path) -> None:
+    """SIGKILL to all its processes, then Ctrl-C; two processes, where the whole sweep had one."""
+    (tmp_path / "trio.toml").write_text(LONGER)
+    sweep = ("trio.toml", *OPTIONS, "-o")
+    trilat("sweep", *sweep, "whole", "--jobs", "1", cwd=tmp_path).succeeds()
+    parts = tmp_path / "parts"
+    code, err = stopped(tmp_path, signal.SIGKILL, 11, *sweep, "parts")
+    assert (code, err) == (-signal.SIGKILL, "")
+    done = lines(parts)
+    code, err = stopped(tmp_path, signal.SIGINT, done + 10, "--resume", "parts")
+    kept = len(keys(parts / JOURNAL_FILE))
+    assert code == 130
     assert err.splitlines() == [
-        f"{kept} runs are done and kept; go on with: trilat sweep --resume stopped",
+        f"{kept} runs are done and kept; go on with: trilat sweep --resume parts",
         "interrupted",
     ]
-    assert 12 <= kept < RUNS
-    text = trilat("sweep", "trio.toml", *OPTIONS, "-o", "stopped", cwd=folder).succeeds()
+    assert done + 10 <= kept < RUNS
+    assert not (parts / "results.parquet").exists()
+    text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
     assert f"{kept} runs are done already" in text
-    assert read_results(folder / "stopped").rows == read_results(folder / "whole").rows
+    assert (parts / "results.parquet").read_bytes() == (tmp_path / "whole/results.parquet").read_bytes()
+    made = keys(parts / JOURNAL_FILE)
+    assert len(made) == len(set(made)) == RUNS
