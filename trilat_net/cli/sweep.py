@@ -164,7 +164,7 @@ def _estimate(
 
 
 def _print_plan(asked: "SweepPlan") -> None:
-    from ..studies.sweep.sweep_report import describe_sweep_plan
+    from ..studies.sweep.sweep_run import describe_sweep_plan
 
     for line in describe_sweep_plan(asked):
         terminal.print_text(line)
@@ -175,8 +175,7 @@ def _run_in_folder(
 ) -> "FinishedSweep":
     """Runs a sweep in its folder and prints its summary; on Ctrl-C, the command that resumes it."""
     from ..studies.sweep import run_sweep
-    from ..studies.sweep.sweep_report import describe_sweep_speed
-    from ..studies.sweep.sweep_run import format_wall_time
+    from ..studies.sweep.sweep_run import describe_sweep_speed, format_wall_time
 
     if expected.seconds:
         terminal.print_text(
@@ -202,7 +201,7 @@ def _run_in_folder(
 
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
     """Prints the summary of a finished sweep, more lines, and what can be done next."""
-    from ..studies.sweep.sweep_report import list_next_commands, summarize_sweep
+    from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
 
     for line in [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]:
         terminal.print_text(line)
@@ -237,7 +236,7 @@ def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
 def _print_cell_commands(path: Path, number: int) -> None:
     """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_report import build_reproduce_command
+    from ..studies.sweep.sweep_run import build_reproduce_command
 
     results = read_results(path)
     for row in results.of_cell(number):

@@ -65,19 +65,15 @@ class WorkerRequirements(NamedTuple):
 def find_unfit(required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
     """Returns why a worker is refused, or ""."""
     here = required.identity
-    different = [name for name in here if name != "commit" and identity.get(name) != here[name]]
-    if different:
-        named = [*different, *(["commit"] if "source files" in different else [])]
+    named = [name for name in here if name != "commit" and identity.get(name) != here[name]]
+    if named:
+        named += ["commit"] if "source files" in named else []
         there, own = (
             ", ".join(f"{name} {one.get(name, 'unknown')}" for name in named) for one in (identity, here)
         )
         return f"has {there}, and here is {own}; results are not mixed"
-    if lacks:
-        return (
-            f"lacks the control law {', '.join(lacks)}, or has another file of it: put the file that the "
-            "scenario names into the worker's folder or PYTHONPATH"
-        )
-    return ""
+    remedy = "put the file that the scenario names into the worker's folder or PYTHONPATH"
+    return f"lacks the control law {', '.join(lacks)}, or has another file of it: {remedy}" if lacks else ""
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:

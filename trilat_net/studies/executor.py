@@ -135,8 +135,7 @@ class WorkerPool:
         executor: runs the batches; None: this process does.
         workers: how many work at the same time.
         restart: returns a new executor after the loss of a worker broke the old one; None: there is none.
-        cluster: the cluster that the executor belongs to.
-        required: what every worker must have.
+        cluster: the cluster that the executor belongs to, and `required` what each of its workers must have.
         hint: what a message about a lost worker recommends.
     """
 
@@ -152,11 +151,7 @@ class WorkerPool:
         self.workers = workers
         self._executor, self._restart = executor, restart
         self._cluster, self._required, self._hint = cluster, required, hint
-
-    @property
-    def is_local(self) -> bool:
-        """True if this process runs the items."""
-        return self._executor is None
+        self.is_local = executor is None
 
     def each(
         self,
@@ -193,7 +188,8 @@ class WorkerPool:
                 for future in sorted(ended, key=lambda one: pending[one].numbers):
                     yield from self._collect(future, pending.pop(future), feed, lost)
         finally:
-            for future in pending:
+            # Processes of our own end with the pool; loky stumbles over futures that are cancelled already.
+            for future in pending if self._restart is None else ():
                 future.cancel()
 
     def map(

@@ -1,15 +1,19 @@
-"""One run: what its command makes is what was judged."""
+"""One run: what its command makes is what was judged, and its text is kept as what differs."""
 
+import json
 import shlex
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.studies.sweep.quick import Judge, asked
 from trilat_net.cli.options import load_chosen_scenario
 from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario
 from trilat_net.studies.sweep import cell_result
-from trilat_net.studies.sweep.sweep_cell import apply_diff, build_sim_command, run_cell
+from trilat_net.studies.sweep.sweep_cell import apply_diff, build_sim_command, diff_lines, run_cell
 
 
 @pytest.fixture
@@ -44,3 +48,28 @@ def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
     task = asked(tmp_path).task(7, 1)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
     with pytest.raises(ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"):
         run_cell(task)
+
+
+texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)
+
+
+@given(text=texts, base=texts)
+def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: str) -> None:
+    parts = diff_lines(text, base)
+    assert apply_diff(parts, base) == text
+    assert apply_diff(json.loads(json.dumps(parts)), base) == text
+
+
+@given(text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5))
+def test_a_line_that_was_changed_is_all_that_differs(text: str, line: int, other: str) -> None:
+    lines = text.split("\n")
+    lines[line % len(lines)] = other
+    own = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
+    assert own in ([other], [])
+
+
+def test_a_scenario_differs_in_what_an_override_changed() -> None:
+    base = load_scenario("p_d_margin")
+    changed = load_scenario("p_d_margin", ["sites.m1.control.d=2.5", "seed=7"])
+    own = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
+    assert own == ["seed = 7", "d = [2.5, 2.5]"]

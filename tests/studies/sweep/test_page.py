@@ -1,15 +1,30 @@
-"""The page of a map: everything in it is in the results, the lines or the commands."""
+"""The page of a map, and its figure: colours are the verdicts, borders half way, lines on top."""
 
 from pathlib import Path
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import rgb_to_hsv, to_hex, to_rgb
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
 
+from trilat_net.reporting.figure_size import make_print_size
 from trilat_net.studies.sweep.cell_result import CellClass
-from trilat_net.studies.sweep.map_page import build_map_page, tabulate_classes, tabulate_edges, write_map
+from trilat_net.studies.sweep.map_page import (
+    CLASS_COLOURS,
+    build_map_page,
+    draw_stability_map,
+    tabulate_classes,
+    tabulate_edges,
+    write_map,
+)
+from trilat_net.studies.sweep.map_plane import CELL_CLASSES, MapPlane
 from trilat_net.studies.sweep.stability_map import StabilityMap, TheoryLine
 
-from .maps import DAMPINGS, DELAYS_MS, drawn
+from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 EXACT = TheoryLine("$d$", "d = 5 T", "the condition", SPARE, 0)
@@ -78,3 +93,109 @@ def test_a_line_that_is_not_there_has_no_difference() -> None:
 def test_a_map_without_an_edge_has_no_table() -> None:
     plane = drawn(lambda *_: CellClass.CONVERGED)
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
+
+
+LINE = TheoryLine("$d$", "d", "", SPARE, 0)
+
+
+def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[TheoryLine, ...] = ()) -> Figure:
+    return draw_stability_map(plane, [lines] * len(plane.panels), make_print_size(width_in))
+
+
+def meshes(made: Figure) -> list[QuadMesh]:
+    return [one for axes in made.axes for one in axes.collections if isinstance(one, QuadMesh)]
+
+
+def every(*place: Any) -> CellClass:
+    return CELL_CLASSES[(DELAYS_MS.index(place[0]) + DAMPINGS.index(place[1])) % 4]
+
+
+def test_every_place_has_the_colour_of_its_verdict() -> None:
+    made = figure(drawn(every))
+    made.canvas.draw()
+    (mesh,) = meshes(made)[:1]
+    colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
+    for i, d in enumerate(DAMPINGS):
+        for j, delay in enumerate(DELAYS_MS):
+            assert to_hex(colours[i, j]) == CLASS_COLOURS[every(delay, d)]
+
+
+def test_a_place_reaches_half_way_to_the_next() -> None:
+    (mesh,) = meshes(figure(drawn()))[:1]
+    corners = mesh.get_coordinates()
+    assert np.allclose(corners[0, :, 0], [-50, 50, 150, 250, 350, 450])
+    assert np.allclose(corners[:, 0, 1], [-0.05, 0.45, 0.95, 1.45, 1.95, 2.45])
+
+
+def test_classes_are_apart_in_lightness() -> None:
+    """Grey print: luminance after Rec. 709; white stands for undecided, and is hatched besides."""
+    light = [float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES]
+    assert min(abs(a - b) for n, a in enumerate(light) for b in light[:n]) > 0.09
+    assert rgb_to_hsv(to_rgb(CLASS_COLOURS[CellClass.UNDECIDED]))[1] == 0.0
+
+
+def test_lines_are_drawn_where_they_are_and_named() -> None:
+    made = figure(drawn(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
+    first, second = (one for one in made.axes[0].collections if isinstance(one, QuadContourSet))
+    for line in (first, second):
+        ends = np.concatenate([path.vertices for path in line.get_paths()])
+        assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
+        assert ends[:, 1].max() - ends[:, 1].min() > 2.0
+    assert first.get_linestyle() != second.get_linestyle()
+    (legend,) = made.legends
+    words = [text.get_text() for text in legend.get_texts()]
+    assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
+
+
+def test_the_legend_has_only_what_occurs() -> None:
+    (legend,) = figure(drawn(lambda *_: CellClass.UNDECIDED)).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
+
+
+def test_of_several_runs_the_share_is_drawn_with_a_scale_and_doubt_in_numbers() -> None:
+    plane = drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4)
+    made = figure(plane, 7.0)
+    share = meshes(made)[0].get_array()
+    assert share is not None
+    assert np.allclose(np.ma.getdata(share), plane.panels[0].share)
+    assert "share of stable runs" in [axes.get_ylabel() for axes in made.axes]
+    texts = {text.get_text() for text in made.axes[0].texts}
+    assert texts
+    for i, j in np.argwhere((plane.panels[0].share > 0.0) & (plane.panels[0].share < 1.0)):
+        assert f"{round(4 * plane.panels[0].share[i, j])}/4" in texts
+    assert not any(text in ("0/4", "4/4") for text in texts)
+
+
+@pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
+def test_every_panel_is_there_with_its_title_and_one_label_for_all(panels: int, width_in: float) -> None:
+    plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
+    made = figure(plane, width_in, (LINE,))
+    assert made.get_figwidth() == width_in
+    assert [axes.get_title() for axes in made.axes if axes.collections] == [p.title for p in plane.panels]
+    labels = [made.get_supxlabel(), *(axes.get_xlabel() for axes in made.axes)]
+    assert [text for text in labels if text] == ["delay (ms)"]
+
+
+def test_nothing_of_matplotlib_is_left_changed() -> None:
+    before = dict(mpl.rcParams)
+    figure(drawn())
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_place_that_did_not_run_is_no_verdict() -> None:
+    from trilat_net.studies.sweep.map_plane import build_plane
+
+    from .maps import KEYS, P_D
+
+    made = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
+    classes = meshes(made)[0].get_array()
+    assert classes is not None
+    assert int(np.ma.getmaskarray(classes).sum()) == 1
+
+
+def test_uneven_values_are_named_one_by_one() -> None:
+    plane = drawn()
+    uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
+    made = figure(uneven)
+    made.canvas.draw()
+    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == ["8", "68", "136", "272", "1088"]

@@ -1,4 +1,6 @@
-"""The plane of a map: every run is in just one place of one panel."""
+"""The plane of a map: every run in just one place, labels, and edges between decided places that differ."""
+
+import itertools
 
 import numpy as np
 import pytest
@@ -6,10 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.errors import UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.scenario_reader import list_shipped
 from trilat_net.studies.sweep.cell_result import CellClass
-from trilat_net.studies.sweep.map_plane import CELL_CLASSES, PlaneAxis, build_plane
+from trilat_net.studies.sweep.map_plane import (
+    CELL_CLASSES,
+    PlaneAxis,
+    StableInterval,
+    build_plane,
+    find_map_edges,
+    label_axis,
+    label_setting,
+)
 
-from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, drawn, rows
+from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
@@ -72,13 +84,7 @@ def test_whole_numbers_stay_whole() -> None:
 def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool) -> None:
     side = PlaneAxis("k", values, "k")
     assert side.even is even
-    assert np.allclose(side.placed(np.array(values)), side.places)
-
-
-def test_between_uneven_values_a_line_lies_between_their_places() -> None:
-    side = PlaneAxis("k", (8.0, 68.0, 1088.0), "k")
-    assert np.allclose(side.placed(np.array([38.0, 578.0])), [0.5, 1.5])
-    assert np.isnan(side.placed(np.array([7.0, np.nan, 2000.0]))).all()
+    assert side.places.tolist() == list(values if even else range(len(values)))
 
 
 def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
@@ -88,3 +94,92 @@ def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
         build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
     with pytest.raises(UsageError, match=r"at most 12 panels, and rate_hz would make 13"):
         drawn(rate_hz=tuple(range(13)))
+
+
+YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
+
+
+def up(column: tuple[CellClass, ...]) -> list[StableInterval]:
+    """The edges of the first column of a map in which all are like this one."""
+    found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
+    return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
+
+
+def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
+    found = drawn()
+    measured = find_map_edges(found, found.panels[0])
+    assert [x for x, _ in measured] == [100, 200, 300, 400]
+    for x, edge in measured:
+        assert edge.low <= 5e-3 * x <= edge.high
+        assert not edge.stable_below
+
+
+@pytest.mark.parametrize("column", list(itertools.product((YES, NO, UNKNOWN), repeat=5))[::7])
+def test_edges_separate_all_that_was_decided(column: tuple[CellClass, ...]) -> None:
+    """From below, the side changes at every edge and nowhere else."""
+    found = up(column)
+    side = [verdict.stable for verdict in column]
+    decided = [(d, one) for d, one in zip(DAMPINGS, side, strict=True) if one is not None]
+    changes = [(a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other]
+    assert [(edge.low, edge.high) for edge in found] == changes
+    for edge in found:
+        assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
+
+
+def test_what_is_undecided_widens_an_edge() -> None:
+    (edge,) = up((NO, UNKNOWN, UNKNOWN, YES, YES))
+    assert (edge.low, edge.high, edge.middle) == (0.2, 1.7, pytest.approx(0.95))
+
+
+def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
+    """Per place seeds 1 and 2 as the line says; below, seed 3 another way: a majority of two of three."""
+    three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
+    assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
+    draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
+    assert all(edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0]))
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("link.delay_ms", "delay (ms)"),
+        ("link.half_width_ms", "half width (ms)"),
+        ("link.loss", "loss"),
+        ("rate_hz", "rate (Hz)"),
+        ("control.K", "K (N m/rad)"),
+        ("control.d", "d (N m s/rad)"),
+        ("control.Gamma", "Gamma"),
+        ("arm.I1_kg_m2", "I1 (kg m²)"),
+        ("limits.qd_limit_rad_s", "qd limit (rad/s)"),
+        ("sites.m.control.k_f", "k_f of m"),
+        ("links.m1->s.delay_ms", "delay m1->s (ms)"),
+        ("dominance.s.m1", "m1's share in s"),
+        ("sites.s.q0_rad.1", "q0[1] of s (rad)"),
+    ],
+)
+def test_a_key_is_told_in_its_words_and_its_unit(key: str, text: str) -> None:
+    assert label_axis(key) == text
+
+
+def test_what_a_number_means_is_told_by_the_scenario() -> None:
+    key = "sites.s.environment.0.stiffness_n_m"
+    assert label_axis(key, load_scenario("contact")) == "stiffness, wall of s (N/m)"
+    assert (
+        label_axis("sites.m.hands.0.damping_nm_s_rad", load_scenario("contact"))
+        == "damping, spring of m (N m s/rad)"
+    )
+
+
+def test_every_suffix_of_a_shipped_arm_and_its_limits_is_a_unit() -> None:
+    """No label shows a piece of a unit as if it were a word."""
+    spec = next(iter(load_scenario(list_shipped()[0]).sites.values()))
+    for table in (spec.arm, spec.limits):
+        for field in table.__struct_fields__:
+            if field not in ("known",):
+                assert label_axis(f"arm.{field}").endswith(")"), field
+
+
+def test_a_place_is_its_value_in_its_unit() -> None:
+    assert label_setting("link.playout_ms", 400.0) == "playout 400 ms"
+    assert label_setting("link.loss", 0.25) == "loss 0.25"
+    assert label_setting("link.order", "in_order") == "order in order"

@@ -10,7 +10,7 @@ from trilat_net.analysis.run_end import EnvelopeTrend
 from trilat_net.scenario import Expect
 from trilat_net.scenario.expect import ExpectWindow
 from trilat_net.studies.trials.expectations import ExpectationResult, evaluate_expectations
-from trilat_net.studies.trials.site_stats import Range
+from trilat_net.studies.trials.measure_run import Range
 
 from .results import CALM, figures
 

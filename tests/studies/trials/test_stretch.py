@@ -14,8 +14,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow
 from trilat_net.studies.record_batches import RecordBatch
-from trilat_net.studies.trials.measure_run import measure_log, measure_virtual_run
-from trilat_net.studies.trials.site_stats import WindowStats
+from trilat_net.studies.trials.measure_run import WindowStats, measure_log, measure_virtual_run
 
 WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
 ASKED = {key: [-1e9, 1e9] for key in WINDOW_QUANTITIES}

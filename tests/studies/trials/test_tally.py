@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.studies.record_batches import RecordBatch
-from trilat_net.studies.trials.site_stats import BUCKET_NS, SiteStats
+from trilat_net.studies.trials.measure_run import BUCKET_NS, SiteStats
 
 PERIOD_NS = 10_000_000
 RECORDS = 400

@@ -1,5 +1,7 @@
 """The procedure as a whole: small budgets, short runs."""
 
+import json
+import re
 import shlex
 from pathlib import Path
 
@@ -12,7 +14,12 @@ from trilat_net.studies.tuning.candidate import measure_candidate
 from trilat_net.studies.tuning.final_posture import CandidateClass
 from trilat_net.studies.tuning.pareto_search import dominates, find_pareto_front
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
-from trilat_net.studies.tuning.tuning_report import tuning_to_json
+from trilat_net.studies.tuning.tuning_report import (
+    tabulate_front,
+    tabulate_laws,
+    tuning_to_json,
+    write_tuning,
+)
 
 from .experiments import asked
 
@@ -144,3 +151,57 @@ def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
     knob = SEARCH_SPACES["p_d"].knobs[0]
     at_edge = one._replace(tried=[{"K": knob.high, "d": 10.0}] * 6, front=[0])
     assert found.at_edge(at_edge) == ["K"]
+
+
+@pytest.fixture(scope="module")
+def written(found: TuningResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the result."""
+    folder = tmp_path_factory.mktemp("written")
+    names = sorted(path.name for path in write_tuning(found, folder))
+    assert names == ["front.json", "front.md", "front.pdf", "front.png"]
+    return folder
+
+
+def test_the_folder_holds_the_result(written: Path) -> None:
+    result = json.loads((written / "front.json").read_text())
+    assert result["procedure"]["candidates_per_law"] == 6
+    assert result["scenario"]["tau_limit_nm"] == {"m1": 60.0, "m2": 60.0, "s": 60.0}
+    for law in ("p_d", "known"):
+        assert len(result["laws"][law]["candidates"]) == sum(result["laws"][law]["outcomes"].values()) == 6
+        for point in result["laws"][law]["front"]:
+            assert point["command"].startswith("trilat sim ")
+            assert point["outcome"] == "settled"
+
+
+def test_the_figure_is_a_vector_one_column_wide(written: Path) -> None:
+    """3.5 in are 252 pt, and 700 pixels at 200 to the inch."""
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (written / "front.pdf").read_bytes())
+    assert box is not None
+    assert float(box[1]) == pytest.approx(252.0)
+    header = (written / "front.png").read_bytes()[16:20]
+    assert int.from_bytes(header, "big") == 700
+
+
+def test_the_page_tells_procedure_search_and_commands(found: TuningResult, written: Path) -> None:
+    text = (written / "front.md").read_text()
+    assert "every law is told gravity exactly" in text
+    assert "torques clamped at 60 N m" in text
+    assert "| p_d | K | N m/rad | 1 | 1000 | gravity |" in text
+    assert "AND inertia exactly: more than the others" in text
+    assert text.count("trilat sim ") == sum(len(one.front) for one in found.found) + 2
+    assert "as printed, told nothing" in text
+
+
+def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
+    table = tabulate_laws(found)
+    places = [table.headers.index(outcome.value) for outcome in CandidateClass]
+    for row in table.rows:
+        assert sum(int(row[place]) for place in places) == int(row[1]) == 6
+
+
+def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult) -> None:
+    one = found.found[0]._replace(front=[0, 1, 2, 3, 4])
+    shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
+    assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
+    assert len(tabulate_front(found, one).rows) == 5
+    assert tabulate_front(found, one._replace(front=[]), 3).rows == []

@@ -122,15 +122,6 @@ class PlaneAxis(NamedTuple):
         """Where its values are drawn: at themselves where they are even, else one apart from the next."""
         return np.array(self.values) if self.even else np.arange(len(self.values), dtype=np.float64)
 
-    def placed(self, values: Array) -> Array:
-        """Returns where any values of the axis are drawn; NaN beyond those that are one apart."""
-        if self.even:
-            return values.astype(np.float64)
-        known = np.isfinite(values)
-        where: Array = np.full(len(values), np.nan)
-        where[known] = np.interp(values[known], self.values, self.places, np.nan, np.nan)
-        return where
-
 
 class MapPanel(NamedTuple):
     """One plane's worth of runs.

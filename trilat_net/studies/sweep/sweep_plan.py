@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, apply_overrides
@@ -33,12 +33,26 @@ _MOST = 10**12
 _HOW = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
+class _Steps:
+    """The values a, a + step, ... as texts, made as they are asked for."""
+
+    def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
+        self._first, self._step, self._count = first, step, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, place: int) -> str:
+        n = range(self._count)[place]
+        return f"{self._first + n * self._step:f}"
+
+
 class SweepAxis(NamedTuple):
     """One axis, asked for as "KEY=a:b:step" or "KEY=v1,v2,v3"; its values are texts of overrides."""
 
     asked: str
     key: str
-    texts: Sequence[str]
+    texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
         """Returns one value: a number where it is one, else its text."""
@@ -48,31 +62,11 @@ class SweepAxis(NamedTuple):
     @property
     def numeric(self) -> bool:
         """True where every value is a number."""
-        return isinstance(self.texts, _Steps) or all(is_number(_read(text)) for text in self.texts)
+        return isinstance(self.texts, _Steps) or all(map(is_number, map(_read, self.texts)))
 
     def override(self, number: int) -> str:
         """Returns the override that sets one value."""
         return f"{self.key}={self.texts[number]}"
-
-
-class _Steps(Sequence[str]):
-    """The values a, a + step, ... as texts, made as they are asked for."""
-
-    def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
-        self._first, self._step, self._count = first, step, count
-
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, place: int) -> str: ...
-    @overload
-    def __getitem__(self, place: slice) -> Sequence[str]: ...
-    def __getitem__(self, place: int | slice) -> str | Sequence[str]:
-        if isinstance(place, slice):
-            return [self[n] for n in range(*place.indices(self._count))]
-        n = range(self._count)[place]
-        return f"{self._first + n * self._step:f}"
 
 
 def parse_axis(asked: str) -> SweepAxis:

@@ -14,13 +14,10 @@ from .measure_run import RunMetrics
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
-    """One thing that was expected of one run.
+    """One thing that was expected of one run; values in words with their units.
 
     Attributes:
         key: the key of [expect] that asked, or a word for what every run must do.
-        held: whether it is so.
-        measured: what was measured, in words with its unit.
-        limit: what was asked, in words with its unit.
         margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare, negative is
             beyond it. None where there is no such number.
     """

@@ -23,8 +23,13 @@ from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
 from ..commands import format_command, set_options
 from ..record_batches import RecordBatch, run_in_batches
-from .consensus_pose import build_twin, compute_consensus_pose
-from .final_posture import CandidateClass, CandidateEnd, classify_candidate
+from .final_posture import (
+    CandidateClass,
+    CandidateEnd,
+    build_twin,
+    classify_candidate,
+    compute_consensus_pose,
+)
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 

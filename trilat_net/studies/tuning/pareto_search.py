@@ -30,13 +30,9 @@ class Objective(StrEnum):
         """Its unit."""
         return "rad" if self is Objective.ERROR else "s"
 
-    def of(self, score: CandidateScore) -> float | None:
-        """Returns what it is in a run; None where the run has none."""
-        return score.error_rad if self is Objective.ERROR else score.settled_s
-
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
         """Returns (objective, effort) of a run that may stand on a front, else None."""
-        value = self.of(score)
+        value = score.error_rad if self is Objective.ERROR else score.settled_s
         if score.outcome is not CandidateClass.SETTLED or value is None or score.effort_nm is None:
             return None
         return value, score.effort_nm

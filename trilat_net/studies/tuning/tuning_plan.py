@@ -15,8 +15,7 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .candidate import CandidateScore, TuningScenario, load_tuning_scenario, measure_candidate_task
-from .consensus_pose import build_twin, check_comparable
-from .final_posture import CandidateClass
+from .final_posture import CandidateClass, build_twin, check_comparable
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
 from .search_space import (
     PAPER_GAINS,
@@ -76,11 +75,6 @@ class TuningPlan(NamedTuple):
     def runs(self) -> int:
         """How many runs it takes, those with printed gains and twins counted."""
         return (len(self.spaces) * self.budget + len(self.printed())) * (1 + self.twin)
-
-    @property
-    def informed(self) -> bool:
-        """True if one of the laws gets more information than the others."""
-        return any(space.law == "known" for space in self.spaces)
 
     @property
     def twin(self) -> bool:

@@ -112,12 +112,13 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     scenario = plan.base.scenario
     clamps = sorted({spec.limits.tau_limit_nm for spec in scenario.sites.values()})
     clamp = " to ".join(f"{value:g}" for value in dict.fromkeys((clamps[0], clamps[-1])))
+    informed = any(space.law == "known" for space in plan.spaces)
     lines = [
         f"{plan.budget} candidates per law, {(plan.budget + 1) // 2} of a Latin hypercube, the others "
         f"refined; seed {plan.seed}",
         f"{scenario.duration_s:g} s of {scenario.name}, its seed {scenario.seed}, "
         f"torques clamped at {clamp} N m",
-        plan.knowledge.text + ("; known gets inertia exactly as well" if plan.informed else ""),
+        plan.knowledge.text + ("; known gets inertia exactly as well" if informed else ""),
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS of tau - G(q)",
     ]
     if plan.objective is Objective.SETTLING:
