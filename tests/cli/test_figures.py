@@ -29,6 +29,7 @@ def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     paths = json.loads(done.succeeds())
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
     assert b"MediaBox [ 0 0 504 " in (folder / paths[0]).read_bytes()
+    trilat("figure", "run.mcap", "control_torques", cwd=folder).refuses("torques.pdf: exists", "--force")
 
 
 def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
@@ -55,10 +56,3 @@ def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
 )
 def test_what_cannot_be_drawn_is_refused(folder: Path, words: list[str], facts: list[str]) -> None:
     trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)
-
-
-def test_a_file_is_replaced_only_by_force(folder: Path) -> None:
-    words = ("figure", "run.mcap", "phase", "--format", "pdf")
-    trilat(*words, cwd=folder).succeeds()
-    trilat(*words, cwd=folder).refuses("phase.pdf: exists", "--force")
-    trilat(*words, "--force", cwd=folder).succeeds()

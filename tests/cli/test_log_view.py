@@ -5,8 +5,6 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from trilat_net.log.ros2.ros2_messages import read_ros2_channels
-
 from .running import trilat
 
 
@@ -21,11 +19,6 @@ def test_a_simulation_shows_itself_as_often_as_asked(
     assert least <= count <= most
 
 
-def test_views_are_on_by_default(tmp_path: Path) -> None:
-    trilat("sim", "two_sites", "--duration", "0.1", "-o", "x.mcap", cwd=tmp_path).succeeds()
-    assert "/viz/m/joint_states" in read_ros2_channels(tmp_path / "x.mcap")
-
-
 @pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])
 @pytest.mark.parametrize("command", [("sim", "two_sites"), ("record", "--session", "x")])
 def test_a_rate_that_is_none_is_refused(tmp_path: Path, command: tuple[str, ...], views: str) -> None:
@@ -34,6 +27,7 @@ def test_a_rate_that_is_none_is_refused(tmp_path: Path, command: tuple[str, ...]
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_what_is_shown_can_be_kept(log_file: Path, tmp_path: Path) -> None:
     """Of a log without views as well."""
     text = trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).succeeds()

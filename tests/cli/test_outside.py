@@ -106,7 +106,7 @@ def test_a_run_whose_law_fails_is_one_sentence_and_a_finished_log(tmp_path: Path
     assert "81/81 records identical" in checked.out
 
 
-@pytest.mark.parametrize("seeds", ["1", "1..3"])
+@pytest.mark.parametrize("seeds", ["1", pytest.param("1..3", marks=pytest.mark.long)])
 def test_a_trial_whose_law_fails_is_a_trial_that_failed(seeds: str, tmp_path: Path) -> None:
     jitter = ("--set", "link.model=uniform", "--set", "link.delay_ms=9", "--set", "link.half_width_ms=1")
     done = trilat("test", "two_sites", "--seeds", seeds, *jitter, *FAILING, cwd=tmp_path)

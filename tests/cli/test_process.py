@@ -12,7 +12,7 @@ from tests.net.waiting import until
 from .running import COMMAND, PLAIN, trilat
 
 
-@pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["scenario", "list"], ["sim", "--help"]])
+@pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["sim", "--help"]])
 def test_a_reader_that_had_enough_is_no_error(command: list[str], tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*COMMAND, *command], cwd=tmp_path, env=PLAIN, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -44,7 +44,7 @@ BLOCKED = """
 import sys
 for name in {blocked!r}:
     sys.modules[name] = None
-import trilat_net, trilat_net.api, trilat_net.reporting.conclude, trilat_net.cli
+import trilat_net, trilat_net.api, trilat_net.reporting.conclude, trilat_net.reporting.page, trilat_net.cli
 from typer.testing import CliRunner
 for arguments in {commands!r}:
     result = CliRunner().invoke(trilat_net.cli.app, arguments)
@@ -59,13 +59,11 @@ def test_virtual_time_and_files_need_neither_posix_nor_zenoh(tmp_path: Path) -> 
     program = BLOCKED.format(
         blocked=["fcntl", "resource", "pwd", "grp", "zenoh", "termios"],
         commands=[
-            ["scenario", "list"],
-            ["scenario", "show", "paper"],
             ["scenario", "check", "paper"],
             ["scenario", "new", "mine.toml"],
             ["sim", "two_sites", "--duration", "0.2", "-o", "run.mcap"],
             ["verify", "run.mcap", "--virtual"],
-            ["report", "run.mcap"],
+            ["figure", "run.mcap", "positions", "--format", "png"],
         ],
     )
     done = subprocess.run(

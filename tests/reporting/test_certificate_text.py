@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,19 +9,12 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
-from trilat_net.log.log_reader import Log
 from trilat_net.reporting.certificate_text import CertificateMark, describe_certificate, list_energies
 from trilat_net.reporting.figures.certificate_energy import draw_functional
-from trilat_net.reporting.page import write_report
-
-
-def jittered() -> Log:
-    return runs.log("free", {**runs.JITTER, "rate_hz": 100})
-
 
 LOGS = {
     "free": lambda: runs.log("free", {"duration_s": 4.0, "rate_hz": 200}),
-    "jitter": jittered,
+    "jitter": lambda: runs.log("free", {**runs.JITTER, "rate_hz": 100}),
     "rich": lambda: runs.log("rich"),
     "four": lambda: logs.simulated("four"),
     "p_d": lambda: runs.log("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}),
@@ -68,17 +60,6 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
     assert len(marked) == (found.verdict.rise is not None)
 
 
-def test_the_page_shows_it_in_one_file_and_a_figure_beside_it(tmp_path: Path) -> None:
-    log = jittered()
-    page, facts, *figures = write_report(log, tmp_path, certificate=certify(log))
-    html = page.read_text(encoding="utf-8")
-    assert "<strong>outside the theorem (delays): V rose by" in html
-    assert "<td>V at 0 s</td>" in html
-    assert 'src="data:image/png;base64,' in html
-    assert tmp_path / "certificate.png" in figures
-    assert json.loads(facts.read_text())["certificate"]["verdict"] == "rose"
-
-
 @pytest.mark.parametrize(
     ("name", "marks"),
     [
@@ -99,6 +80,14 @@ def test_lines_give_verdict_growth_and_balance_and_pass_where_one_vouches_and_no
     assert found.passed is (CertificateMark.OK in marks[:2] and CertificateMark.FAIL not in marks)
 
 
+def test_many_links_are_one_entry() -> None:
+    balance = certify(LOGS["four"]()).balance
+    assert balance is not None
+    some = {f"a->{n}": np.ones_like(balance.V) for n in range(7)}
+    names = [name for name, _ in list_energies(replace(balance, work={**balance.work, **some}))]
+    assert [name for name in names if "->" in name or "links" in name] == ["given: 19 links"]
+
+
 def test_the_papers_weights_are_told_of_where_they_are_wrong_and_v_rises_with_them() -> None:
     told = describe_certificate(runs.certified("free", runs.LYAPUNOV))[-1]
     assert told.mark is CertificateMark.NOTE
@@ -112,15 +101,6 @@ def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
     assert found.balance is not None
     (_, first), *between, (_, last) = list_energies(found.balance)
     assert first + sum(amount for _, amount in between) == pytest.approx(last, abs=1e-5 * found.balance.scale)
-
-
-def test_many_links_are_one_entry() -> None:
-    found = certify(LOGS["four"]())
-    assert found.balance is not None
-    some = {f"a->{n}": np.ones_like(found.balance.V) for n in range(7)}
-    listed = list_energies(replace(found.balance, work={**found.balance.work, **some}))
-    assert [name for name, _ in listed if "->" in name] == []
-    assert any("links" in name for name, _ in listed)
 
 
 def test_no_energy_is_said() -> None:

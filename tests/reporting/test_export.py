@@ -3,9 +3,11 @@
 import csv
 import json
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import polars as pl
 import pytest
@@ -13,8 +15,46 @@ import scipy.io
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.reporting.exported import expected, exported, log
+from tests.analysis import logs
+from tests.log_editing import opened, recorded
+from trilat_net.log.log_reader import Log
+from trilat_net.net.messages import Event
+from trilat_net.reporting.export import Exporter, ExportFormat
 from trilat_net.scenario import parse_scenario
+
+
+@cache
+def log() -> Log:
+    """A log with everything in it: links of all kinds, modes, changes, events, statistics."""
+    text = 'says "no",\nand 1.5 °C'
+    awkward = Event(member="a", boot=2**64 - 1, kind="refused", text=text, t_ns=-1, clocks={"a": "x"}, n=0)
+    plain = Event(member="c", boot=7, kind="end", text="c made 5 ticks", t_ns=9_000_000, ticks=5, n=0)
+    stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
+    new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
+    told = [msgspec.structs.replace(one, **new) for one in stats]
+    return logs.rewritten(logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told])
+
+
+@cache
+def expected() -> dict[str, dict[str, list[Any]]]:
+    """Per table the values of every column, as Python's own; None where there is none."""
+    wanted = {
+        table.label: {column.name: column.rows(0, len(table)) for column in table.columns}
+        for table in log().tables()
+    }
+    assert len(wanted) == 3 * 3 + 1
+    assert None in wanted["a_state"]["used_b_tick"]
+    assert {"run", "hold", "return"} & set(wanted["a_state"]["mode"])
+    assert any("\n" in text for text in wanted["events"]["text"])
+    assert None in wanted["a_link"]["offset_c_us"]
+    return wanted
+
+
+def exported(form: str, folder: Path) -> Path:
+    path = folder / f"out-{form}"
+    Exporter(ExportFormat(form), path).export(log())
+    assert [entry.name for entry in folder.iterdir()] == [path.name]
+    return path
 
 
 def bits(value: float) -> bytes:
@@ -28,34 +68,20 @@ def same(value: Any, wanted: Any) -> bool:
     return type(value) is type(wanted) and value == wanted
 
 
-def test_there_is_something_to_export() -> None:
-    wanted = expected()
-    assert len(wanted) == 3 * 3 + 1
-    assert None in wanted["a_state"]["used_b_tick"]
-    assert {"run", "hold", "return"} & set(wanted["a_state"]["mode"])
-    assert any("\n" in text for text in wanted["events"]["text"])
-    assert None in wanted["a_link"]["offset_c_us"]
-
-
-def test_csv_read_by_the_standard_library(tmp_path: Path) -> None:
+def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
     folder = exported("csv", tmp_path)
     for name, columns in expected().items():
         with (folder / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.reader(stream))
-        assert rows[0] == list(columns)
-        for place, (_, values) in enumerate(columns.items()):
-            for row, wanted in zip(rows[1:], values, strict=True):
+            heads, *rows = csv.reader(stream)
+        assert heads == list(columns)
+        for place, values in enumerate(columns.values()):
+            for row, wanted in zip(rows, values, strict=True):
                 text = row[place]
                 read = text if isinstance(wanted, str) else None if text == "" else type(wanted)(text)
                 assert same(read, wanted)
-
-
-def test_csv_read_by_polars(tmp_path: Path) -> None:
-    folder = exported("csv", tmp_path)
-    wanted = expected()["b_state"]
     frame = pl.read_csv(folder / "b_state.csv")
-    assert frame.columns == list(wanted)
-    for name, values in wanted.items():
+    assert frame.columns == list(expected()["b_state"])
+    for name, values in expected()["b_state"].items():
         assert all(map(same, frame[name].to_list(), values))
 
 

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from tests.analysis import logs
+from tests.analysis.certificate import runs
 from trilat_net.analysis import site_signals
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_summary import summarise_run
 from trilat_net.execution.log_checks import CheckLine
+from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures
 from trilat_net.reporting.page import render_report, write_report
 
 VERDICTS = [CheckLine("records", "all <b>there</b>", True), CheckLine("executed again", "differs", False)]
@@ -29,11 +32,7 @@ class Page(HTMLParser):
         self.elements.append((tag, dict(attrs)))
 
     def handle_data(self, data):
-        tag = self.elements[-1][0] if self.elements else ""
-        self.texts.setdefault(tag, []).append(data)
-
-    def scripts(self):
-        return [attrs for tag, attrs in self.elements if tag == "script"]
+        self.texts.setdefault(self.elements[-1][0] if self.elements else "", []).append(data)
 
 
 def read(html):
@@ -46,24 +45,27 @@ def page(log, twin=None):
     return read(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
 
 
-def written(log, folder, twin=None):
-    paths = write_report(log, folder / "new", twin=twin, verdicts=VERDICTS)
-    return paths, *read(paths[0].read_text(encoding="utf-8"))
-
-
 def column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
-@pytest.mark.parametrize("name", ["two_sites", "four"])
-def test_a_report_is_a_page_numbers_and_pictures(name, tmp_path):
-    paths, html, data = written(logs.simulated(name), tmp_path, logs.twin(name))
+def test_a_report_is_a_page_numbers_and_pictures(tmp_path):
+    """With a certificate: of a run in which V rose."""
+    log = runs.log("free", {**runs.JITTER, "rate_hz": 100})
+    paths = write_report(log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS)
     assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
-    assert all(path.suffix == ".png" for path in paths[2:])
+    wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {"certificate"}
+    assert {path.stem for path in paths[2:]} == wanted | {"hands_moved"}
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths[2:])
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
     facts = json.loads(paths[1].read_text())
     assert facts["checks"] == [verdict._asdict() for verdict in VERDICTS]
+    assert facts["certificate"]["verdict"] == "rose"
+    html, data = read(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000
+    assert "<strong>outside the theorem (delays): V rose by" in html
+    assert "<td>V at 0 s</td>" in html
+    assert 'src="data:image/png;base64,' in html
     sections = {attrs.get("data-section") for _, attrs in Page(html).elements} - {None}
     assert {chart["section"] for chart in data["charts"]} == sections
 
@@ -88,28 +90,19 @@ def test_texts_of_a_scenario_stay_texts():
     log = logs.simulated("four")
     html, _ = page(log)
     seen = Page(html)
-    assert len(seen.scripts()) == 3  # data, library, page
+    assert sum(tag == "script" for tag, _ in seen.elements) == 3  # data, library, page
     assert not [tag for tag, _ in seen.elements if tag == "i"]
     assert "alert(1)" in "".join(seen.texts["h1"])
     assert "<script>alert" not in html
     assert "&lt;script&gt;alert(1)" in html
     assert "all &lt;b&gt;there&lt;/b&gt;" in html
-
-
-def test_verdicts_show_what_passed_and_what_failed():
-    html, _ = page(logs.simulated("paper"))
-    items = [attrs["class"] for tag, attrs in Page(html).elements if tag == "li" and "class" in attrs]
+    items = [attrs["class"] for tag, attrs in seen.elements if tag == "li" and "class" in attrs]
     assert items == ["passed", "failed"]
-
-
-def test_the_page_says_how_to_do_it_again():
-    html, _ = page(logs.simulated("four"))
     assert "trilat verify FILE" in html
     assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
-    assert "dominance" in html
 
 
-def test_a_spike_of_one_tick_is_on_the_page():
+def test_the_page_holds_the_log_with_a_spike_of_one_tick():
     def spike(state):
         return (
             msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
@@ -124,11 +117,6 @@ def test_a_spike_of_one_tick_is_on_the_page():
     ticks = np.frombuffer(base64.b64decode(table["tick"]), "<i4")
     assert values.max() == 9.5
     assert ticks[values.argmax()] == 123
-
-
-def test_the_page_holds_the_log():
-    log = logs.simulated("two_sites")
-    _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
         values = column(data["tables"][series["table"]], series["column"])
@@ -166,20 +154,15 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
     assert [chart["lines"] for chart in ages] == [[{"value": 200.0, "colour": "limit"}]] * 3
 
 
-@pytest.mark.parametrize("records", [0, 1])
-def test_short_logs_have_a_report(records, tmp_path):
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False)
-    paths, html, _ = written(log, tmp_path, logs.twin("paper"))
-    assert "the file was not finished" in html
+@pytest.mark.parametrize("sites", [(), pytest.param(("m2", "s"), marks=pytest.mark.long)])
+def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
+    """No record at all, and one of two sites and none of the third."""
+    some = logs.timed(logs.simulated("paper"))
+    log = logs.rewritten(some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live")
+    paths = write_report(log, tmp_path, twin=logs.twin("paper"), verdicts=VERDICTS)
     assert {"report.html", "summary.json", "positions.png", "arms.png"} <= {path.name for path in paths}
+    assert "the file was not finished" in paths[0].read_text(encoding="utf-8")
 
 
-def test_a_site_without_records_has_a_report(tmp_path):
-    log = logs.rewritten(logs.timed(logs.simulated("paper")), keep=lambda s: s.site != "m1", driver="live")
-    paths, _, _ = written(log, tmp_path, logs.twin("paper"))
-    assert {"report.html", "summary.json", "positions.png", "arms.png"} <= {path.name for path in paths}
-
-
-def test_a_run_that_diverged_has_a_report():
-    html, _ = page(logs.diverged())
-    assert "<tr><th>diverged</th><td>yes</td></tr>" in html
+def test_a_run_that_diverged_has_a_page():
+    assert "<tr><th>diverged</th><td>yes</td></tr>" in page(logs.diverged())[0]

@@ -1,6 +1,5 @@
 """What is shown where: every curve is in the file, has a name and shares a plot with its unit alone."""
 
-import io
 from pathlib import Path
 
 import pytest
@@ -71,13 +70,7 @@ def test_a_number_of_two_dimensions_has_the_name_of_both(files: dict[str, Path])
     assert delays[0].curves[0].names == ("s median", "s max")
 
 
-@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"nonsense" * 100])
-def test_a_file_without_an_index_has_no_channels_to_show(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "x.mcap").write_bytes(content)
-    assert read_ros2_channels(tmp_path / "x.mcap") == {}
-
-
-def test_a_torn_log_has_none_either(files: dict[str, Path], tmp_path: Path) -> None:
-    data = io.BytesIO(files["live"].read_bytes()).read(50_000)
-    (tmp_path / "torn.mcap").write_bytes(data)
-    assert read_ros2_channels(tmp_path / "torn.mcap") == {}
+def test_a_file_without_an_index_has_no_channels_to_show(files: dict[str, Path], tmp_path: Path) -> None:
+    for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
+        (tmp_path / "x.mcap").write_bytes(content)
+        assert read_ros2_channels(tmp_path / "x.mcap") == {}

@@ -13,7 +13,7 @@ from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.reporting import rerun_viewer
-from trilat_net.reporting.rerun_viewer import ViewerOptions, open_rerun
+from trilat_net.reporting.rerun_viewer import ViewerOptions, make_application_id, open_rerun
 
 
 @pytest.fixture(scope="module")
@@ -71,34 +71,25 @@ def test_what_was_made_for_it_is_gone_when_the_viewer_is(files: dict[str, Path])
     assert files["live"].exists()
 
 
-def test_parts_are_shown_as_one(files: dict[str, Path]) -> None:
-    parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
-    rerun, _ = shown(parts, ViewerOptions(save=Path("x.rrd")))
-    assert rerun.log.name == parts[0].name
-    assert "/m/joint_states" in rerun.topics
-
-
-def test_a_log_that_was_not_finished_is_shown_as_far_as_it_is_whole(
+def test_parts_are_shown_as_one_and_a_torn_log_as_far_as_it_is_whole(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
+    parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(files["live"].read_bytes()[:150_000])
-    rerun, _ = shown([torn], ViewerOptions(save=Path("x.rrd")))
-    assert rerun.log.name == "run.mcap"
-    assert "/s/error" in rerun.topics
+    for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
+        rerun, _ = shown(paths, ViewerOptions(save=Path("x.rrd")))
+        assert rerun.log.name == name
+        assert {"/m/joint_states", "/s/error"} <= rerun.topics
 
 
-@pytest.mark.parametrize(
-    ("name", "called"),
-    [("run.mcap", "run"), ("my run.2.mcap", "my-run-2"), ("-x.mcap.active", "x"), ("ü.mcap", "log")],
-)
-def test_a_name_that_rerun_does_not_take_is_replaced(
-    files: dict[str, Path], tmp_path: Path, name: str, called: str
-) -> None:
+def test_a_name_that_rerun_does_not_take_is_replaced(files: dict[str, Path], tmp_path: Path) -> None:
     """It would find another one for the log than for its layout, and complain."""
-    (tmp_path / name).write_bytes(files["live"].read_bytes())
-    rerun, _ = shown([tmp_path / name], ViewerOptions(save=Path("x.rrd")))
-    assert rerun.log.stem == called
+    names = {"run.mcap": "run", "my run.2.mcap": "my-run-2", "-x.mcap.active": "x", "ü.mcap": "log"}
+    assert {name: make_application_id(Path(name)) for name in names} == names
+    (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
+    rerun, _ = shown([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
+    assert rerun.log.stem == "log"
     assert "/viz/m/error" in rerun.topics
 
 
@@ -124,22 +115,15 @@ def test_a_window_needs_a_display(files: dict[str, Path], monkeypatch: pytest.Mo
     assert "--save" not in rerun.command
 
 
-def test_an_end_that_was_bad_is_told(files: dict[str, Path]) -> None:
+def test_what_fails_is_told(files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    web = ViewerOptions(web=True)
     with pytest.raises(RunFailed, match="Rerun ended with exit code 3"):
-        shown([files["live"]], ViewerOptions(web=True), code=3)
-
-
-def test_without_rerun_it_says_what_to_install(
-    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+        shown([files["live"]], web, code=3)
+    with pytest.raises(LogError, match="No such file"):
+        shown([tmp_path / "none.mcap"], web)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(UsageError, match=r"pip install 'trilat-net\[view\]'"):
-        shown([files["live"]], ViewerOptions(web=True))
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="No such file"):
-        shown([tmp_path / "none.mcap"], ViewerOptions(web=True))
+        shown([files["live"]], web)
 
 
 def test_rerun_takes_log_and_layout_into_one_recording(files: dict[str, Path], tmp_path: Path) -> None:

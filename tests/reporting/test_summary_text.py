@@ -51,27 +51,10 @@ def test_of_many_lines_the_first_are_shown(monkeypatch):
 
 def statistics(tick, **clock):
     none = {"m1": 0, "s": 0}
-    fields = {
-        "accepted": none,
-        "late": none,
-        "duplicate": none,
-        "refused": none,
-        "dropped": {},
-        "overruns": 0,
-    }
-    return LinkStats(
-        v=2,
-        site="m2",
-        boot=1,
-        tick=tick,
-        t_ns=tick * 5_000_000,
-        mode="run",
-        age_us=none,
-        late_max_us=0,
-        busy_max_us=0,
-        **fields,
-        **clock,
-    )
+    counts = dict.fromkeys(("accepted", "late", "duplicate", "refused", "age_us"), none)
+    zeros = dict.fromkeys(("late_max_us", "busy_max_us", "overruns"), 0)
+    place = {"v": 2, "site": "m2", "boot": 1, "tick": tick, "t_ns": tick * 5_000_000, "mode": "run"}
+    return LinkStats(**place, **counts, **zeros, dropped={}, **clock)
 
 
 def clocked():
@@ -79,21 +62,10 @@ def clocked():
     first = {"offset_us": {"m1": 3_000_000, "s": 0}, "bound_us": {"m1": 200, "s": 0}, "rtt_us": {"m1": -1}}
     last = {"offset_us": {"m1": 3_000_100, "s": 0}, "bound_us": {"m1": 60, "s": 0}, "rtt_us": {"m1": 180}}
     faults = {"clock_faults": {"m1": 2}}
-    estimate = Event(
-        member="m2",
-        boot=1,
-        kind="clock",
-        text="",
-        about="m1",
-        ticks=20,
-        drift_ppb=50_000,
-        drift_bound_ppb=900,
-    )
-    return logs.rewritten(
-        logs.simulated("paper"),
-        driver="live",
-        others=[statistics(20, **first), estimate, statistics(380, **last, **faults)],
-    )
+    drift = {"drift_ppb": 50_000, "drift_bound_ppb": 900}
+    estimate = Event(member="m2", boot=1, kind="clock", text="", about="m1", ticks=20, **drift)
+    others = [statistics(20, **first), estimate, statistics(380, **last, **faults)]
+    return logs.rewritten(logs.simulated("paper"), driver="live", others=others)
 
 
 def test_a_clock_is_told_as_it_stood_at_the_end():

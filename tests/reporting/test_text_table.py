@@ -37,9 +37,6 @@ def test_a_terminal_gets_every_cell_and_no_control_characters() -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "\x1b" not in text
     assert "".join(text.split()).count("[red]") == 1
-
-
-def test_a_table_without_headers_has_no_header_line() -> None:
     console = Console(file=StringIO(), width=40)
-    console.print(TextTable(("", ""), [("a", "b")]).rich())
+    console.print(TextTable(("", ""), [("a", "b")]).rich())  # without headers, without their line
     assert console.file.getvalue().split() == ["a", "b"]  # type: ignore[attr-defined]
