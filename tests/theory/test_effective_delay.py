@@ -35,14 +35,8 @@ def test_a_constant_delay_is_in_use_from_the_next_tick_on(delay_ms: float, rate_
         {"link.delay_ms": 40.0, "link.loss": 0.3},
         {"link.delay_ms": 40.0, "sites.m.rate_hz": 110},
         {"link.model": "sine", "link.delay_ms": 60.0, "link.amplitude_ms": 40.0, "link.period_s": 1.0},
-        {
-            "link.model": "uniform",
-            "link.delay_ms": 60.0,
-            "link.half_width_ms": 50.0,
-            "link.playout_ms": 110.0,
-        },
     ],
-    ids=["jitter", "loss", "rates", "sine", "play-out"],
+    ids=["jitter", "loss", "rates", "sine"],
 )
 def test_the_mean_is_that_of_a_run(overrides: dict[str, object]) -> None:
     chosen = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 500, **overrides})

@@ -1,7 +1,6 @@
 """What linear analysis says of a scenario, in Python, in words, and as facts."""
 
 import json
-from dataclasses import FrozenInstanceError
 
 import pytest
 
@@ -31,12 +30,10 @@ def digital() -> LinearAnalysis:
     return analyse_linear_loop("paper", given, pose=POSE)
 
 
-def test_it_is_frozen_and_has_all(calm: LinearAnalysis) -> None:
+def test_above_the_edge_it_is_stable_with_a_margin(calm: LinearAnalysis) -> None:
     assert calm.verdict == "stable"
     assert calm.continuous.zeros == 2  # a pose that all share, per joint
     assert calm.margin.intervals[0].high_s == pytest.approx(0.23, abs=0.01)
-    with pytest.raises(FrozenInstanceError):
-        calm.notes = ()  # type: ignore[misc]
 
 
 def test_less_damping_than_the_edge_is_unstable() -> None:

@@ -46,11 +46,6 @@ def test_without_a_box_the_slave_returns() -> None:
     assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
 
 
-def test_a_small_gain_of_the_gravity_terms_lets_the_arms_hang() -> None:
-    made = measured("box", {**NO_BOX, "control.Gamma": [1.0, 1.0, 1.0, 0.01, 0.01]})
-    assert made.end_pose_rad["s"][0] == printed(-1.58, 0.01)
-
-
 def test_a_truth_on_the_edge_of_the_box_lets_them_sag() -> None:
     made = measured("box", {**EDGE, "duration_s": 20.0})
     assert made.end_pose_rad["s"][0] < -0.4

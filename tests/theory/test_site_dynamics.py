@@ -106,11 +106,6 @@ def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
     x[Q] = 2.5, 0.1
     assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
-    x[QD] = 1e3, 0.0
-    assert np.abs(evaluate_site_rates(one, x).external).max() in (
-        0.0,
-        np.abs(evaluate_site_rates(one, x).external).max(),
-    )
     outward = np.sign(
         evaluate_site_rates(one, x * np.where(np.arange(ARGUMENT_COUNT) == QD.start, 0.0, 1.0)).external[0]
     )

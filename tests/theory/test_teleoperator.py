@@ -31,6 +31,7 @@ from trilat_net.theory.port_response import (
 
 BARE: dict[str, Any] = {"sites.m1.hands": [], "sites.m2.hands": [], "sites.s.hands": [], "timeline": []}
 POSE = (-0.6, 1.8)
+ALONE: dict[str, dict[str, Any]] = {"free": {}, "two_sites": {"sites.m.hands": []}}
 
 
 def at_pose(
@@ -41,14 +42,18 @@ def at_pose(
     return scenario, now, rest, linearise_teleoperator(now, rest)
 
 
+def grid(loop: LinearLoop) -> np.ndarray:
+    delay_s = find_longest_delay_s(loop)
+    return refine_frequencies(build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s))
+
+
 def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> Passivity:
     output = build_proof_output(now, loop)
     assert output is not None
-    w = refine_frequencies(
-        build_admittance(loop), build_frequency_grid(1e-3, 100.0, find_longest_delay_s(loop))
-    )
     beta = np.repeat(np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2)
-    return check_passivity(lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output), w, beta)
+    return check_passivity(
+        lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output), grid(loop), beta
+    )
 
 
 def test_hands_back_at_their_ports_make_the_loop_that_had_them() -> None:
@@ -85,34 +90,21 @@ def test_force_that_a_law_reflects_is_reflected_of_a_load_as_well() -> None:
 
 def test_what_acted_at_the_rest_goes_on_acting() -> None:
     scenario = load_scenario("training")
-    now, rest = derive_operating_conditions(scenario), find_equilibrium(load_scenario("training"))
-    off = freeze_external_torques(now, rest)
+    off = freeze_external_torques(derive_operating_conditions(scenario), find_equilibrium(scenario))
     pushes = [site.actors[0].a for site in off.sites if site.actors]
     assert len(pushes) == 2
     assert np.abs(np.array(pushes)).max() > 1.0
-    assert (
-        not freeze_external_torques(
-            derive_operating_conditions(load_scenario("training", BARE)),
-            find_equilibrium(load_scenario("training", BARE), POSE),
-        )
-        .sites[0]
-        .actors
-    )
+    _, now, rest, _ = at_pose("training", BARE)
+    assert not any(site.actors for site in freeze_external_torques(now, rest).sites)
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 50.0, 200.0, 800.0])
 @pytest.mark.parametrize("name", ["free", "two_sites"])
 def test_the_paper_s_law_is_passive_in_r_and_not_in_qd_whatever_the_delay(name: str, delay_ms: float) -> None:
     """What its theorem states of the nonlinear loop with hands, docs/errata.md."""
-    _, now, _, loop = at_pose(
-        name,
-        {"link.delay_ms": delay_ms} if name == "free" else {"link.delay_ms": delay_ms, "sites.m.hands": []},
-    )
+    _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
-    Y = build_admittance(loop)
-    assert not check_passivity(
-        Y, refine_frequencies(Y, build_frequency_grid(1e-3, 100.0, find_longest_delay_s(loop)))
-    ).passive
+    assert not check_passivity(build_admittance(loop), grid(loop)).passive
 
 
 def test_rows_of_dominance_that_do_not_circle_need_the_weights_of_the_proof() -> None:
@@ -163,10 +155,7 @@ def test_statics_share_the_force_by_dominance() -> None:
 @pytest.mark.parametrize("name", ["free", "two_sites"])
 def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: float) -> None:
     """A push moves N sites together, each a spring Gamma g^2 cos^2 q (1 + Lambda T) of its channel."""
-    _, now, _, loop = at_pose(
-        name,
-        {"link.delay_ms": delay_ms} if name == "free" else {"link.delay_ms": delay_ms, "sites.m.hands": []},
-    )
+    _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     w = 1e-4
     Z = 1j * w * np.linalg.inv(build_admittance(loop)(np.array([w]))[0])  # stiffness of all ports
     first, outer = (9.81**2 * np.cos(angle) ** 2 * (1.0 + 1e-3 * delay_ms) for angle in (POSE[0], sum(POSE)))
@@ -178,7 +167,7 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
 
 def test_against_a_clamped_site_the_learnt_gravity_winds_up() -> None:
     """Impedance as 1 / w^2 towards zero, its phase that of a negative damper."""
-    _, _, _, loop = at_pose("two_sites", {"sites.m.hands": []})
+    _, _, _, loop = at_pose("two_sites", ALONE["two_sites"])
     held = apply_loads(loop, {"s": CLAMPED})
     assert {parse_port_site(name) for name in held.inputs} == {"m"}
     Z = 1.0 / build_admittance(held)(np.array([1e-3, 2e-3]))[:, 0, 0]
