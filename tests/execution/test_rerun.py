@@ -119,14 +119,6 @@ def test_on_a_measured_link_arrivals_are_all_that_counts() -> None:
     assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == ((20.0, 9.0), (20.0, 9.0))
 
 
-def test_all_sites_replaced_are_a_closed_loop() -> None:
-    log = opened(recorded("free"))
-    changes = {"control.Kp": 2.0}
-    by_name, at_once = rerun(log, SITES, changes), rerun(log, [], changes, closed_loop=True)
-    assert by_name.request == at_once.request
-    assert by_name.to_json() == at_once.to_json()
-
-
 def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
     """An m1 that moves otherwise is seen by s where s is executed, 20 ms later, and by nobody else."""
     log = opened(recorded("free"))

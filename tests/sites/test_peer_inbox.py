@@ -24,17 +24,9 @@ RATE_HZ = 1000
 
 
 def payload(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
-    message = {
-        "v": VERSION,
-        "site": PEERS[peer],
-        "boot": BOOTS[peer],
-        "tick": tick,
-        "q": [0.1 * tick, 0.2],
-        "qd": [0.3, 0.4],
-        "tau_x": [0.5, 0.6],
-        "sent_ns": tick * 1_000_000,
-    }
-    return msgpack.packb({**message, **changed})
+    message = {"v": VERSION, "site": PEERS[peer], "boot": BOOTS[peer], "tick": tick}
+    vectors = {"q": [0.1 * tick, 0.2], "qd": [0.3, 0.4], "tau_x": [0.5, 0.6]}
+    return msgpack.packb({**message, **vectors, "sent_ns": tick * 1_000_000, **changed})
 
 
 EPOCH_NS = 7_000_000_000

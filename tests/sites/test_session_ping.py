@@ -81,19 +81,10 @@ def test_sites_that_run_say_how_their_links_are() -> None:
     party = Party(("m", "s"))
     party.start("m")
     visit = Visit(party)
-    stats = LinkStats(
-        v=VERSION,
-        site="m",
-        boot=1,
-        tick=5,
-        t_ns=5,
-        mode="run",
-        overruns=0,
-        **{name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")},
-        late_max_us=0,
-        busy_max_us=0,
-        delay_us={"s": 120},
-    )
+    counts = {name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")}
+    zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
+    own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
+    stats = LinkStats(**own, **counts, **zeros, delay_us={"s": 120})
     for junk in (b"", b"\xc1", bytes(70_000)):
         party.say("m", junk, topics.LINK)
         party.say("m", junk, topics.INFO)

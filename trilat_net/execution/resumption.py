@@ -155,7 +155,7 @@ class RecordedInputs(Generic[Change]):
         older than record n, or than the first sample that arrived after it.
         """
         states = self._part.states
-        records, ticks = self._listing[peer]
+        first_listed, records, ticks = self._listing[peer]
         place = bisect_left(records, n)
         next_listed = ticks[place] if place < len(records) else self.ends[peer] + 1
         newest = max(-(-states[n].t_ns * rate_hz // NS_PER_S) - 1, next_listed - 1)
@@ -168,7 +168,7 @@ class RecordedInputs(Generic[Change]):
         # a waiting sample was sent within the longest delay there is
         oldest = (states[n].t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
         for tick in range(max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1):
-            listed = self._listed[peer].get(tick)
+            listed = first_listed.get(tick)
             if listed is None and tick <= newest:
                 probable.add(tick)
             elif listed is not None and listed < n:
@@ -176,24 +176,18 @@ class RecordedInputs(Generic[Change]):
         return certain, probable
 
     @cached_property
-    def _listed(self) -> list[dict[int, int]]:
-        """Per peer and sample, the first record (by its place) that lists it."""
-        listed: list[dict[int, int]] = [{} for _ in self.samples]
-        for m, state in enumerate(self._part.states):
-            for peer, tick, _ in state.rx:
-                if 0 <= peer < len(listed):
-                    listed[peer].setdefault(tick, m)
-        return listed
+    def _listing(self) -> list[tuple[dict[int, int], list[int], list[int]]]:
+        """Per peer the first record (by its place) that lists each sample.
 
-    @cached_property
-    def _listing(self) -> list[tuple[list[int], list[int]]]:
-        """Per peer the records (by their places) that list samples of it, and the first that each lists."""
-        listing: list[tuple[list[int], list[int]]] = [([], []) for _ in self.samples]
+        Beside it the records that list any sample of it, and the first that each of them lists.
+        """
+        listing: list[tuple[dict[int, int], list[int], list[int]]] = [({}, [], []) for _ in self.samples]
         for m, state in enumerate(self._part.states):
-            seen = set()
             for peer, tick, _ in state.rx:
-                if 0 <= peer < len(listing) and peer not in seen:
-                    seen.add(peer)
-                    listing[peer][0].append(m)
-                    listing[peer][1].append(tick)
+                if 0 <= peer < len(listing):
+                    first_listed, records, ticks = listing[peer]
+                    first_listed.setdefault(tick, m)
+                    if not records or records[-1] != m:
+                        records.append(m)
+                        ticks.append(tick)
         return listing
