@@ -56,11 +56,9 @@ class _Child:
             )
 
     def code(self) -> int | None:
-        """Returns the exit code, negative for a signal, or None while it runs."""
         return self._process.poll()
 
     def end(self, number: int) -> None:
-        """Sends a signal that ends the process."""
         if self.code() is None:
             self._signalled = True
             self._process.send_signal(number)

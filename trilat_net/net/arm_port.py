@@ -29,11 +29,7 @@ FRESH_NS = 100_000_000
 
 
 class ArmPort:
-    """The connection of an arm to its site; a context, which closes it.
-
-    Attributes:
-        record: the newest record of the site, None before the first.
-    """
+    """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         self.record: State | None = None

@@ -118,19 +118,16 @@ class _Ring(Generic[T]):
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:
-        """Returns the oldest entry, or None."""
         return self._entries.popleft() if self._entries else None
 
 
 class StampingRing:
     """The `StampedInbox` of every bus; `take` may run in another thread than `poll`.
 
-    Attributes:
-        overflowed: see `StampedInbox`; every message taken is polled, waits, or is counted here.
+    Every message taken is polled, waits, or is counted in `overflowed`.
     """
 
     def __init__(self, now_ns: Callable[[], int], capacity: int) -> None:

@@ -69,7 +69,6 @@ class Connection:
     """Endpoints and mode of a member.
 
     Attributes:
-        listen: endpoints to listen at.
         connect: endpoints to connect to; a client takes the first that answers. None: still to be found.
         mode: peer of the other members, client of a router, or a router.
         own: Zenoh settings of a user's file.

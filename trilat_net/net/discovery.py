@@ -123,7 +123,7 @@ def request_change(
         SessionError: the session has no such site, has not begun, or the site does not reply.
     """
     with connect_to_session(
-        connection, clock, session, names, stopped=_never, timeout_s=REPLY_TIMEOUT_S
+        connection, clock, session, names, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
     ) as bus:
         assert bus is not None  # nothing stops it
         info = _find_site(bus, clock, session, site, names)
@@ -141,12 +141,8 @@ def request_change(
     raise SessionError(f"{site} gave no answer; its records show whether it made the change")
 
 
-def _never() -> bool:
-    return False
-
-
 def _find_site(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
-    for info in find_members(bus, clock, session, stopped=_never, timeout_s=REPLY_TIMEOUT_S):
+    for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
         if info.member == site:
             return info
         sites = names(info.scenario) if info.scenario else ()

@@ -21,7 +21,6 @@ class LoopStats:
     """Counters of a loop, since the last statistics and since the start; `rates` are those of the peers, Hz.
 
     Attributes:
-        dropped: messages dropped, by reason.
         overruns: ticks whose work began after the next one was due.
     """
 

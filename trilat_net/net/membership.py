@@ -18,7 +18,7 @@ from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info
-from .pinging import Pinger, RepeatedQuery
+from .pinging import RepeatedQuery
 from .wire import M, decode, encode
 
 
@@ -49,9 +49,7 @@ def read_events(inbox: Inbox) -> Iterator[Event]:
 class EventPublisher:
     """Publishes a member's events and answers queries for its identity.
 
-    Attributes:
-        info: the identity that it answers with.
-        published: number of events so far; `keep` takes the payload of each.
+    It answers with `info`; `keep` takes the payload of every event.
     """
 
     def __init__(
@@ -84,11 +82,7 @@ class EventPublisher:
 
 
 class MemberQuery:
-    """Asks the members of a session for their identities, again and again.
-
-    Attributes:
-        unreadable: by member, why its answer cannot be read.
-    """
+    """Asks the members of a session for their identities, again and again; notes why one is unreadable."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
         self.unreadable: dict[str, str] = {}
@@ -234,35 +228,3 @@ class Epoch(NamedTuple):
     unix_ns: int
     boots: Mapping[str, int]
     epochs: Mapping[str, int] = {}
-
-
-class LateJoin:
-    """Finds the epoch of a session that is already running, for a recorder."""
-
-    def __init__(self, membership: Membership, pinger: Pinger) -> None:
-        self._membership, self._pinger = membership, pinger
-        self._first_ns: int | None = None
-
-    def poll(self, now_ns: int) -> Epoch | None:
-        """Returns the epoch once all members of the session that are present have been met."""
-        infos = [
-            info
-            for _, info in sorted(self._membership.met.items())
-            if info.running and info.scenario and info.boots.get(info.member) == info.boot
-        ]
-        running = [info for info in infos if info.boots == infos[0].boots]
-        if not running:
-            self._first_ns = None
-            return None
-        if self._first_ns is None:
-            self._first_ns = now_ns
-        sites = set(running[0].boots) - {topics.RECORDER}
-        if {info.member for info in running} < sites and now_ns - self._first_ns < LATE_GATHER_NS:
-            return None
-        own = self._membership.own.clock
-        for info in sorted(running, key=lambda info: info.clock != own):
-            if info.clock == own or self._pinger.know([info.boot]):
-                # as the clocks stand now: their drift apart since the epoch is unknown
-                offset_ns = 0 if info.clock == own else self._pinger.estimate(info.boot).offset_at(now_ns)
-                return Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
-        return None

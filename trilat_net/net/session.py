@@ -16,7 +16,7 @@ from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import Epoch, EventPublisher, LateJoin, Membership, liveliness_token, read_events
+from .membership import LATE_GATHER_NS, Epoch, EventPublisher, Membership, liveliness_token, read_events
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
@@ -37,7 +37,7 @@ class SessionJoin:
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self.membership = Membership(bus, clock, session, publisher, sites)
         self.pinger = Pinger(bus, clock, session)
-        self._late_join = LateJoin(self.membership, self.pinger)
+        self._met_ns: int | None = None  # the first member of a running session
         answer_pings(bus, clock, session, publisher.info)
         self._offered: Event | None = None
         self._epoch_ns = 0
@@ -66,8 +66,32 @@ class SessionJoin:
             if membership.leads:
                 epoch = self._lead()
             elif not self._sites and (self._announced is None or now_ns >= self._epoch_ns):
-                epoch = self._late_join.poll(now_ns)  # not while `start` may still be under way
+                epoch = self._join_late(now_ns)  # not while `start` may still be under way
         return epoch
+
+    def _join_late(self, now_ns: int) -> Epoch | None:
+        """Returns a recorder's epoch of a running session once all its present members have been met."""
+        infos = [
+            info
+            for _, info in sorted(self.membership.met.items())
+            if info.running and info.scenario and info.boots.get(info.member) == info.boot
+        ]
+        running = [info for info in infos if info.boots == infos[0].boots]
+        if not running:
+            self._met_ns = None
+            return None
+        if self._met_ns is None:
+            self._met_ns = now_ns
+        sites = set(running[0].boots) - {topics.RECORDER}
+        if {info.member for info in running} < sites and now_ns - self._met_ns < LATE_GATHER_NS:
+            return None
+        own = self.membership.own.clock
+        for info in sorted(running, key=lambda info: info.clock != own):
+            if info.clock == own or self.pinger.know([info.boot]):
+                # as the clocks stand now: their drift apart since the epoch is unknown
+                offset_ns = 0 if info.clock == own else self.pinger.estimate(info.boot).offset_at(now_ns)
+                return Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
+        return None
 
     def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
         """Returns the boots of the sites on another clock."""

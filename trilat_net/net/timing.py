@@ -99,8 +99,6 @@ class LinkTimingMonitor:
     """Timing of one link, at its receiving end.
 
     Attributes:
-        peer: the sender's clock.
-        offset: the offset in use.
         newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
         faults: impossible stamps since the start.
         worst_ns: largest time by which a sample arrived before it was sent, since `reset_faults`.
