@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.analysis import delivery as module
@@ -72,7 +72,6 @@ def test_what_is_lost_is_what_the_link_was_said_to_lose():
     assert changed.lost[changed.stamp_ns >= 10**9].any()
 
 
-@settings(max_examples=200)
 @given(st.lists(st.integers(0, 10**14), max_size=20), st.integers(1, 20_000))
 def test_first_ticks_are_those_of_the_grid(due_ns, rate_hz):
     found = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)

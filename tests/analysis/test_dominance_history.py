@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
@@ -15,6 +15,7 @@ RATE_HZ = 50
 ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
 
 
+@settings(max_examples=40)
 @given(st.lists(ramps, max_size=4, unique_by=lambda ramp: ramp[0]))
 def test_they_are_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     tick_ns = 10**9 // RATE_HZ

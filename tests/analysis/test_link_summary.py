@@ -217,7 +217,7 @@ def test_the_effective_delay_under_jitter_is_that_of_theory(link, order, theory,
     use = uses(log)[link]
     assert use.age_ms.mean == pytest.approx(mean_ms, rel=margin)
     peer, site = link.split("->")
-    release = predict_delivery(log, peer, site, 300_000).release(1000)
+    release = predict_delivery(log, peer, site, 100_000).release(1000)
     ages = long_ages(release)[2000:-2000]
     assert ages.mean() == pytest.approx(mean_ms, rel=0.01)
     assert ages.std() == pytest.approx(deviation_ms, rel=0.05)
@@ -242,7 +242,7 @@ def test_the_figures_that_are_quoted():
 
 def test_loss_and_bursts_as_seen_are_those_of_the_model():
     scenario = load_scenario(
-        "two_sites", {"duration_s": 60.0, "rate_hz": 200, "link.loss": 0.2, "link.loss_burst": 5.0}
+        "two_sites", {"duration_s": 60.0, "rate_hz": 100, "link.loss": 0.2, "link.loss_burst": 5.0}
     )
     for use in summarise_links(trilat_net.simulate(scenario)):
         bursts = use.counts.lost / 5.0

@@ -48,18 +48,19 @@ def test_every_actor_does_what_the_core_says(
 
 
 def test_hands_and_environment_are_told_apart_and_make_up_the_record() -> None:
-    log = runs.log("rich")
+    log = runs.run("rich").log
     for site, track in align_records(log).items():
         spec = log.scenario.sites[site]
         by = attribute_torque(track, spec)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
-        assert by.operator.any() == bool(spec.hands)
-        assert by.environment.any() == bool(spec.environment)
+        assert (site == "s") == by.environment_now.any() == by.environment.any()
+        assert (site == "m1") == (np.abs(by.operator_held).max() > 1e-9)
+        assert (site == "m2") == (np.abs(by.operator_now).max() > 1e-9)
         assert by.script is not None  # every hand did what the scenario says
 
 
 def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
-    log = runs.log("rich")
+    log = runs.run("rich").log
     track = align_records(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
     assert attribute_torque(other, log.scenario.sites["m2"]).script is None

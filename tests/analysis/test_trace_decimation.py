@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -9,6 +9,7 @@ numbers = st.one_of(st.floats(-1e6, 1e6), st.just(np.nan))
 columns = hnp.arrays(np.float64, st.tuples(st.integers(1, 400), st.integers(1, 4)), elements=numbers)
 
 
+@settings(max_examples=40)
 @given(columns, st.integers(1, 30))
 def test_every_bucket_keeps_its_extremes(values, buckets):
     keep = extreme_rows(values, buckets)
@@ -25,6 +26,7 @@ def test_every_bucket_keeps_its_extremes(values, buckets):
                 assert np.nanmax(thinned) == np.nanmax(whole)
 
 
+@settings(max_examples=40)
 @given(columns, st.integers(1, 30))
 def test_the_ends_stay_and_the_rest_is_bounded(values, buckets):
     keep = extreme_rows(values, buckets)

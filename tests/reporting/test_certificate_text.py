@@ -13,11 +13,11 @@ from trilat_net.reporting.certificate_text import CertificateMark, describe_cert
 from trilat_net.reporting.figures.certificate_energy import draw_functional
 
 LOGS = {
-    "free": lambda: runs.log("free", {"duration_s": 4.0, "rate_hz": 200}),
-    "jitter": lambda: runs.log("free", {**runs.JITTER, "rate_hz": 100}),
-    "rich": lambda: runs.log("rich"),
+    "free": lambda: runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log,
+    "jitter": lambda: runs.run("free", {**runs.JITTER, "rate_hz": 100}).log,
+    "rich": lambda: runs.run("rich").log,
     "four": lambda: logs.simulated("four"),
-    "p_d": lambda: runs.log("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}),
+    "p_d": lambda: runs.run("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}).log,
     "empty": lambda: logs.rewritten(logs.simulated("paper"), lambda _: False),
     "diverged": logs.diverged,
     "busy": lambda: logs.busy().log,
@@ -89,10 +89,10 @@ def test_many_links_are_one_entry() -> None:
 
 
 def test_the_papers_weights_are_told_of_where_they_are_wrong_and_v_rises_with_them() -> None:
-    told = describe_certificate(runs.certified("free", runs.LYAPUNOV))[-1]
+    told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
     assert told.mark is CertificateMark.NOTE
     assert told.text.startswith("with the paper's weights, ones, V would have risen by 12.3 J of 32.8")
-    assert runs.certified("free", {"duration_s": 4.0, "rate_hz": 200}).ones is None
+    assert runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.ones is None
 
 
 @pytest.mark.parametrize("name", ["jitter", "rich", "busy"])
@@ -105,5 +105,5 @@ def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
 
 def test_no_energy_is_said() -> None:
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
-    found = certify(runs.log("paper", rest))
+    found = certify(runs.run("paper", rest).log)
     assert describe_certificate(found)[-1].text == "energy balance: there is no energy in this run"

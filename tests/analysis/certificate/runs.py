@@ -1,7 +1,8 @@
 """Virtual runs with their books, each made once per test session."""
 
+import json
 from collections.abc import Mapping
-from functools import cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
-from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario, parse_scenario
 
 ROWS = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
@@ -24,12 +24,15 @@ LYAPUNOV = {
     "sites.m2.control.Kd": 3.0,
     "sites.s.control.Kd": 0.3,
     "control.Kp": 0.1,
-    "duration_s": 10.0,
+    "duration_s": 5.0,
     "rate_hz": 500,
 }
 """Unequal shares and Kd, upon `free`."""
 
 JITTER = {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0, "duration_s": 3.0}
+
+EXPERT = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
+"""m1 and s follow each other, and m2 follows both."""
 
 RICH = """
 name = "rich"
@@ -96,6 +99,7 @@ to = { m2 = 0.9, s = 0.1 }
 
 WALL = """
 name = "wall"
+rate_hz = 500
 duration_s = 6.0
 [control]
 theta_hat0 = [3.0, 1.0, 1.0, 2.0, 1.0]
@@ -125,51 +129,36 @@ s = { m1 = 0.5, m2 = 0.5 }
 TEXTS = {"rich": RICH, "wall": WALL}
 
 
-def _frozen(overrides: Mapping[str, Any] | None) -> tuple[tuple[str, Any], ...]:
-    pairs = sorted((overrides or {}).items())
-    return tuple((key, tuple(value) if isinstance(value, list) else value) for key, value in pairs)
+class _Run:
+    """A run, and what is made of it, each once."""
+
+    def __init__(self, name: str, overrides: Mapping[str, Any]) -> None:
+        known = name in TEXTS
+        scenario = parse_scenario(TEXTS[name], name, overrides) if known else load_scenario(name, overrides)
+        self.log = trilat_net.simulate(scenario)
+
+    @cached_property
+    def energies(self) -> dict[str, SiteEnergy]:
+        return compute_site_energies(self.log)
+
+    @cached_property
+    def balance(self) -> EnergyBalance:
+        return compute_energy_balance(self.energies)
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        return certify(self.log)
 
 
-@cache
-def _log(name: str, overrides: tuple[tuple[str, Any], ...]) -> Log:
-    values = {key: list(value) if isinstance(value, tuple) else value for key, value in overrides}
-    scenario = parse_scenario(TEXTS[name], name, values) if name in TEXTS else load_scenario(name, values)
-    return trilat_net.simulate(scenario)
+_made: dict[str, _Run] = {}
 
 
-def log(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
-    """The log of a shipped scenario or of one above."""
-    return _log(name, _frozen(overrides))
-
-
-@cache
-def _books(name: str, overrides: tuple[tuple[str, Any], ...]) -> dict[str, SiteEnergy]:
-    return compute_site_energies(_log(name, overrides))
-
-
-def booked(name: str, overrides: Mapping[str, Any] | None = None) -> dict[str, SiteEnergy]:
-    """Its books."""
-    return _books(name, _frozen(overrides))
-
-
-@cache
-def _balanced(name: str, overrides: tuple[tuple[str, Any], ...]) -> EnergyBalance:
-    return compute_energy_balance(_books(name, overrides))
-
-
-def balanced(name: str, overrides: Mapping[str, Any] | None = None) -> EnergyBalance:
-    """Its balance."""
-    return _balanced(name, _frozen(overrides))
-
-
-@cache
-def _certified(name: str, overrides: tuple[tuple[str, Any], ...]) -> Certificate:
-    return certify(_log(name, overrides))
-
-
-def certified(name: str, overrides: Mapping[str, Any] | None = None) -> Certificate:
-    """Its certificate."""
-    return _certified(name, _frozen(overrides))
+def run(name: str, overrides: Mapping[str, Any] | None = None) -> _Run:
+    """A run of a shipped scenario or of one above, made once per test session."""
+    key = json.dumps([name, overrides or {}], sort_keys=True)
+    if key not in _made:
+        _made[key] = _Run(name, dict(overrides or {}))
+    return _made[key]
 
 
 def relative(balance: EnergyBalance) -> float:

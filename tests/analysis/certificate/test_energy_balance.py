@@ -25,30 +25,30 @@ def of_largest_v(b: EnergyBalance) -> float:
 
 def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
     rates = fine_hz // 2, fine_hz
-    coarse, fine = (of_largest_v(runs.balanced(name, {**overrides, "rate_hz": hz})) for hz in rates)
+    coarse, fine = (of_largest_v(runs.run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates)
     return float(np.log2(coarse / fine))
 
 
-@pytest.mark.parametrize("name", ["paper", "free", "asymmetric"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"])
 def test_it_closes_to_2e_5_of_the_largest_v_with_order_two(name: str) -> None:
-    assert of_largest_v(runs.balanced(name, {"duration_s": 3.0, "rate_hz": 1000})) <= 2e-5
-    assert order(name, duration_s=3.0) == pytest.approx(2.0, abs=0.1)
+    assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
+    assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
 
 def test_it_closes_until_both_hands_have_let_go() -> None:
-    """At half the rate four times the error is allowed."""
-    assert of_largest_v(runs.balanced("paper", {"duration_s": 11.5, "rate_hz": 500})) <= 8e-5
+    """At a tenth of the rate a hundred times the error is allowed."""
+    assert of_largest_v(runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
 def test_digital_closes_to_some_percent_with_order_one_and_sampling_is_what_is_left() -> None:
-    b = runs.balanced("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 1000})
-    assert of_largest_v(b) == pytest.approx(1.6e-2, rel=0.2)
-    assert order("paper", duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
-    assert np.abs(b.unexplained).max() <= 1e-5 * b.scale
+    b = runs.run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
+    assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
+    assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
+    assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
 def test_jitter_closes_to_1e_4_where_the_jumps_are_booked_and_not_to_3e_3_where_they_are_not() -> None:
-    b = runs.balanced("free", runs.JITTER)
+    b = runs.run("free", runs.JITTER).balance
     links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
     assert np.abs(b.residual + links).max() / b.V.max() >= 3e-3
@@ -57,7 +57,7 @@ def test_jitter_closes_to_1e_4_where_the_jumps_are_booked_and_not_to_3e_3_where_
 
 def test_jitter_is_of_order_one_at_least() -> None:
     """Of some seeds together: which jumps a run has is a matter of its draws; errors cancel to order 1.5."""
-    seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2, 3, 4)]
+    seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
     orders = [order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
 
@@ -66,19 +66,19 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     """Arms that brake: e and its derivative jump at once, and the torque that is held is that of before."""
     cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
     rest = [
-        float(np.abs(runs.balanced("free", {**cut, "rate_hz": hz}).unexplained).max()) for hz in (200, 400)
+        float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max()) for hz in (200, 400)
     ]
     assert np.log2(rest[0] / rest[1]) == pytest.approx(2.0, abs=0.2)
 
 
 def test_a_wall_closes_to_1e_4_though_it_gives_energy_to_r() -> None:
-    b = runs.balanced("wall")
+    b = runs.run("wall").balance
     assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
 
 
 def test_everything_at_once_closes_to_1e_4_at_500_hz() -> None:
-    b = runs.balanced("rich")
+    b = runs.run("rich").balance
     assert of_largest_v(b) <= 1e-4
     assert all(np.abs(x).max() > 1e-4 * b.scale for name, x in b.work.items() if name not in _SILENT)
 
@@ -100,20 +100,22 @@ TERMS = [
 def test_any_one_term_with_another_sign_or_factor_is_caught(
     name: str, group: str, term: str, factor: float
 ) -> None:
-    b = runs.balanced(name, runs.JITTER if name == "free" else None)
+    b = runs.run(name, runs.JITTER if name == "free" else None).balance
     terms = {**getattr(b, group), term: factor * getattr(b, group)[term]}
     assert runs.relative(replace(b, **{group: terms})) > CAUGHT > 5 * runs.relative(b)
 
 
 def test_ones_for_beta_is_caught_and_named() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
-    ones = compute_energy_balance(runs.booked("asymmetric", {"duration_s": 3.0, "rate_hz": 1000}), ones=True)
+    ones = compute_energy_balance(
+        runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies, ones=True
+    )
     assert runs.relative(ones) > 10 * CAUGHT
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
 def test_the_papers_v_rises_by_12_3_of_32_8_and_the_corrected_one_never() -> None:
-    books = runs.booked("free", runs.LYAPUNOV)
+    books = runs.run("free", runs.LYAPUNOV).energies
     ones, right = compute_energy_balance(books, ones=True), compute_energy_balance(books)
     assert ones.V[0] == pytest.approx(32.8, abs=0.1)
     assert _rise(ones) == pytest.approx(12.3, abs=0.5)
@@ -129,7 +131,10 @@ def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
     """`tests/theory/energy.py` knows one constant delay per link and nothing else; there both must agree."""
     overrides = {"duration_s": 2.5, "rate_hz": 500}
     made = run(name, overrides)
-    theirs, ours = balance_by_hand(made, left_null_vector(made.scenario) * 3), runs.balanced(name, overrides)
+    theirs, ours = (
+        balance_by_hand(made, left_null_vector(made.scenario) * 3),
+        runs.run(name, overrides).balance,
+    )
     close = {"abs": 1e-12 * float(theirs.V.max())}
     assert pytest.approx(theirs.V, **close) == ours.V
     assert sum(ours.dissipation.values()) == pytest.approx(theirs.taken, **close)
@@ -138,10 +143,10 @@ def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
 
 def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
     """V, dissipation and work of the continuous equations: DOP853 and Gauss-Legendre, nothing of ours."""
-    scenario = load_scenario("paper", {"duration_s": 3.0})
-    exact = equations(scenario).solve(3.0)
-    ours = runs.balanced("paper", {"duration_s": 3.0, "rate_hz": 1000})
-    for t in (0.5, 1.4, 2.9):
+    scenario = load_scenario("paper", {"duration_s": 2.0})
+    exact = equations(scenario).solve(2.0)
+    ours = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
+    for t in (0.5, 1.2, 1.9):
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
         taken, given = _exact_integrals(exact, t)
@@ -201,7 +206,7 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
 def test_a_closed_group_is_balanced_by_itself() -> None:
     """m1 and m2 follow each other alone; s follows both and has no part in their balance."""
     pair = {"dominance.m1.m2": 1.0, "dominance.m1.s": 0.0, "dominance.m2.m1": 1.0, "dominance.m2.s": 0.0}
-    energies = runs.booked("free", {**pair, "duration_s": 3.0, "rate_hz": 500})
+    energies = runs.run("free", {**pair, "duration_s": 3.0, "rate_hz": 500}).energies
     group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
     assert runs.relative(group) <= 1e-4

@@ -57,7 +57,7 @@ def outside(log: Log, *, known: bool) -> Log:
 
 
 def still_free() -> Log:
-    return logs.rewritten(runs.log("free", {"duration_s": 2.0, "rate_hz": 200}), lambda _: True)
+    return logs.rewritten(runs.run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True)
 
 
 def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
@@ -98,7 +98,7 @@ def test_a_period_too_long_for_the_gains_is_not_judged_and_accuses_nobody() -> N
 
 
 def test_gaps_are_left_out_and_told_of() -> None:
-    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0})
+    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
     log = logs.rewritten(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
     found = certify(log)
     assert found.balance is not None
@@ -113,7 +113,7 @@ def test_gaps_are_left_out_and_told_of() -> None:
 
 def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
     """Whatever was lost, nobody is accused for what lies in the gap."""
-    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
     for site in whole.sites:
         found = certify(
             logs.rewritten(whole, lambda s, site=site: not (s.site == site and 50 <= s.tick < 450))
@@ -122,7 +122,7 @@ def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
 
 
 def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes() -> None:
-    whole = runs.log("free", {"duration_s": 4.0, "rate_hz": 200})
+    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
     found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
     assert found.balance is not None
     assert found.verdict.finding is StabilityFinding.COVERED
@@ -149,7 +149,7 @@ def test_two_records_are_a_period() -> None:
 def test_nobody_moves_and_there_is_no_energy() -> None:
     """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by it."""
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
-    found = runs.certified("paper", rest)
+    found = runs.run("paper", rest).certificate
     assert found.balance is not None
     assert found.balance.V[0] == 0.0
     assert runs.relative(found.balance) <= 1e-3
@@ -158,7 +158,7 @@ def test_nobody_moves_and_there_is_no_energy() -> None:
 
 def test_sites_of_different_rates_are_booked_together() -> None:
     rates = {"sites.m2.rate_hz": 250, "sites.s.rate_hz": 350, "rate_hz": 500, "duration_s": 4.0}
-    found = runs.certified("asymmetric", rates)
+    found = runs.run("asymmetric", rates).certificate
     assert found.balance is not None
     assert len(found.balance.t_s) == pytest.approx(2000, abs=5)
     assert runs.relative(found.balance) <= 2e-4

@@ -19,7 +19,9 @@ SHORT = {"duration_s": 4.0, "rate_hz": 200}
 
 
 def made(name: str = "free", **overrides: object) -> Log:
-    return runs.log(name, {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}})
+    return runs.run(
+        name, {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
+    ).log
 
 
 def test_free_motion_is_covered() -> None:
@@ -30,7 +32,7 @@ def test_free_motion_is_covered() -> None:
 
 
 def test_hands_are_told_of_and_excused() -> None:
-    found = runs.certified("paper", {"duration_s": 11.5, "rate_hz": 100})
+    found = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).certificate
     assert found.verdict.finding is StabilityFinding.COVERED
     assert (
         "covered by the theorem: V rose by no more than the hands gave: 24 J at 0 s, " in found.verdict.text
@@ -38,7 +40,7 @@ def test_hands_are_told_of_and_excused() -> None:
 
 
 def test_outside_and_yet_not_risen() -> None:
-    found = runs.certified("wall")
+    found = runs.run("wall").certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.verdict.text.startswith(
         "outside the theorem (hands), yet V rose by no more than the hands and walls gave: "
@@ -47,7 +49,7 @@ def test_outside_and_yet_not_risen() -> None:
 
 
 def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
-    found = runs.certified("free", runs.JITTER)
+    found = runs.run("free", runs.JITTER).certificate
     rise = found.verdict.rise
     assert found.verdict.finding is StabilityFinding.ROSE
     assert rise is not None
@@ -93,7 +95,7 @@ def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) ->
 
 
 def test_a_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
-    log = runs.log("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500})
+    log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
     found = certify(
         logs.rewritten(log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s)
@@ -102,7 +104,7 @@ def test_a_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
 
 
 def test_hands_that_were_erased_break_the_balance() -> None:
-    log = runs.log("paper", {"duration_s": 11.5, "rate_hz": 100})
+    log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
     found = certify(logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0])))
     assert found.verdict.finding is StabilityFinding.BROKEN
     assert "the energy of m1 does not add up" in found.verdict.text
@@ -148,13 +150,9 @@ def test_groups_that_only_a_change_makes_are_refused_too() -> None:
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
-EXPERT = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
-"""m1 and s follow each other, and m2 follows both."""
-
-
 def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
     """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
-    found = certify(trilat_net.simulate(load_scenario("free", {**SHORT, **EXPERT, "duration_s": 1.0})))
+    found = certify(trilat_net.simulate(load_scenario("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0})))
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.end.behaviour.grows is None
     assert found.passed
@@ -163,7 +161,7 @@ def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
 def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
     hand = {"sites.m2.hands": [{"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}]}
     found = certify(
-        trilat_net.simulate(load_scenario("free", {**SHORT, **EXPERT, **hand, "duration_s": 1.0}))
+        trilat_net.simulate(load_scenario("free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}))
     )
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert not found.bounded_by_v
@@ -171,7 +169,7 @@ def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
 
 
 def test_growth_fails_a_run_whatever_v_did() -> None:
-    found = runs.certified("wall")
+    found = runs.run("wall").certificate
     grown = found.end._replace(behaviour=EndBehaviour.GROWS)
     assert found.passed
     assert not found._replace(end=grown).passed

@@ -62,23 +62,22 @@ def test_in_a_closed_loop_the_one_who_drives_tells_whose_impedance_it_is() -> No
     the plain ratio of the two, without the drive, is far off.
     """
     k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
-    x, push = noise(3), 2.0 * noise(4)
-    q, torque, speed = 0.0, np.zeros(len(x)), np.zeros(len(x))
-    for n in range(len(x)):
-        torque[n] = k * (x[n] - q)
-        speed[n] = (torque[n] + push[n]) / b
-        q += h * speed[n]
+    x, torque, speed = noise(3), np.zeros(len(EVERYTHING)), np.zeros(len(EVERYTHING))
+
+    def shake(push: np.ndarray) -> None:
+        q = 0.0
+        for n in range(len(x)):
+            torque[n] = k * (x[n] - q)
+            speed[n] = (torque[n] + push[n]) / b
+            q += h * speed[n]
+
+    shake(2.0 * noise(4))
     plain = estimate_response(speed, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert plain.gain is None or abs(plain.gain - b) > 0.2 * b
     driven = estimate_response(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert driven.gain is None  # half of what moves is not the hand's
-    calm = noise(3)
-    q = 0.0
-    for n in range(len(x)):
-        torque[n] = k * (calm[n] - q)
-        speed[n] = torque[n] / b
-        q += h * speed[n]
-    alone = estimate_response(calm, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    shake(0.0 * x)
+    alone = estimate_response(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert alone.gain == pytest.approx(b, rel=1e-6)
 
 

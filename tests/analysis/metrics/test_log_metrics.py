@@ -54,13 +54,16 @@ def test_busy_and_uneven_sites_are_measured() -> None:
     told(logs.simulated("four"))
 
 
-def test_a_gap_leaves_numbers_and_is_counted() -> None:
+def test_a_gap_and_a_late_begin_leave_numbers_and_are_counted() -> None:
     log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
     torn = logs.rewritten(log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False)
     found = told(torn)
     assert found["sites"]["m1"]["missing"] == 40.0
     assert found["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert not found["complete"]
+    late = told(logs.rewritten(log, lambda state: 150 < state.tick < 400))
+    assert late["sites"]["m1"]["unaccounted_j"] < 1e-3
+    assert late["run"]["spread_max_rad"] > 0.0
 
 
 def test_a_site_without_any_record_takes_only_its_own_figures_away() -> None:
@@ -98,13 +101,6 @@ def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> 
         ),
     )
     assert told(grown)["sites"]["m"]["mechanical_j"] is None
-
-
-def test_a_log_that_begins_late_is_measured() -> None:
-    log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
-    found = told(logs.rewritten(log, lambda state: 150 < state.tick < 400))
-    assert found["sites"]["m1"]["unaccounted_j"] < 1e-3
-    assert found["run"]["spread_max_rad"] > 0.0
 
 
 def test_loops_are_told_of_where_a_clock_was_read() -> None:

@@ -68,7 +68,7 @@ def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
 def test_contact_as_scenarios_tell_of_it() -> None:
     """20 ms: one hit, then 3.3 N."""
     found = compute_log_metrics(
-        simulated("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 500})
+        simulated("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 200})
     ).walls["s/1"]
     assert found["hits"].value == 1.0
     assert found["end_force_mean_n"].value == pytest.approx(3.3, abs=0.05)
@@ -77,7 +77,7 @@ def test_contact_as_scenarios_tell_of_it() -> None:
 
 def test_contact_at_200_ms_hammers() -> None:
     """8 +- 14 N, peak 52 N."""
-    found = compute_log_metrics(simulated("contact")).walls["s/1"]
+    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).walls["s/1"]
     assert found["force_peak_n"].value == pytest.approx(52.0, abs=0.5)
     assert found["end_force_mean_n"].value == pytest.approx(8.0, rel=0.15)
     assert found["end_force_deviation_n"].value == pytest.approx(14.0, rel=0.05)
@@ -86,9 +86,9 @@ def test_contact_at_200_ms_hammers() -> None:
 
 def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
-    log = simulated("windup", {"duration_s": 20.0, "rate_hz": 250})
+    log = simulated("windup", {"duration_s": 40.0, "rate_hz": 100})
     spec, track = log.scenario.sites["s"], align_records(log)["s"]
     end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
     force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
-    assert force[250 * 10] == pytest.approx(4.3, abs=0.05)
-    assert force[-1] == pytest.approx(8.5, abs=0.1)
+    assert force[100 * 10] == pytest.approx(4.3, abs=0.05)
+    assert force[100 * 20] == pytest.approx(8.5, abs=0.1)
