@@ -51,7 +51,7 @@ def column(table, n):
 
 def test_a_report_is_a_page_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
-    log = runs.log("free", {**runs.JITTER, "rate_hz": 100})
+    log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
     paths = write_report(log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS)
     assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
     wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {"certificate"}
