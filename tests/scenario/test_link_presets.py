@@ -8,7 +8,7 @@ from scipy import stats
 
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import HyperExponentialDelay
-from trilat_net.scenario.resolve_links import _PRESETS_FILE, PRESETS
+from trilat_net.scenario.resolve import _PRESETS_FILE, PRESETS
 
 ROUND_TRIPS_MS = {
     "frankfurt-bangalore": (144.88, 2.18),

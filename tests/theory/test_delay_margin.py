@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tests.theory.loops import loop
 from trilat_net.scenario import load_scenario
 from trilat_net.theory import find_equilibrium, linearise_scenario
+from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import MAX_COMMON_DELAY_S, find_delay_margin, set_common_delay
-from trilat_net.theory.delay_roots import compute_delay_spectrum
 
 
 @given(a=st.floats(0.2, 5.0))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import lambertw
 
 from tests.theory.loops import loop, residual, roots_within
-from trilat_net.theory.delay_roots import (
+from trilat_net.theory.characteristic_roots import (
     chebyshev_differentiation,
     chebyshev_interpolation,
     chebyshev_nodes,

@@ -12,8 +12,8 @@ from trilat_net.core.ticks import BUCKETS_PER_S
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.theory import analyse_linear_loop, find_equilibrium, linearise_scenario
+from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.delay_roots import compute_delay_spectrum
 from trilat_net.theory.equilibrium import follow_equilibrium
 
 POSE = (-0.1236, 0.3373)

@@ -11,8 +11,7 @@ from tests.theory.loops import Array
 from tests.virtual_runs import trajectories
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory import find_equilibrium
-from trilat_net.theory.characteristic_roots import Spectrum
-from trilat_net.theory.delay_roots import compute_delay_spectrum
+from trilat_net.theory.characteristic_roots import Spectrum, compute_delay_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
 from trilat_net.theory.tick_map import (

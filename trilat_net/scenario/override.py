@@ -13,7 +13,7 @@ from ..errors import ScenarioError
 from .delay_models import DELAY_MODELS
 from .fields import TomlTable, check_keys, field_names, suggest_nearest
 from .laws import LAWS, ImportedLaw
-from .resolve_links import PRESETS, TRACE_KEYS
+from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}

@@ -1,4 +1,4 @@
-"""Changes of links and of dominance during a run: scripted in the timeline, or requested while it runs.
+"""Changes of links and of dominance while a run goes on, by request or by its timeline.
 
 Invariant: a change is completed upon the state before it, and its text in a record is the whole change:
 every reader derives the same `CoreChange` from it.
@@ -10,8 +10,7 @@ import msgspec
 
 from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import ScenarioError
-from .fields import TomlTable, check_keys, field_names, is_number, suggest_nearest
-from .resolve_links import TRACE_KEYS, resolve_dominance_row, resolve_link
+from .resolve import resolve_dominance_row, resolve_target
 from .scenario_types import Change, Scenario
 from .validate import check_change
 
@@ -34,7 +33,7 @@ def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, A
     change = {**written, "at_s": from_ns / NS_PER_S}
     if ("link" in change) == ("dominance" in change):
         raise ScenarioError("a change names either a link or, as dominance, a site")
-    change["to"] = _resolve_target(change, present, list(scenario.names), "change")
+    change["to"] = resolve_target(change, present, list(scenario.names), "change")
     if "link" in change and change["to"]["model"] == "trace":  # a record cannot hold it
         raise ScenarioError("a link with a trace can only be given another model", path="change.to")
     try:
@@ -85,60 +84,3 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
 def scheduled_link_tables(scenario: Scenario) -> list[tuple[int, str, dict[str, Any]]]:
     """Returns the links of the scenario's own timeline: (first stamp, ns, the link, its table)."""
     return [(change.start_ns, change.link, change.to) for change in scenario.timeline if change.link]
-
-
-def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
-    """Returns the changes, each complete in itself, checked against the sites and the change before."""
-    if not isinstance(written, list):
-        raise ScenarioError("must be a list of tables [[timeline]]", path="timeline")
-    present = dict(links)
-    changes = []
-    before_s = 0.0
-    for n, entry in enumerate(written):
-        path = f"timeline[{n}]"
-        change = dict(check_keys(entry, field_names(Change), path))
-        at_s = change.get("at_s")
-        if not is_number(at_s):
-            raise ScenarioError("must be a time in s", path=f"{path}.at_s")
-        if at_s < before_s:
-            raise ScenarioError(
-                f"must not be before the change above it, {before_s:g} s", path=f"{path}.at_s"
-            )
-        before_s = at_s
-        if ("link" in change) == ("dominance" in change):
-            raise ScenarioError("names either a link or, as dominance, a site", path=path)
-        for key in ("link", "dominance"):
-            if not isinstance(change.get(key, ""), str):
-                raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
-        change["to"] = _resolve_target(change, present, names, path)
-        if "link" in change:
-            present[change["link"]] = change["to"]
-        changes.append(change)
-    return changes
-
-
-def _resolve_target(change: TomlTable, present: TomlTable, names: list[str], path: str) -> TomlTable:
-    """Returns the complete link, or row of the dominance matrix, that a change leads to."""
-    written = change.get("to", {})
-    if "link" in change:
-        return _change_link(written, change["link"], present, path)
-    site = change["dominance"]
-    if site not in names:
-        hint = suggest_nearest(site, names) or f"; sites are {', '.join(names)}"
-        raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
-    return resolve_dominance_row(written, names, site, f"{path}.to")
-
-
-def _change_link(written: Any, link: str, present: TomlTable, path: str) -> TomlTable:
-    if link not in present:
-        hint = suggest_nearest(link, list(present)) or f"; links are {', '.join(present)}"
-        raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
-    before = present[link]
-    after = resolve_link(written, before, f"{path}.to")
-    if any(key in after for key in TRACE_KEYS):
-        raise ScenarioError("no file can be named here", path=f"{path}.to.file")
-    if after["model"] == "trace" and after.get("trace") != before.get("trace"):
-        raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
-    if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
-        raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
-    return {**after, "outages_s": before["outages_s"]} if "outages_s" in before else after

@@ -1,4 +1,4 @@
-"""Characteristic roots of a nonlinear eigenproblem Delta(s) v = 0: Newton's method and roots at zero.
+"""Characteristic roots of a nonlinear eigenproblem Delta(s) v = 0: of loops with delays, and those at zero.
 
 Invariant: a root solves the equation to rounding, whatever discretisation its first guess came from.
 Roots at zero that are there for every delay (shared poses, estimates without excitation) are counted, and
@@ -8,6 +8,11 @@ Newton's method in the form of successive linear problems: solve Delta(s) v = mu
 the smallest mu from s. It converges quadratically for simple roots, and for multiple ones with as many
 vectors, which loops of identical sites have. Ruhe, "Algorithms for the nonlinear eigenvalue problem",
 SIAM J. Numerical Analysis 10 (1973).
+
+Guesses for the continuous loop come from the Chebyshev pseudospectral discretisation of the infinitesimal
+generator, whose order doubles until the wanted roots agree. Breda, Maset and Vermiglio, "Pseudospectral
+differencing methods for characteristic roots of delay differential equations", SIAM J. Scientific Computing
+27 (2005); nodes after Trefethen, "Spectral Methods in MATLAB" (2000).
 
 `limit_blas_threads` keeps OpenBLAS on one thread for these small matrices: it shares products of a
 hundred rows out to all cores and busy-waits, which takes a hundred times as long if another process has a
@@ -24,9 +29,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.linalg
+from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
+from .linear_loop import LinearLoop
 
 Complex = NDArray[np.complex128]
 
@@ -48,6 +55,10 @@ _ZERO = 1e-9
 _LONGEST_CHAIN = 4
 _NAMED_SHARE = 0.3
 """States with at least this share of the largest participation are named."""
+_INITIAL_ORDER = 12
+MAX_GENERATOR_SIZE = 1600
+"""The largest discretisation: its eigenvalues take some seconds."""
+_ROOT_AGREEMENT = 1e-9
 _BLAS_SYMBOLS = ("scipy_openblas_{}_num_threads64_", "openblas_{}_num_threads64_", "openblas_{}_num_threads")
 
 
@@ -321,3 +332,77 @@ def sort_root_guesses(values: Complex, zeros: int) -> Complex:
     """Returns eigenvalues without the `zeros` smallest ones, which stand for zeros, by falling real part."""
     kept = values[np.argsort(np.abs(values), kind="stable")][zeros:]
     return kept[np.lexsort((np.abs(kept.imag), -kept.real))]
+
+
+def find_moving_part(loop: LinearLoop) -> MovingPart:
+    """Returns the part of a loop that moves."""
+    Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
+    delays_s = np.array([term.delay_s for term in loop.delayed])
+    return extract_moving_part(Pencil(loop.A, delays_s, Ad), loop.names)
+
+
+def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
+    """Returns the rightmost roots of a loop; conjugate ones and multiple ones count once in `wanted`."""
+    with limit_blas_threads():
+        pencil, names, constant = find_moving_part(loop)
+        zeros, drifting = count_zero_roots(pencil)
+        if not len(names):
+            return Spectrum((), constant + zeros, drifting, 0, 0)
+        has_delays = len(pencil.delays) > 0
+        order, before = _INITIAL_ORDER if has_delays else 0, None
+        while True:
+            matrix = discretise_generator(pencil, order) if has_delays else pencil.A
+            guesses = sort_root_guesses(np.linalg.eigvals(matrix).astype(np.complex128), zeros)
+            roots, dropped = refine_roots(pencil, guesses, names, wanted)
+            too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
+            if not has_delays or too_large or (before is not None and _agree(before, roots)):
+                return Spectrum(tuple(roots), constant + zeros, drifting, dropped, order)
+            before, order = roots, 2 * order
+
+
+def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> bool:
+    return len(now) >= len(before) and all(
+        any(abs(a.s - b.s) <= _ROOT_AGREEMENT * (1.0 + abs(a.s)) for b in before) for a in now
+    )
+
+
+def discretise_generator(pencil: Pencil, order: int) -> Array:
+    """Returns the discretised generator of a pencil with delays, by polynomials of degree `order`.
+
+    Its states are the loop's, and the history of their delayed part at Chebyshev nodes.
+    """
+    delayed, longest_s, n = pencil.delayed_states, float(pencil.delays.max()), len(pencil.A)
+    c = len(delayed)
+    whole = np.zeros((n + order * c, n + order * c))
+    whole[:n, :n] = pencil.A
+    # history over [-longest, 0] as a polynomial of x in [-1, 1]
+    for weights, Ad in zip(
+        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays / longest_s), pencil.Ad, strict=True
+    ):
+        whole[:n, delayed] += weights[0] * Ad[:, delayed]
+        whole[:n, n:] += np.kron(weights[1:], Ad[:, delayed])
+    transport = chebyshev_differentiation(order)[1:] * (2.0 / longest_s)
+    whole[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
+    for place, state in enumerate(delayed):
+        whole[n + place :: c, state] = transport[:, 0]
+    return whole
+
+
+def chebyshev_nodes(order: int) -> Array:
+    """Returns Chebyshev's extremal nodes from 1 to -1, shape (M + 1,)."""
+    return np.cos(np.pi * np.arange(order + 1) / order)
+
+
+def chebyshev_interpolation(order: int, x: Array) -> Array:
+    """Returns the matrix from values at the nodes to the polynomial's values at x, shape (K, M + 1)."""
+    at_nodes = chebvander(chebyshev_nodes(order), order)
+    weights: Array = np.linalg.solve(at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
+    return weights
+
+
+def chebyshev_differentiation(order: int) -> Array:
+    """Returns the matrix from values at the nodes to the polynomial's derivatives there."""
+    nodes = chebyshev_nodes(order)
+    slopes = chebvander(nodes, order - 1) @ chebder(np.eye(order + 1))
+    matrix: Array = np.linalg.solve(chebvander(nodes, order).T, slopes.T).T.astype(np.float64)
+    return matrix

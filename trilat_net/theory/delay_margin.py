@@ -19,8 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-from .characteristic_roots import Complex, Pencil, limit_blas_threads
-from .delay_roots import compute_delay_spectrum, find_moving_part
+from .characteristic_roots import (
+    Complex,
+    Pencil,
+    compute_delay_spectrum,
+    find_moving_part,
+    limit_blas_threads,
+)
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0

@@ -13,9 +13,8 @@ import numpy as np
 
 from ..errors import UsageError
 from ..scenario import Scenario, load_scenario
-from .characteristic_roots import CharacteristicRoot, Spectrum
+from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
-from .delay_roots import compute_delay_spectrum
 from .equilibrium import find_equilibrium
 from .linear_loop import LinearLoop, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions

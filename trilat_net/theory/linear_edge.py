@@ -13,8 +13,7 @@ import numpy as np
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
-from .characteristic_roots import CharacteristicRoot
-from .delay_roots import compute_delay_spectrum
+from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import choose_equilibrium, find_equilibrium, follow_equilibrium
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions

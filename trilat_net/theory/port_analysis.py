@@ -17,7 +17,7 @@ from ..core.site_setup import Law
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..scenario import Scenario
-from .delay_roots import compute_delay_spectrum
+from .characteristic_roots import compute_delay_spectrum
 from .frequency_search import (
     HIGH_HZ,
     LOW_HZ,
