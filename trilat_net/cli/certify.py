@@ -44,7 +44,6 @@ def certify_command(files: options.LogsArgument, as_json: options.JsonOption = F
 
 
 def _show(found: "Certificate") -> None:
-    """Prints a certificate: what it comes to, then premises and energies."""
     from ..reporting.certificate_text import describe_certificate, list_energies
 
     for line in describe_certificate(found):

@@ -53,7 +53,6 @@ def _print_comparison(
 
 
 def _tabulate_quantities(found: "MetricComparison") -> TextTable:
-    """Returns a row per quantity, with its unit, under the heading of its group."""
     rows: list[list[str]] = []
     for group, members in groupby(found.rows, key=lambda row: row.quantity.group):
         rows.append([group])
@@ -64,7 +63,6 @@ def _tabulate_quantities(found: "MetricComparison") -> TextTable:
 
 
 def _print_reasons(found: "MetricComparison") -> None:
-    """Prints why numbers are missing; of very many the first."""
     reasons = [
         f"{name}: no {row.quantity.name}: {entry.why}"
         for row in found.rows
@@ -104,7 +102,6 @@ def _run_tuning(
 
 
 def _print_procedure(asked: "TuningPlan", workers: int) -> None:
-    """Prints the conditions that all laws share, and the expected duration of the search."""
     from ..studies.tuning.tuning_report import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
@@ -125,7 +122,6 @@ def _format_duration(seconds: float) -> str:
 
 
 def _print_tuned(found: "TuningResult") -> None:
-    """Prints the laws, every front, the gains of the paper, and the commands of the best points."""
     from ..studies.tuning.tuning_report import (
         list_class_meanings,
         tabulate_front,
@@ -229,7 +225,6 @@ def compare_command(
 
 
 def _compare_logs(files: list[Path], *, as_json: bool) -> None:
-    """Compares logs, side by side."""
     if len(files) < 2:
         raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
     from ..analysis.metrics.log_metrics import compare_metrics, comparison_to_json

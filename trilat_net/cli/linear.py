@@ -17,13 +17,7 @@ if TYPE_CHECKING:
     from ..theory.port_analysis import PortAnalysis
 
 
-class LinearFigure(StrEnum):
-    """What `--draw` draws."""
-
-    ROOTS = "roots"
-    IMPEDANCE = "impedance"
-    PASSIVITY = "passivity"
-
+LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
@@ -64,7 +58,8 @@ def linear_command(
         _check_picture(picture, force=force)
     spans = [_range(text) for text in over or []]
     from ..theory import analyse_linear_loop, iterate_linear_edges
-    from ..theory.port_analysis import analyse_ports
+    from ..theory.linear_analysis import linear_to_json
+    from ..theory.port_analysis import analyse_ports, ports_to_json
 
     found = analyse_linear_loop(scenario, overrides or [], pose=_pose(pose), roots=roots)
     lines = {
@@ -76,7 +71,9 @@ def linear_command(
     if picture is not None:
         _draw(found, section, what, picture)
     if as_json:
-        _print_json(found, lines, section)
+        edges = {key: [one._asdict() for one in line] for key, line in lines.items()}
+        felt = None if section is None else ports_to_json(section)
+        terminal.print_json({**linear_to_json(found), "ports": felt, "edges": edges})
         return
     _show(found)
     if ports and section is not None:
@@ -91,7 +88,6 @@ def linear_command(
 
 
 def _pose(text: str | None) -> tuple[float, float] | None:
-    """Returns the pose that a text such as 0.1,0.3 names."""
     if text is None:
         return None
     try:
@@ -125,32 +121,18 @@ def _check_picture(path: Path, *, force: bool) -> None:
 
 
 def _draw(found: "LinearAnalysis", section: "PortAnalysis | None", what: LinearFigure, path: Path) -> None:
-    """Writes a figure."""
-    from ..reporting import style
     from ..reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
     from ..reporting.figures.root_map import draw_root_map
-    from ..reporting.style import write_figure
+    from ..reporting.style import REPORT_DPI, write_figure
 
     if section is None or what is LinearFigure.ROOTS:
-        write_figure(draw_root_map(found), path, style.REPORT_DPI)
-        return
-    drawn = draw_port_impedance if what is LinearFigure.IMPEDANCE else draw_port_passivity
-    write_figure(drawn(section), path, style.REPORT_DPI)
-
-
-def _print_json(
-    found: "LinearAnalysis", lines: "dict[str, list[LinearEdge]]", section: "PortAnalysis | None"
-) -> None:
-    from ..theory.linear_analysis import linear_to_json
-    from ..theory.port_analysis import ports_to_json
-
-    ports = None if section is None else ports_to_json(section)
-    edges = {key: [one._asdict() for one in line] for key, line in lines.items()}
-    terminal.print_json({**linear_to_json(found), "ports": ports, "edges": edges})
+        drawn = draw_root_map(found)
+    else:
+        drawn = (draw_port_impedance if what is LinearFigure.IMPEDANCE else draw_port_passivity)(section)
+    write_figure(drawn, path, REPORT_DPI)
 
 
 def _show(found: "LinearAnalysis") -> None:
-    """Prints an analysis: the rest, the roots, the verdict, the margin, the notes."""
     from ..reporting import linear_text
 
     for line in (*linear_text.describe_equilibrium(found), *linear_text.describe_effective_delays(found)):
@@ -166,7 +148,6 @@ def _show(found: "LinearAnalysis") -> None:
 
 
 def _edge_words(key: str, low: float, high: float, line: "list[LinearEdge]", scenario: "Scenario") -> str:
-    """Returns the values of a key at which stability changes, in words."""
     if not line:
         return f"{key} from {low:g} to {high:g}: stability of {scenario.name} does not change"
     edges = [

@@ -56,7 +56,6 @@ def log_check_command(files: options.LogsArgument, as_json: options.JsonOption =
 
 
 def _print_check(files: list[Path], found: "LogCheckResult") -> None:
-    """Prints a line per check, and the places where it failed."""
     for finding in found.findings:
         terminal.print_check(finding.passed, f"{finding.check:<9}  {finding.text}")
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:

@@ -73,7 +73,6 @@ def _print_group(
 
 
 def _print_statics(found: "LogMetrics") -> None:
-    """Prints the reflected torques of the windows at rest, and the stiffness between them."""
     if found.sharing_ratios:
         heads = ("at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off")
         rows = []

@@ -109,6 +109,7 @@ LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE"
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
+NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 
 def _check_count(value: int) -> int:
-    """Refuses a number of round trips out of range."""
     if not 5 <= value <= 10_000:
         raise UsageError(f"--count is a number from 5 to 10000, not {value}")
     return value
@@ -69,7 +68,6 @@ def ping_command(
 
 
 def _member(reach: "PingResult") -> dict[str, Any]:
-    """Returns the measurements of a member; times in us."""
     info, rtts = reach.info, sorted(reach.rtts_ns)
     facts: dict[str, Any] = {
         "member": info.member,

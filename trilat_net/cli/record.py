@@ -100,7 +100,6 @@ def record_command(
 
 
 def _conclude(parts: list[Path]) -> None:
-    """Verifies and reports a log, into its own folder."""
     log, conclusion = terminal.conclude_files(parts, parts[0].parent)
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")

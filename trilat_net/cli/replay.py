@@ -73,7 +73,7 @@ def replay_command(
     low_cpu: Annotated[
         bool, typer.Option("--low-cpu", help="Sleep until every deadline: about 0.1 ms less exact.")
     ] = False,
-    needs_recorder: Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")] = False,
+    needs_recorder: options.NeedsRecorderOption = False,
     preload: Annotated[
         int,
         typer.Option(
@@ -117,7 +117,7 @@ def replay_command(
     tell = partial(console.print, markup=False, soft_wrap=True)
     for line in _opening_lines(facts, name, speed):
         tell(line)
-    reported = set(facts.torn)
+    reported = set(facts.torn)  # playing may add to them
     _warn_torn(facts.torn)
     clock = SystemClock()
     show = _line(clock)
@@ -127,24 +127,17 @@ def replay_command(
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
-    _report_playback(outcome, name, speed, reported, as_json=as_json)
-    if interrupt.requested():
-        terminal.err.print("interrupted")
-        raise typer.Exit(interrupt.exit_code)
-    if outcome.cut or outcome.strays:
-        raise typer.Exit(1)
-
-
-def _report_playback(
-    outcome: "PlaybackSummary", name: str, speed: float, reported: set[Path], *, as_json: bool
-) -> None:
-    """Prints the summary of a playback, and warns of damage not `reported` before and of gaps."""
     if as_json:
         terminal.print_json({"session": name, **_facts(outcome, speed)})
     else:
         _show(outcome)
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     _warn_undelivered(outcome)
+    if interrupt.requested():
+        terminal.err.print("interrupted")
+        raise typer.Exit(interrupt.exit_code)
+    if outcome.cut or outcome.strays:
+        raise typer.Exit(1)
 
 
 def _time(text: str) -> Literal["publish", "log"]:
@@ -154,7 +147,6 @@ def _time(text: str) -> Literal["publish", "log"]:
 
 
 def _opening_lines(facts: "SessionHeader", name: str, rate: float) -> list[str]:
-    """Returns the sites, session and speed that will be played."""
     from ..net.messages import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
@@ -187,7 +179,6 @@ def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
 
 
 def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
-    """Returns the summary for JSON."""
     late = outcome.lateness
     return {
         "messages": outcome.counts,
@@ -207,7 +198,6 @@ def _facts(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
 
 
 def _show(outcome: "PlaybackSummary") -> None:
-    """Prints the summary."""
     if terminal.err.is_interactive:
         terminal.err.file.write("\r" + " " * 72 + "\r")
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
@@ -228,7 +218,6 @@ def _show(outcome: "PlaybackSummary") -> None:
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Warns of torn files, with the command that mends them."""
     for path, text in torn.items():
         terminal.print_note(
             f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}"
@@ -236,7 +225,6 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_undelivered(outcome: "PlaybackSummary") -> None:
-    """Reports messages that did not arrive, or arrived late."""
     if outcome.cut:
         terminal.print_error(
             f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "

@@ -63,7 +63,6 @@ def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
 
 
 def _show(again: "Rerun", output: Path | None) -> None:
-    """Prints the request, its effects, and their limits."""
     from ..execution.rerun_request import describe_rerun_changes
 
     asked = again.request
@@ -81,7 +80,6 @@ def _show(again: "Rerun", output: Path | None) -> None:
 
 
 def _tabulate_sites(again: "Rerun") -> TextTable:
-    """Returns a row per site that was executed, each figure in the log and here."""
     headers = ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here")
     rows = []
     for effect in again.sites.values():

@@ -102,7 +102,6 @@ def set_dominance_command(
 
 
 def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
-    """Sends a change to a site and prints its reply."""
     from ..net.clock import SystemClock
     from ..net.discovery import request_change
     from ..net.requests import ChangeRequest

@@ -29,7 +29,7 @@ def site_command(
             callback=options.check_seconds,
         ),
     ] = 60.0,
-    needs_recorder: Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")] = False,
+    needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
     stay: Annotated[
         float,

@@ -47,7 +47,6 @@ def _check_modes(given: Sequence[str]) -> None:
 def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
-    """Draws the map of a sweep into a folder: map.png, map.svg, map.md."""
     from ..reporting.figure_size import COLUMN_IN, make_print_size
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map, build_sweep_command
@@ -141,7 +140,6 @@ def _start_sweep(
 
 
 def _resume_sweep(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
-    """Runs the rest of a sweep."""
     with folder.journal() as journal:
         done = list(journal.done)
     _print_plan(folder.plan)
@@ -200,7 +198,6 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
-    """Prints the summary of a finished sweep, more lines, and what can be done next."""
     from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
 
     for line in [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]:
@@ -388,7 +385,6 @@ def _show_results(
     width: float | None,
     confirm: int | None,
 ) -> None:
-    """Draws the map of finished results, confirms some of their cells live, or prints their summary."""
     from ..studies.sweep import read_results
 
     results = read_results(path)

@@ -117,7 +117,6 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
 
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":
-    """Runs trials over a network, one after the other."""
     from sites.demo_session import run_demo
     from sites.monitor import SessionDisplay
 
@@ -144,7 +143,6 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
 
 
 def _show(report: "TrialReport") -> None:
-    """Prints the table, what failed and how to repeat it, and how fast it went."""
     heads, *rows = report.table()
     terminal.out.print(heads, soft_wrap=True)
     for line in rows:

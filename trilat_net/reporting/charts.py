@@ -74,7 +74,6 @@ class Charts:
         return len(self._tables) - 1
 
     def _site_table(self, site: str, values: NDArray[Any]) -> int:
-        """Stores columns over all records of a site."""
         return self._table(site, self._log[site].tick, self._log[site].t_s, values)
 
     def _series(self, site: str, table: int, column: int, label: str = "") -> ChartJson:
@@ -194,7 +193,6 @@ class Charts:
             yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
 
     def _arm(self, index: int, site: str) -> ChartJson:
-        """Returns what draws an arm at any time: its links and the table of its angles."""
         part, arm = self._log[site], self._log.scenario.sites[site].arm
         values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
         table = self._site_table(site, values)

@@ -12,14 +12,7 @@ COLUMN_IN, PAGE_IN = 3.5, 7.0
 
 
 class FigureSize(NamedTuple):
-    """The measures of a figure.
-
-    Attributes:
-        width_in: its width, in.
-        tick_pt: size of the numbers at its axes, pt.
-        small_pt: size of its footnotes, pt.
-        dpi: of its PNG.
-    """
+    """The measures of a figure: width, in; type of numbers at its axes and of footnotes, pt; its dpi."""
 
     width_in: float
     tick_pt: float

@@ -119,7 +119,6 @@ def _print_channels(channels: dict[str, JsonObject], session: JsonObject | None)
 
 
 def _print_accounts(session: JsonObject) -> None:
-    """Prints the recorder's accounts of channels with faults, and counts the others."""
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
     out.print()

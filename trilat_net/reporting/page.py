@@ -146,7 +146,6 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
 
 
 def _links(log: Log, facts: JsonObject) -> str:
-    """Returns the tables of links, clocks, changes and modes, each with a sentence."""
     parts = [
         (page_tables.render_link_ages(log, facts), _EFFECTIVE),
         (page_tables.render_link_samples(log, facts), _SAMPLES),
@@ -162,7 +161,6 @@ def _links(log: Log, facts: JsonObject) -> str:
 
 
 def _site_css(log: Log) -> str:
-    """Returns the colours of the sites for the page's pictures and tables."""
     light, dark = (
         "".join(
             f".site-{n} {{ stroke: {palette[n % len(palette)]}; }} "

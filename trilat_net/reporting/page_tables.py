@@ -255,7 +255,6 @@ def _label_link(log: Log, link: str) -> str:
 
 
 def _swatch(log: Log, name: str) -> str:
-    """Returns a small square in the colour of a site."""
     return f'<span class="swatch fill-{log.sites.index(name)}"></span>'
 
 

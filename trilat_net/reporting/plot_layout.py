@@ -63,11 +63,7 @@ class PlotLayout(NamedTuple):
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Returns the plots of the standard channels of a log.
-
-    Args:
-        channels: by topic: `<root>/<site>/<name>`, and of the session `<root>/log`.
-    """
+    """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session `<root>/log`."""
     session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES)]
     roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
     pages = {
@@ -81,7 +77,6 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
 def _row(
     channels: Ros2Channels, roots: list[str], what: str, unit: str, parts: tuple[tuple[str, str], ...]
 ) -> Iterator[CurvePlot]:
-    """Yields the plots of a quantity, one per site that has it."""
     for root in roots:
         found = [_curves(f"{root}/{name}", field, channels.get(f"{root}/{name}")) for name, field in parts]
         if curves := tuple(one for one in found if one is not None):
@@ -90,7 +85,6 @@ def _row(
 
 
 def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
-    """Returns the curves of a channel, or of a list of joint states."""
     if channel is None:
         return None
     names = _names(channel.about.get("names", ""))

@@ -48,12 +48,7 @@ def open_rerun(
 ) -> None:
     """Shows a log in its file or parts, until its viewer is closed.
 
-    Args:
-        paths: its file, or its parts.
-        opened: opens the log if it has to be read.
-        show: where to show it.
-        say: prints a line.
-        run: runs Rerun; by default as a process.
+    The log is opened by `opened` if it has to be read; `say` prints a line, and `run` runs Rerun.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.

@@ -149,7 +149,6 @@ class _SiteMessages:
 
 
 def _events(log: Log) -> Iterator[_TimedMessages]:
-    """Yields the events, each as a text and as a line."""
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:

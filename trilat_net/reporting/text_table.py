@@ -44,8 +44,7 @@ class TextTable(NamedTuple):
     def rich(self, styles: Mapping[str, str] = NO_STYLES) -> "Table":
         """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow.
 
-        Args:
-            styles: Rich style of every cell with just this text, as in {"fails": "yellow"}.
+        Cells that are a text of `styles` get that style, as in {"fails": "yellow"}.
         """
         from rich.table import Table
         from rich.text import Text

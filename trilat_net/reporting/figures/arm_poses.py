@@ -27,13 +27,7 @@ _BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, 
 
 
 class ArmPose(NamedTuple):
-    """One site at one instant.
-
-    Attributes:
-        actual: base, elbow and end effector, shape (3, 2), m.
-        desired: the same of the reference, shape (3, 2), m.
-        path: path of the end effector until then, shape (P, 2), m.
-    """
+    """A site at an instant: base, elbow and end effector, (3, 2), and the path of the last, (P, 2), m."""
 
     actual: Array
     desired: Array

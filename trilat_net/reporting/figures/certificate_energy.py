@@ -86,7 +86,6 @@ def _draw_parts(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
 
 
 def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
-    """Puts a legend above the lines."""
     low, high = axes.get_ylim()
     columns = 2 if form.narrow else 4
     rows = -(-len(axes.get_legend_handles_labels()[0]) // columns)
@@ -96,7 +95,6 @@ def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
 
 
 def _legend_pt(form: FigureSize) -> float:
-    """Returns the size of type inside a panel, pt."""
     return form.small_pt if form.small_pt == form.tick_pt else form.small_pt + 0.5
 
 

@@ -247,12 +247,9 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def thin_path(path: Array) -> Array:
-    """Returns the points of a path at about equal distances along it, ends included, shape (P, 2).
+    """Returns points of a path, shape (K, 2), K > 0, at about equal distances along it, ends included.
 
     A path in a plane is thinned by its length and not by time, so that fast parts keep as many points.
-
-    Args:
-        path: shape (K, 2), K > 0, of finite numbers.
     """
     extent = np.ptp(path, axis=0)
     scaled = path / np.where(extent > 0.0, extent, 1.0)

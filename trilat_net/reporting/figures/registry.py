@@ -38,14 +38,7 @@ Absent = Callable[[Log], str]
 
 
 class FigureEntry(NamedTuple):
-    """A figure.
-
-    Attributes:
-        about: its content, in a few words.
-        draw: draws it.
-        absent: returns why a log has nothing to show in it; "" if it has.
-        in_report: whether the report has it.
-    """
+    """A figure: what is in it, what draws it, and what returns why a log has nothing to show in it, or ""."""
 
     about: str
     draw: Draw
@@ -154,16 +147,10 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes figures of a log into a folder, and returns the paths.
+    """Writes figures of a log into a folder, which is made if it does not exist, and returns the paths.
 
-    Args:
-        log: the log.
-        folder: made if it does not exist.
-        names: the figures; none: all for which the log has something to show.
-        width_in: 3.5 or 7, in.
-        formats: of `FIGURE_FORMATS`.
-        force: whether files that exist are replaced.
-        progress: called with the number of figures that are drawn, and of all.
+    Without names these are all for which the log has something to show. They are 3.5 or 7 in wide;
+    `progress` is called with the number of figures that are drawn, and of all.
 
     Raises:
         UsageError: there is no such figure, width or format, the log has nothing to show in it, or a file

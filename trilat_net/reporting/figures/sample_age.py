@@ -25,14 +25,7 @@ _TALL = 6.0
 
 
 class DelayDistribution(NamedTuple):
-    """Delays on a link, and the ages that its receiver saw.
-
-    Attributes:
-        peer: the sender.
-        site: the receiver.
-        delay_ms: delays of the samples, ms: those of the model, or else those that were measured.
-        age_ms: ages of the sample in use at the receiver's ticks, ms.
-    """
+    """Delays of a link's samples, by its model or else measured, and ages in use at the receiver's ticks."""
 
     peer: str
     site: str
@@ -144,7 +137,6 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def _age_axis(axes: Axes, values: Array) -> None:
-    """Gives panels their axis of ages."""
     known = values[np.isfinite(values)]
     if needs_log_axis(known):
         axes.set(yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max())))

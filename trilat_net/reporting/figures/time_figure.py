@@ -80,11 +80,7 @@ class TimeFigure:
     def mark(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
         """Marks a panel: shaded in the color of a site while it does not follow its peers, lines at changes.
 
-        Args:
-            axes: the panel.
-            sites: whose modes and changes.
-            link: the only link whose changes it shows, or "": all changes that these sites carried out.
-            numbered: whether changes have their numbers there.
+        Changes are those that the sites carried out, or of these those of one link.
         """
         for site in sites:
             colour = style.site_colour(self.log, site)
