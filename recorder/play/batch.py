@@ -17,6 +17,11 @@ from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
 
+PlayedMessage = tuple[int, int, int, bytes]
+"""Time in ns since the epoch, channel, number in it, and payload of a message.
+
+The number is the tick of a record, the place from 0 of another message of a site, else the time.
+"""
 PIECE_BYTES = 65_536
 """Payload of a piece: small enough that preparing or receiving one does not delay the player."""
 
@@ -80,8 +85,8 @@ class MessageBatch:
         start, end = self.rows[index, 3:].tolist()
         return bytes(self.data[start:end])
 
-    def messages(self) -> Iterator[tuple[int, int, int, bytes]]:
-        """Yields (time in ns, channel, number, payload) of every message."""
+    def messages(self) -> Iterator[PlayedMessage]:
+        """Yields every message."""
         view = memoryview(self.data)
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])

@@ -21,8 +21,8 @@ import numpy as np
 from trilat_net import process
 from trilat_net.errors import LogError, RuntimeFault
 
-from .batch import BatchBuilder, MessageBatch
-from .session_reader import HORIZON_NS, PlayedMessage, PlaySelection, SessionHeader, SessionReader
+from .batch import BatchBuilder, MessageBatch, PlayedMessage
+from .session_reader import HORIZON_NS, PlaySelection, SessionHeader, SessionReader
 
 SIZE = struct.Struct("<Q")
 """Number of bytes of the pickle that follows, in the pipe of a reader process."""
@@ -146,60 +146,54 @@ class MessageSource:
             self._pipe.close()
 
 
-class MessageSorter:
-    """Puts messages in order that stand in the file at most a horizon from their turn.
+def sort_messages(
+    messages: Iterable[PlayedMessage],
+    horizon_ns: int = HORIZON_NS,
+    step_ns: int = STEP_NS,
+    limit_bytes: int = LIMIT_BYTES,
+) -> Iterator[tuple[MessageBatch, int]]:
+    """Yields messages in play order that stand in the file at most a horizon from their turn.
 
     Args:
-        messages: the messages in file order.
+        messages: in file order.
         horizon_ns: that horizon.
         step_ns: length of log that is put in order at a time.
         limit_bytes: most memory; a longer horizon is shortened.
 
-    Attributes:
-        strays: messages that stood further from their turn.
+    Yields:
+        Messages, and how many of them stood further from their turn.
     """
+    waiting = BatchBuilder()
+    given: dict[int, int] = {}  # per channel the last number
 
-    def __init__(
-        self,
-        messages: Iterable[PlayedMessage],
-        horizon_ns: int = HORIZON_NS,
-        step_ns: int = STEP_NS,
-        limit_bytes: int = LIMIT_BYTES,
-    ) -> None:
-        self.strays = 0
-        self._messages, self._horizon_ns, self._step_ns = messages, horizon_ns, step_ns
-        self._limit_bytes = limit_bytes
-        self._waiting = BatchBuilder()
-        self._given: dict[int, int] = {}  # per channel the last number
-
-    def batches(self) -> Iterator[MessageBatch]:
-        """Yields the messages in play order."""
-        newest_ns, next_ns = -(2**62), None
-        for message in self._messages:
-            self._waiting.add(*message)
-            self.strays += message.number < self._given.get(message.channel, -1)
-            newest_ns = max(newest_ns, message.t_ns)
-            if next_ns is None:
-                next_ns = message.t_ns + self._horizon_ns + self._step_ns
-            if newest_ns >= next_ns:
-                yield self._release(newest_ns - self._horizon_ns)
-                next_ns = newest_ns + self._step_ns
-            elif self._waiting.memory > self._limit_bytes:
-                yield self._release(None)
-        yield self._release(1 << 62)
-
-    def _release(self, until_ns: int | None) -> MessageBatch:
+    def release(until_ns: int | None) -> tuple[MessageBatch, int]:
         """Returns the messages that are due until then, or half of all, and keeps the rest."""
-        ordered = self._waiting.ordered()
+        nonlocal waiting
+        ordered, strays = waiting.ordered(), 0
         count = (len(ordered) + 1) // 2
         if until_ns is not None:
             count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
-        self._waiting = BatchBuilder(ordered.part(slice(count, None)))
+        waiting = BatchBuilder(ordered.part(slice(count, None)))
         released = ordered.part(slice(count))
         for channel in np.unique(released.channels).tolist():
-            last = int(released.numbers[released.channels == channel].max())
-            self._given[channel] = max(last, self._given.get(channel, -1))
-        return released
+            numbers = released.numbers[released.channels == channel]
+            last = given.get(channel, int(numbers.min()))
+            strays += int(np.count_nonzero(numbers < last))
+            given[channel] = max(last, int(numbers.max()))
+        return released, strays
+
+    newest_ns, next_ns = -(2**62), None
+    for message in messages:
+        waiting.add(*message)
+        newest_ns = max(newest_ns, message[0])
+        if next_ns is None:
+            next_ns = newest_ns + horizon_ns + step_ns
+        if newest_ns >= next_ns:
+            yield release(newest_ns - horizon_ns)
+            next_ns = newest_ns + step_ns
+        elif waiting.memory > limit_bytes:
+            yield release(None)
+    yield release(1 << 62)
 
 
 def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool) -> None:
@@ -215,13 +209,13 @@ def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelectio
     with suppress(BrokenPipeError), process.pause_gc(), open(pipe.fileno(), "wb", closefd=False) as sink:
         try:
             while True:
-                reader = SessionReader(paths, selection)
-                sorter = MessageSorter(reader.messages())
-                for batch in sorter.batches():
+                reader, strays = SessionReader(paths, selection), 0
+                for batch, further in sort_messages(reader.messages()):
+                    strays += further
                     for piece in batch.pieces():
                         assert reader.header is not None  # there was a message
                         send(ReadPiece(reader.header.topics, piece.compact()))
-                send(RoundEnd(sorter.strays, reader.header.torn if reader.header else {}))
+                send(RoundEnd(strays, reader.header.torn if reader.header else {}))
                 if not loop:
                     return
         except LogError as error:

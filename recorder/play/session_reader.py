@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import msgspec
 
@@ -30,7 +30,7 @@ from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
 from trilat_net.scenario import Scenario, parse_embedded
 
-from .batch import BatchBuilder, MessageBatch
+from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
 PlayTime = Literal["publish", "log"]
 """The time that orders messages: of sending, or of arrival."""
@@ -122,16 +122,12 @@ class SessionHeader:
     """The session that files hold.
 
     Attributes:
-        session: its name there.
-        scenario: its scenario.
         scenario_text: the scenario as the files have it.
-        fingerprint: arithmetic of the platform that made the log, or "".
         version: schema version of the messages; 0 if unknown.
         boots: the sites' boots, as far as read.
         topics: topics of the channels that are played, by number.
         torn: unfinished or damaged files, with the reason.
-        first_ns: the earliest message of any channel so far, ns since the epoch.
-        last_ns: the latest one.
+        first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the latest one.
     """
 
     session: str
@@ -144,23 +140,6 @@ class SessionHeader:
     torn: dict[Path, str] = field(default_factory=dict)
     first_ns: int = 2**62
     last_ns: int = -(2**62)
-
-
-class PlayedMessage(NamedTuple):
-    """One message to be played.
-
-    Attributes:
-        t_ns: its time, ns since the epoch.
-        channel: its place in `SessionHeader.topics`.
-        number: its number in its channel: the tick of a record, the place from 0 of another message of a
-            site; in other channels its time.
-        payload: as published.
-    """
-
-    t_ns: int
-    channel: int
-    number: int
-    payload: bytes
 
 
 class _PlayedChannel:
@@ -238,7 +217,7 @@ class SessionReader:
                 header.boots.update({channel.site: boot} if boot >= 0 else {})
             number = channel.number(item, t_ns)
             if channel.place >= 0 and holds(t_ns):
-                yield PlayedMessage(t_ns, channel.place, number, item.payload)
+                yield t_ns, channel.place, number, item.payload
         if epoch_ns is None:
             _, header = self._read_session(path, reader)
         if not reader.complete:

@@ -9,26 +9,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder, MessageBatch
-from recorder.play.message_source import MessageSorter, MessageSource, feed_player
-from recorder.play.session_reader import PlayedMessage, PlaySelection, SessionHeader, preload_messages
+from recorder.play.batch import BatchBuilder, MessageBatch, PlayedMessage
+from recorder.play.message_source import MessageSource, feed_player, sort_messages
+from recorder.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from tests.net.waiting import until
 from trilat_net.errors import LogError, RuntimeFault
 
 from .logs import loaded, write
 
-Message = tuple[int, int, int, bytes]
 
-
-def whole(messages: list[PlayedMessage]) -> list[Message]:
+def whole(messages: list[PlayedMessage]) -> list[PlayedMessage]:
     gathering = BatchBuilder()
     for message in messages:
         gathering.add(*message)
     return list(gathering.ordered().messages())
 
 
-def joined(blocks: list[MessageBatch]) -> list[Message]:
+def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
     return [message for block in blocks for message in block.messages()]
+
+
+def sorted_in(messages: list[PlayedMessage], *how: int, **limits: int) -> tuple[list[PlayedMessage], int]:
+    """Messages in the order of play, and how many stood too far away."""
+    found = list(sort_messages(messages, *how, **limits))
+    return joined([batch for batch, _ in found]), sum(strays for _, strays in found)
 
 
 @given(
@@ -43,28 +47,28 @@ def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
     sent = []
     for step, channel, delay in steps:
         t_ns += step
-        sent.append((t_ns + delay, PlayedMessage(t_ns, channel, made[channel], bytes([len(sent)]))))
+        sent.append((t_ns + delay, (t_ns, channel, made[channel], bytes([len(sent)]))))
         made[channel] += 1
     messages = [message for _, message in sorted(sent, key=lambda entry: entry[0])]
-    sorting = MessageSorter(messages, 30, step_ns)
-    assert joined(list(sorting.batches())) == whole(messages)
-    assert sorting.strays == 0
+    assert sorted_in(messages, 30, step_ns) == (whole(messages), 0)
 
 
 def test_what_stands_further_away_is_played_all_the_same_and_counted() -> None:
-    rising = [PlayedMessage(t, 0, t, b"") for t in range(1, 100)]
-    sorting = MessageSorter([*rising, PlayedMessage(0, 0, 0, b"stray")], 30, 10)
-    assert len(joined(list(sorting.batches()))) == 100
-    assert sorting.strays == 1
+    rising = [(t, 0, t, b"") for t in range(1, 100)]
+    played, strays = sorted_in([*rising, (0, 0, 0, b"stray")], 30, 10)
+    assert (len(played), strays) == (100, 1)
+
+
+def test_a_time_before_the_epoch_that_stands_for_a_number_is_none_too_far_away() -> None:
+    before = [(t, 0, t, b"") for t in range(-50, 50)]
+    assert sorted_in(before, 30, 10) == (before, 0)
 
 
 def test_what_would_be_too_much_to_hold_is_given_before_its_time() -> None:
     """A file that says that everything was sent at once."""
-    sorting = MessageSorter([PlayedMessage(0, 0, n, bytes(100)) for n in range(1000)], limit_bytes=20_000)
-    blocks = list(sorting.batches())
-    assert [n for _, _, n, _ in joined(blocks)] == list(range(1000))
-    assert max(map(len, blocks)) <= 20_000 // 100
-    assert sorting.strays == 0
+    given = [(0, 0, n, bytes(100)) for n in range(1000)]
+    assert sorted_in(given, limit_bytes=20_000) == (given, 0)
+    assert max(len(batch) for batch, _ in sort_messages(given, limit_bytes=20_000)) <= 20_000 // 100
 
 
 @contextmanager
@@ -91,7 +95,7 @@ def taken(source: MessageSource) -> list[MessageBatch]:
     return blocks
 
 
-def rounds(source: MessageSource, count: int) -> Iterator[list[Message]]:
+def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
     for _ in range(count):
         yield joined(taken(source))
         source.restart()
