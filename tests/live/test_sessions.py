@@ -175,18 +175,6 @@ def test_who_waits_in_vain_says_for_whom_and_leaves_no_file(stage: Stage) -> Non
 
 
 @pytest.mark.long
-def test_a_busy_port_is_named(stage: Stage) -> None:
-    session = Session(stage, "two_sites", ("m", "s"))
-    holder = ZenohBus(session.endpoints[:1])
-    try:
-        site = session.site("m")
-        assert site.code() == 2
-    finally:
-        holder.close()
-    assert f"{session.endpoints[0]}: the port is in use" in site.text()
-
-
-@pytest.mark.long
 def test_another_scenario_is_refused_with_both_hashes(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"))
     leader = session.site("m")

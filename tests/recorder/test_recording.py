@@ -140,6 +140,8 @@ def test_stored_is_said_only_when_every_record_is_in() -> None:
     desk.write()
     assert desk.stored() == []
     assert [e.about for e in desk.log().events if e.kind == "stored"] == ["m"]
+    own = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
+    assert (own.expected, own.received) == (1, 1)
 
 
 def alive(name: str, boot: int | str) -> str:
@@ -160,18 +162,6 @@ def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> No
     assert "20 records of a number that it never said" in desk.recording.summary()[1]
     log = desk.log()
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
-
-
-def test_a_site_that_comes_back_in_time_goes_on() -> None:
-    desk = Desk()
-    desk.whole("m")
-    desk.recording.presence(alive("s", BOOTS["s"]), False)
-    assert not desk.over()
-    desk.recording.presence(alive("s", BOOTS["s"]), True)
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
-    assert not desk.over()
-    desk.whole("s")
-    assert desk.over()
 
 
 @pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, SETTLE_NS), (False, AWAY_NS)])
@@ -281,15 +271,3 @@ OUT_OF_RANGE = {
     "an end after the end": ("event", end("m", TICKS + 1)),
     "an end before the beginning": ("event", end("m", -1)),
 }
-
-
-def test_what_it_says_itself_stands_in_its_log_from_its_first_word() -> None:
-    desk = Desk()
-    desk.whole("m", "s")
-    log = desk.log()
-    assert [(e.kind, e.about) for e in log.events if e.member == topics.RECORDER] == [
-        ("stored", "m"),
-        ("stored", "s"),
-    ]
-    account = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
-    assert (account.expected, account.received) == (2, 2)

@@ -122,25 +122,6 @@ def test_a_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path
     assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]
 
 
-@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255), keep=st.floats(0.2, 1.0))
-def test_a_file_that_was_changed_or_cut_is_read_or_refused(
-    place: float, bits: int, keep: float, tmp_path_factory: TmpFactory
-) -> None:
-    base = tmp_path_factory.getbasetemp()
-    path, whole = base / "changed.mcap", base / "whole.mcap"
-    if not whole.exists():
-        write(whole, [("m1", n, n, n) for n in range(5)])
-    data = bytearray(whole.read_bytes())
-    data[int(place * len(data))] ^= bits
-    path.write_bytes(data[: int(keep * len(data))])
-    try:
-        facts, block = preload_messages([path], PlaySelection(), LARGE)
-    except (LogError, UsageError):
-        return
-    assert block is not None
-    assert facts.torn or keep == 1.0 or len(block) == 5
-
-
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
     missing = tmp_path / "missing.mcap"
     with pytest.raises(LogError, match=r"missing\.mcap: cannot be read"):
