@@ -34,12 +34,8 @@ GIVE_UP_NS = 10_000_000_000
 """Time for a site that has ended to answer."""
 
 
-class RepairedMessage(NamedTuple):
-    """One message out of a site's retransmission buffer."""
-
-    channel: str
-    message: SiteMessage
-    payload: bytes
+RepairedMessage = tuple[str, SiteMessage, bytes]
+"""One message out of a site's retransmission buffer: its channel, the message, its payload."""
 
 
 class _OpenRequest(NamedTuple):
@@ -158,7 +154,7 @@ class GapRepair:
                 continue
             if self._reception.refill(channel, message):
                 useful = True
-                yield RepairedMessage(channel, message, payload)
+                yield channel, message, payload
         self._next[channel] = max(past.first + len(past.payloads), wanted.first + 1)
         gap = account.wanted(wanted.first)
         self._due_ns = now_ns

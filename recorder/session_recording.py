@@ -22,7 +22,7 @@ from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
 from .inbound_queue import InboundMessage, InboundQueue
-from .site_reception import SiteMessage, SiteReception
+from .site_reception import SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""
@@ -102,10 +102,10 @@ class Recording:
         self._drain(queue, now_ns)
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in self._repairs.items():
-            for repaired in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
-                key = topics.key(self.session, name, repaired.channel)
-                sent_ns = max(repaired.message.t_ns, 0)  # an event before the epoch has no time
-                self._add(key, repaired.payload, repaired.message, sent_ns, log_time_ns)
+            for channel, message, payload in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
+                key = topics.key(self.session, name, channel)
+                sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
+                self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
         for name, site in self._sites.items():
             if name in self._stored or not site.full:
                 continue
@@ -135,7 +135,9 @@ class Recording:
         message = site.read(channel, arrived.payload)
         if site.take(channel, message, arrived.mono_ns):
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
-            self._add(arrived.key, arrived.payload, message, t_ns, log_time_ns)
+            self._writer.add(
+                arrived.key, arrived.payload, t_ns, log_time_ns, message.sequence, message.content
+            )
 
     def _take_own(self, arrived: InboundMessage, since_ns: int, log_time_ns: int) -> None:
         """Writes the recorder's own message."""
@@ -152,9 +154,6 @@ class Recording:
             raise WireError("another recorder", arrived.key)
         if number >= 0 and account.take(number, arrived.mono_ns):
             self._writer.add(arrived.key, arrived.payload, since_ns, log_time_ns, number, content)
-
-    def _add(self, key: str, payload: bytes, message: SiteMessage, t_ns: int, log_time_ns: int) -> None:
-        self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
 
     def presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""

@@ -66,10 +66,7 @@ def parse_rate(text: str) -> float:
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
     """Returns the clock's reading at a deadline, or at once if that has passed.
 
-    Args:
-        clock: the time.
-        due_ns: the deadline.
-        spin_ns: time before it at which to stop sleeping and poll the clock; 0 sleeps to the end.
+    It stops sleeping `spin_ns` before and polls the clock; with 0 it sleeps to the end.
     """
     clock.sleep_until(due_ns - spin_ns)
     now_ns = clock.monotonic_ns()

@@ -87,46 +87,43 @@ class PlaybackSummary(NamedTuple):
     torn: dict[Path, str]
 
 
+@dataclass
 class Playback:
     """One playback in a session of its own."""
 
-    def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        header: SessionHeader,
-        source: MessageSource,
-        options: PlayOptions,
-        stopped: Callable[[], bool],
-        say: Callable[[str], None],
-        show: Callable[[PlayProgress], None],
-    ) -> None:
-        self._bus, self._clock, self._header, self._source = bus, clock, header, source
-        self._options, self._stopped, self._say, self._show = options, stopped, say, show
-        history = PlayedHistory(kept_ns=None if source.whole else HORIZON_NS)
-        self._stand_ins = SiteStandIns(bus, clock, options.session, header, history)
-        self._shown_ns = clock.monotonic_ns()
-        self._player = Player(
-            source, history, clock, self._publisher, self._attend, stopped, low_cpu=options.low_cpu
-        )
+    bus: Bus
+    clock: Clock
+    header: SessionHeader
+    source: MessageSource
+    options: PlayOptions
+    stopped: Callable[[], bool]
+    say: Callable[[str], None]
+    show: Callable[[PlayProgress], None]
+
+    def __post_init__(self) -> None:
+        history = PlayedHistory(kept_ns=None if self.source.whole else HORIZON_NS)
+        self._stand_ins = SiteStandIns(self.bus, self.clock, self.options.session, self.header, history)
+        self._shown_ns = self.clock.monotonic_ns()
+        own = history, self.clock, self._publisher, self._attend, self.stopped
+        self._player = Player(self.source, *own, low_cpu=self.options.low_cpu)
 
     def _publisher(self, channel: int) -> Callable[[bytes], None]:
-        key = map_key_to_session(self._header.topics[channel], self._header.session, self._options.session)
-        return self._bus.publisher(key, patient=True)
+        key = map_key_to_session(self.header.topics[channel], self.header.session, self.options.session)
+        return self.bus.publisher(key, patient=True)
 
     def _attend(self, progress: PlayProgress) -> None:
         self._stand_ins.attend()
-        now_ns = self._clock.monotonic_ns()
+        now_ns = self.clock.monotonic_ns()
         if now_ns - self._shown_ns >= PROGRESS_EVERY_NS:
             self._shown_ns = now_ns
-            self._show(progress)
+            self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
         """Plays from `start_ns` since the epoch of the log (None: from the first message) to the end.
 
         It stays until all recorders have everything.
         """
-        clock, options = self._clock, self._options
+        clock, options = self.clock, self.options
         first_ns = self._player.prepare()
         self._await_recorders()
         begun_ns = clock.monotonic_ns() + AHEAD_NS
@@ -139,28 +136,28 @@ class Playback:
         recorders = set(self._stand_ins.recorders)
         self._linger()
         return PlaybackSummary(
-            counts=dict(zip(self._header.topics, self._player.counts, strict=False)),
+            counts=dict(zip(self.header.topics, self._player.counts, strict=False)),
             rounds=self._player.rounds,
             lateness=self._player.lateness.summary() if math.isfinite(options.rate) else None,
             took_s=took_ns / NS_PER_S,
             held_s=self._player.held_ns / NS_PER_S,
             cut=self._player.stalls,
-            strays=self._source.strays,
+            strays=self.source.strays,
             recorders=len(recorders),
             stored=self._stand_ins.stored(recorders),
             refilled=self._stand_ins.refilled,
-            torn=self._header.torn,
+            torn=self.header.torn,
         )
 
     def _await_recorders(self) -> None:
         """Waits for announced recorders, and for at least one if the options ask for it."""
-        clock, stand_ins = self._clock, self._stand_ins
-        if self._options.needs_recorder:
-            self._say("waiting for a recorder")
+        clock, stand_ins = self.clock, self._stand_ins
+        if self.options.needs_recorder:
+            self.say("waiting for a recorder")
         give_up_ns = clock.monotonic_ns() + LISTEN_NS
-        while not self._stopped():
+        while not self.stopped():
             stand_ins.attend()
-            missing = self._options.needs_recorder and not stand_ins.recorders
+            missing = self.options.needs_recorder and not stand_ins.recorders
             listening = stand_ins.recorders_listen()
             if missing:
                 give_up_ns = clock.monotonic_ns() + LISTEN_NS
@@ -170,9 +167,9 @@ class Playback:
 
     def _linger(self) -> None:
         """Answers recorders until they have everything, or have asked nothing for a while."""
-        clock, stand_ins = self._clock, self._stand_ins
+        clock, stand_ins = self.clock, self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
-        while clock.monotonic_ns() < give_up_ns and not self._stopped():
+        while clock.monotonic_ns() < give_up_ns and not self.stopped():
             if stand_ins.attend():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue

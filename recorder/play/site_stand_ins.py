@@ -10,7 +10,6 @@ import platform
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,13 +28,8 @@ from .batch import Ints, MessageBatch
 from .pace import Pace
 from .session_reader import SessionHeader
 
-
-class _PlayedRun(NamedTuple):
-    """Messages of one channel within one batch: their numbers, ascending, and their places in it."""
-
-    numbers: Ints
-    places: Ints
-    batch: MessageBatch
+_PlayedRun = tuple[Ints, Ints, MessageBatch]
+"""Messages of one channel within one batch: their numbers, ascending, their places in it, and the batch."""
 
 
 class PlayedHistory:
@@ -58,10 +52,10 @@ class PlayedHistory:
         for channel in np.unique(batch.channels).tolist():
             places = np.flatnonzero(batch.channels == channel)
             runs = self._runs.setdefault(channel, deque())
-            runs.append(_PlayedRun(batch.numbers[places], places, batch))
+            runs.append((batch.numbers[places], places, batch))
             if self._kept_ns is not None:
                 oldest_ns = int(batch.times_ns[-1]) - self._kept_ns
-                while int(runs[0].batch.times_ns[-1]) < oldest_ns:
+                while int(runs[0][2].times_ns[-1]) < oldest_ns:
                     runs.popleft()
 
     def forget(self) -> None:
@@ -80,15 +74,15 @@ class PlayedHistory:
         made = self.made.get(channel, 0)
         payloads: list[bytes] = []
         size, wanted, begun = 0, first, first
-        for run in runs[bisect_left(runs, first, key=lambda run: int(run.numbers[-1])) :]:
-            begin = int(np.searchsorted(run.numbers, wanted))
+        for numbers, places, batch in runs[bisect_left(runs, first, key=lambda run: int(run[0][-1])) :]:
+            begin = int(np.searchsorted(numbers, wanted))
             part = slice(begin, begin + BACKFILL_MESSAGES + 1)
-            for number, place in zip(run.numbers[part].tolist(), run.places[part].tolist(), strict=True):
+            for number, place in zip(numbers[part].tolist(), places[part].tolist(), strict=True):
                 if not payloads:
                     begun = wanted = max(first, min(number, made))
                 if number < wanted:
                     continue  # a repeated number
-                payload = run.batch.payload(place)
+                payload = batch.payload(place)
                 size += len(payload)
                 full = len(payloads) == BACKFILL_MESSAGES or (payloads and size > BACKFILL_BYTES)
                 if number > min(last, made - 1) or number > wanted or full:
