@@ -1,4 +1,4 @@
-"""Session membership: boots, liveliness tokens, events, who is present, and late join of a recorder.
+"""Session membership: boots, liveliness tokens, events, and who is present.
 
 Invariant: a different scenario, a running session and a second start of the same member are refused at
 the first exchange; replies of strangers are ignored and kept for the error message. A recorder may join a
