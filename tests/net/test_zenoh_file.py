@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import UsageError
 from trilat_net.net.zenoh_bus import MAX_DEPTH, read_zenoh_file
-from trilat_net.net.zenoh_config import REQUIREMENTS, ZenohFile, check_zenoh_file, make_zenoh_config
+from trilat_net.net.zenoh_config import REQUIREMENTS, ZenohFile, _merge, check_zenoh_file, make_zenoh_config
 
 SOURCE = "mine.json5"
 
@@ -71,7 +71,7 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
         value = data.draw(
             st.sampled_from([WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"])
         )
-        merge(stated, nested(path, value))
+        stated = _merge(stated, nested(path, value))
     try:
         file = checked(stated)
     except UsageError:
@@ -84,14 +84,6 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
         except KeyError:
             continue  # neither stated nor set: Zenoh's default is what is needed
         assert need.holds(value) or value == found(plain, path), path
-
-
-def merge(into: dict[str, Any], more: Mapping[str, Any]) -> None:
-    for key, value in more.items():
-        if isinstance(value, dict) and isinstance(into.get(key), dict):
-            merge(into[key], value)
-        else:
-            into[key] = value
 
 
 def test_what_a_session_does_not_need_is_taken_as_it_is() -> None:

@@ -53,10 +53,8 @@ class RerunSite:
     Samples of executed peers appear in `inputs` as they are computed.
 
     Attributes:
-        k: its next tick.
         first: the first difference from the log's records.
         lacking: number of samples that arrived and are not in the log.
-        output: its last record.
     """
 
     output: TickRecord

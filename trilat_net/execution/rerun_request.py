@@ -32,7 +32,6 @@ class RerunRequest:
     """A rerun: its sites, its scenario and its changes.
 
     Attributes:
-        original: the scenario of the log.
         scenario: the scenario of the rerun: changed for the executed sites, the log's for the others.
         replaced: the executed sites, in scenario order.
         without_effect: requested changes of recorded sites, which change nothing.

@@ -66,8 +66,6 @@ class RecordedInputs(Generic[Change]):
     """Arrivals, changes and resumption of one site, from its records and those of its peers.
 
     Attributes:
-        samples: per peer, in scenario order, its samples by tick.
-        ends: per peer the last tick that it made.
         assumed: per peer the samples that are assumed to have arrived where no record is.
         lacking: per peer the samples that arrived and whose own record is missing.
     """

@@ -26,14 +26,9 @@ LAST_LOG_NS = (1 << 64) - 1
 
 
 class SiteEntry(NamedTuple):
-    """One message of the file.
+    """One message of the file; entries are written in order of `t_ns`, ns since the epoch.
 
-    Attributes:
-        t_ns: its time, ns since the epoch; entries are written in this order.
-        sent_ns: its sending time on the sender's clock.
-        channel: its channel, as in "state".
-        sequence: its sequence number in the file.
-        number: its number in its channel, for the account.
+    `sequence` stands in the file; `number`, that in its channel, is for the account.
     """
 
     site: str

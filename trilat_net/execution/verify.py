@@ -35,13 +35,11 @@ from .resumption import ArrivalEntry, RecordedInputs, read_output
 
 @dataclass(slots=True)
 class VerifyResult:
-    """The result of executing a log again.
+    """The result of executing a log again, in numbers of records.
 
     Attributes:
         whole_run: True if whole runs were executed and bits compared; False if tick by tick, to 1e-9.
-        identical: records of which every computed field agreed.
         unjudged: records behind gaps that could not be judged.
-        differing: records that differ.
         first: the first difference, by tick and then by site.
         gaps: missing ticks: (site, first, last).
     """
@@ -67,12 +65,7 @@ class VerifyResult:
 
 
 class LoggedUserLaw(NamedTuple):
-    """A user law that a log names.
-
-    Attributes:
-        code: the law, as in "package.module:Law".
-        changed: how its file differs from the one that ran; "" if it does not.
-    """
+    """A user law that a log names, its sites, and how its file differs from the one that ran, or ""."""
 
     code: str
     sites: tuple[str, ...]

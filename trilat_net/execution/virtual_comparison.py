@@ -29,12 +29,7 @@ from .virtual_network import Network, RecordedNetwork
 
 
 class RecordComparison(NamedTuple):
-    """Agreement of a log with another execution.
-
-    Attributes:
-        identical: records of which every computed field has the same bits.
-        first: the first difference, by tick and then by site, or None.
-    """
+    """Agreement of a log with another execution: equal bits, and the first difference by tick, then site."""
 
     records: int
     identical: int
@@ -103,13 +98,9 @@ def find_late_samples(log: Log) -> list[LateSample]:
 
 
 class VirtualComparison(NamedTuple):
-    """A log against virtual time.
+    """A log against virtual time: always equal if fed with its arrivals, else until the first late sample.
 
-    Attributes:
-        fed: against virtual time fed with the log's arrivals; always equal.
-        plain: against plain virtual time; equal until the first late sample. Empty if an arm is external:
-            there is no such run.
-        late: the samples that arrived after they were due.
+    The plain one is empty if an arm is external: there is no such run.
     """
 
     fed: RecordComparison

@@ -96,13 +96,9 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """The arrivals of one site.
+    """The arrivals of one site per tick, in order, from the first tick with a record to the last, or -1.
 
-    Attributes:
-        at: per tick the arrivals, in order.
-        unrecorded: ticks between the first record and the last without one: their arrivals are assumed.
-        first: the first tick that has a record.
-        last: the last one, -1 if there is none.
+    In the `unrecorded` ticks between them arrivals are assumed.
     """
 
     at: dict[int, Sequence[ArrivalEntry]]
