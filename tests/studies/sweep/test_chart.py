@@ -1,17 +1,26 @@
-"""A map: runs from the results, lines from the plan, and neither from the other."""
+"""Theory on a map: conditions in closed form, lines column by column, and neither from the runs."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.map_plane import PlaneAxis
 from trilat_net.studies.sweep.stability_map import (
     PanelScenarios,
+    StabilityCriterion,
     build_stability_map,
+    evaluate_criterion,
+    find_criterion_edge,
     format_override,
     format_override_value,
     panel_scenarios,
+    trace_closed_form,
     trace_linear_analysis,
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
@@ -97,3 +106,169 @@ def test_a_number_as_an_override_is_just_that_number(value: float, text: str) ->
     assert float(format_override_value(value)) == value
     assert format_override("a.b", value) == f"a.b={text}"
     assert format_override("link.order", "in_order") == "link.order=in_order"
+
+
+DELAY = PlaneAxis("link.delay_ms", (0.0, 100.0, 200.0, 300.0, 400.0, 800.0), "delay (ms)")
+DAMPING = PlaneAxis("control.d", (0.2, 0.7, 1.2, 1.7, 2.2), "d (N m s/rad)")
+P_D = load_scenario("p_d_margin")
+
+
+def at(x: float, y: float) -> Scenario:
+    return load_scenario(P_D, {"link.delay_ms": x, "control.d": y})
+
+
+def spare(excess: float) -> StabilityCriterion:
+    return StabilityCriterion("", "", "", excess)
+
+
+def test_the_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
+    """No d of the map is little enough for no delay, or enough for 800 ms."""
+    line = trace_closed_form(at, DELAY, DAMPING)
+    assert line is not None
+    found = [line.crossings(column, DAMPING) for column in range(6)]
+    assert [len(some) for some in found] == [0, 1, 1, 1, 1, 0]
+    assert np.allclose([some[0] for some in found[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
+    assert (line.spare > 0.0)[-1, 0]
+    assert not (line.spare > 0.0)[0, -1]
+
+
+def test_a_law_without_a_condition_has_no_line() -> None:
+    assert trace_closed_form(lambda x, _: load_scenario("free", {"link.delay_ms": x}), DELAY, DAMPING) is None
+
+
+def test_a_condition_that_nothing_of_the_map_changes_has_no_line() -> None:
+    assert (
+        trace_closed_form(
+            lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}), DELAY, DAMPING
+        )
+        is None
+    )
+
+
+@given(st.floats(-50.0, 50.0), st.floats(1.0, 3.0), st.sampled_from([-1.0, 1.0]))
+def test_a_condition_is_met_where_it_has_nothing_to_spare(root: float, power: float, sign: float) -> None:
+    def condition(value: float) -> StabilityCriterion:
+        gap = value - root
+        return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
+
+    found = find_criterion_edge(condition, -60.0, 60.0)
+    assert found is not None
+    assert abs(condition(found).excess) <= 1e-5 * 120.0**power
+
+
+def test_a_key_of_whole_numbers_has_no_point_between_them() -> None:
+    def condition(value: float) -> StabilityCriterion:
+        if value != round(value):
+            raise ScenarioError("is a whole number")
+        return spare(value - 2.5)
+
+    assert find_criterion_edge(condition, 0.0, 7.0) is None
+
+
+def test_the_linear_line_is_where_nothing_grows() -> None:
+    """Real parts that are zero along y = 0.4 x: positive below, negative above."""
+    columns = [([0.4 * x - y for y in (0.0, 1.0, 2.0)], []) for x in (0.0, 1.0, 2.0, 3.0)]
+    line, remarks = trace_linear_analysis(columns)
+    assert line is not None
+    assert not remarks
+    side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
+    assert np.allclose([line.crossings(n, side)[0] for n in (1, 2, 3)], [0.4, 0.8, 1.2])
+
+
+def test_a_column_may_be_crossed_again_and_again() -> None:
+    side = PlaneAxis("y", (0.0, 1.0, 2.0, 3.0), "y")
+    line, _ = trace_linear_analysis([([-1.0, 1.0, 3.0, -1.0], [])] * 2)
+    assert line is not None
+    assert line.crossings(0, side) == [0.5, 2.75]
+
+
+def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
+    side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
+    line, _ = trace_linear_analysis([([-np.inf, 1.0, -1.0], []), ([np.nan, 1.0, -1.0], [])])
+    assert line is not None
+    assert line.crossings(0, side) == line.crossings(1, side) == [1.5]
+
+
+def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> None:
+    why = ["nobody knows the delay"]
+    line, remarks = trace_linear_analysis([([np.nan, np.nan], why), ([np.nan, np.nan], why)])
+    assert line is None
+    assert remarks == why
+    assert trace_linear_analysis([([-1.0, -2.0], []), ([-1.0, -3.0], [])]) == (None, [])
+
+
+GAIN = st.floats(0.1, 50.0)
+DELAY_MS = st.integers(1, 5000)
+
+
+def excess(scenario: Scenario) -> float:
+    found = evaluate_criterion(scenario)
+    assert found is not None
+    return found.excess
+
+
+@given(GAIN, GAIN, DELAY_MS)
+def test_equal_sites_ask_for_half_of_stiffness_times_delay(K: float, d: float, delay_ms: int) -> None:
+    """Three sites with equal shares: the least eigenvalue of alpha is -1/2."""
+    one = load_scenario("p_d_margin", {"control.K": K, "control.d": d, "link.delay_ms": delay_ms})
+    assert excess(one) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
+
+
+@given(GAIN, GAIN, GAIN, GAIN, DELAY_MS, DELAY_MS)
+def test_two_sites_are_judged_by_the_sign_of_the_general_condition(
+    K1: float, K2: float, d1: float, d2: float, there_ms: int, back_ms: int
+) -> None:
+    names = load_scenario("p_d_margin_two").names
+    settings: dict[str, Any] = {}
+    for name, K, d in zip(names, (K1, K2), (d1, d2), strict=True):
+        settings |= {
+            f"sites.{name}.control.{key}": value for key, value in (("law", "p_d"), ("K", K), ("d", d))
+        }
+    settings |= {f"links.{names[0]}->{names[1]}.delay_ms": there_ms}
+    settings |= {f"links.{names[1]}->{names[0]}.delay_ms": back_ms}
+    margin = 4.0 * d1 * d2 - ((there_ms + back_ms) / 1e3) ** 2 * K1 * K2
+    if abs(margin) > 1e-6:
+        assert np.sign(excess(load_scenario("p_d_margin_two", settings))) == np.sign(margin)
+
+
+def test_of_two_equal_sites_both_conditions_are_one() -> None:
+    """N = 2: abs(lambda_min) = 1, d = K T."""
+    one = load_scenario("p_d_margin_two", {"control.d": 2.0, "control.K": 10.0, "link.delay_ms": 200.0})
+    assert excess(one) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_digital_scheme_rests_on_gravity_learnt_slower_than_a_tick_allows() -> None:
+    settings = {"scheme": "digital", "link.delay_ms": 0.0, "rate_hz": 100, "control.Gamma": 1.0}
+    assert excess(load_scenario("paper", settings)) == pytest.approx(1.0 - 9.81**2 / 100)
+    gravity = {**settings, "control.Gamma": [9.0, 9.0, 9.0, 1.0, 1.0]}
+    assert excess(load_scenario("paper", gravity)) == pytest.approx(excess(load_scenario("paper", settings)))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("free", {}),  # the theorem: stable for every constant delay, no line
+        ("free", {"scheme": "digital"}),  # with a delay of many ticks the rule says nothing
+        ("p_d_margin", {"control.gravity": 0.9}),
+        ("p_d_margin", {"control.K": [10.0, 5.0]}),
+        ("p_d_margin", {"sites.s.control.law": "p_d", "sites.s.control.K": 5.0}),
+        ("p_d_margin", {"links.m1->s.delay_ms": 100.0}),
+        ("p_d_margin", {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0}),
+        ("p_d_margin", {"link.loss": 0.5}),
+        ("p_d_margin", {"on_stale.action": "hold"}),
+        ("p_d_margin", {"control.law": "pd_d"}),
+        ("jitter", {}),
+        ("contact", {}),
+    ],
+)
+def test_where_its_premises_do_not_hold_a_condition_says_nothing(name: str, settings: dict[str, Any]) -> None:
+    assert evaluate_criterion(load_scenario(name, settings)) is None
+
+
+def test_play_out_counts_as_delay() -> None:
+    assert excess(load_scenario("p_d_margin", {"link.playout_ms": 400.0})) == pytest.approx(1.1 - 2.0)
+
+
+def test_of_shares_that_turn_in_a_circle_the_roots_are_complex_and_nothing_is_said() -> None:
+    circle = {f"dominance.{a}": {b: 1.0} for a, b in (("m1", "m2"), ("m2", "s"), ("s", "m1"))}
+    assert evaluate_criterion(load_scenario("p_d_margin", circle)) is None

@@ -1,15 +1,28 @@
-"""One definition of every figure: a virtual run is measured as its log is."""
+"""One definition of every metric: a run is measured as its log is, however it is cut into batches."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import trilat_net
 from tests.log_editing import edited, opened, recorded, without
+from trilat_net.core.two_link_arm import end_effector_jacobian
+from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.record_batches import BATCH_RECORDS
-from trilat_net.studies.trials.measure_run import RunMetrics, measure_log, measure_virtual_run
+from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow
+from trilat_net.studies.record_batches import BATCH_RECORDS, RecordBatch
+from trilat_net.studies.trials.measure_run import (
+    BUCKET_NS,
+    RunMetrics,
+    SiteStats,
+    WindowStats,
+    measure_log,
+    measure_virtual_run,
+)
 
 RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
 SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}
@@ -96,3 +109,184 @@ def test_every_missing_record_of_a_log_is_counted() -> None:
     none = measure_log(opened(edited(whole, record=without("s", set(range(120))))))
     assert none.missing == 120
     assert none.synchronised_at_s is none.end_spread_rad is none.ages["m1->s"].mean_ms is None
+
+
+PERIOD_NS = 10_000_000
+TALLIED = 400
+
+
+def records(seed: int) -> RecordBatch:
+    """Four seconds at 100 Hz with peers at 100 and 50 Hz; the second is heard of from tick 20 on."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(TALLIED)
+    used = np.array([k - 5, np.where(k < 20, -1, k // 2 - rng.integers(2, 9, TALLIED))]).T
+    return RecordBatch(k * PERIOD_NS, *rng.normal(size=(5, TALLIED, 2)), np.maximum(used, -1))
+
+
+def tallied(rows: RecordBatch, cuts: list[int], synchronised_rad: float = 1.0) -> SiteStats:
+    tally = SiteStats([100, 50], synchronised_rad)
+    edges = [0, *sorted(cuts), TALLIED]
+    for first, last in pairwise(edges):
+        tally.add(RecordBatch(*(part[first:last] for part in rows)))
+    return tally
+
+
+@given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(0, TALLIED), max_size=12))
+def test_the_cut_into_blocks_changes_no_statistics_of_a_site(seed: int, cuts: list[int]) -> None:
+    rows = records(seed)
+    cut, whole = tallied(rows, cuts), tallied(rows, [])
+    for figure in ("records", "peak_error_rad", "peak_torque_nm", "peak_speed_rad_s", "apart_ns", "last_ns"):
+        assert getattr(cut, figure) == getattr(whole, figure)
+    assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
+    assert cut.peaks().tolist() == whole.peaks().tolist()
+    assert cut.rms_error_rad == pytest.approx(whole.rms_error_rad)
+    assert cut.mean_age_ms == pytest.approx(whole.mean_age_ms)
+    end, end_of_whole = cut.end(cut.last_ns), whole.end(whole.last_ns)
+    assert all(np.array_equal(a, b) for a, b in zip(end, end_of_whole, strict=True))
+
+
+@given(seed=st.integers(0, 1000))
+def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
+    rows = records(seed)
+    tally = tallied(rows, [37, 38, 290])
+    error = np.abs(rows.q - rows.q_des)
+    assert tally.peak_error_rad == error.max()
+    assert tally.peak_torque_nm == np.abs(rows.tau).max()
+    assert tally.peak_speed_rad_s == np.abs(rows.qd).max()
+    assert tally.rms_error_rad == pytest.approx(max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1)))
+    apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
+    assert tally.apart_ns == (apart[-1] if apart else -1)
+    assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
+    ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
+    assert tally.mean_age_ms[1] == pytest.approx(np.mean(ages))
+    assert tally.age_max_ms[1] == pytest.approx(max(ages))
+    for bucket, peak in enumerate(tally.peaks()):
+        assert peak == error[rows.t_ns // BUCKET_NS == bucket].max()
+
+
+def test_what_it_keeps_does_not_grow_with_the_records() -> None:
+    tally, block = SiteStats([100, 50], 1.0), records(1)
+    for n in range(30):
+        tally.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
+    assert len(tally.end(0).t_ns) <= 2 * TALLIED
+    assert len(tally.end(tally.last_ns).t_ns) == 100
+
+
+def test_a_link_that_never_had_a_sample_has_no_age() -> None:
+    rows = records(1)
+    rows.used[:, 1] = -1
+    assert tallied(rows, [])._age_records[1] == 0
+    assert tallied(rows, []).mean_age_ms[1] is None
+
+
+def test_a_bucket_without_records_says_so() -> None:
+    rows = records(1)
+    keep = (rows.t_ns // BUCKET_NS) != 7
+    tally = SiteStats([100, 50], 1.0)
+    tally.add(RecordBatch(*(part[keep] for part in rows)))
+    assert [n for n, peak in enumerate(tally.peaks()) if peak < 0] == [7]
+
+
+WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
+ASKED = {key: [-1e9, 1e9] for key in WINDOW_QUANTITIES}
+CHANGES = {
+    "duration_s": 2.0,
+    "link.delay_ms": 20.0,
+    "sites.m.hands": [{"kind": "pulse", "start_s": 0.0, "end_s": 2.0, "peak_nm": [0.0, -20.0]}],
+    "sites.s.environment": [{**WALL, "damping_n_s_m": 5.0}],
+}
+RECORDS = 200
+
+
+def windowed(**changes: Any) -> Scenario:
+    window = {"from_s": 0.5, "to_s": 1.5, "site": "s", **ASKED}
+    return load_scenario("contact", {**CHANGES, "expect": {"windows": [window]}, **changes})
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return trilat_net.simulate(windowed())
+
+
+def rows(seed: int) -> RecordBatch:
+    """Two seconds at 100 Hz about the start pose, in and out of a wall."""
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(5, RECORDS, 2))
+    vectors[0] = [-0.6, 1.8] + 0.02 * vectors[0]
+    return RecordBatch(np.arange(RECORDS) * 10_000_000, *vectors, np.zeros((RECORDS, 1), dtype=np.int64))
+
+
+def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
+    spec = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100}).sites["s"]
+    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), spec)
+    for first, last in pairwise([0, *sorted(cuts), RECORDS]):
+        if first < last:
+            made.add(RecordBatch(*(column[first:last] for column in records)))
+    return made.figures()
+
+
+@given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))
+def test_the_cut_into_blocks_has_no_influence(seed: int, cuts: list[int]) -> None:
+    cut, whole = stretched(rows(seed), cuts), stretched(rows(seed), [])
+    for key in WINDOW_QUANTITIES:
+        assert cut[key] == pytest.approx(whole[key], rel=1e-12, abs=1e-12)
+
+
+@given(seed=st.integers(0, 100), outside=st.sampled_from([slice(0, 50), slice(150, RECORDS)]))
+def test_what_lies_outside_of_the_window_leaves_no_trace(seed: int, outside: slice) -> None:
+    records = rows(seed)
+    bent = RecordBatch(*(column.copy() for column in records))
+    for column in bent[1:6]:
+        column[outside] += 100.0
+    assert stretched(bent, []) == stretched(records, [])
+
+
+@pytest.mark.parametrize(("to_s", "known"), [(1.5, True), (2.0, True), (2.01, False), (5.0, False)])
+def test_a_window_that_the_records_do_not_fill_tells_nothing(to_s: float, known: bool) -> None:
+    assert bool(stretched(rows(1), [], to_s=to_s)) == known
+
+
+def test_quantities_of_a_window_are_what_their_definitions_say(log: Log) -> None:
+    """The wall's force is the one whose torque J' F stands in the records."""
+    (found,) = measure_log(log).windows
+    site = log["s"]
+    inside = (site.t_s >= 0.5) & (site.t_s < 1.5)
+    force = np.zeros(len(site))
+    for k, q in enumerate(site.q):
+        J = np.array(end_effector_jacobian(np.ones(2), q))
+        force[k] = -np.linalg.solve(J.T, -site.tau_x[k])[0]
+    push, force = -site.tau_x[inside], force[inside]
+    wanted = {
+        "error_peak_rad": np.abs(site.e[inside]).max(),
+        "speed_peak_rad_s": np.abs(site.qd[inside]).max(),
+        "torque_peak_nm": np.abs(site.tau[inside]).max(),
+        "push1_mean_nm": push[:, 0].mean(),
+        "push2_mean_nm": push[:, 1].mean(),
+        "wall_mean_n": force.mean(),
+        "wall_deviation_n": force.std(),
+        "wall_peak_n": force.max(),
+        "wall_hits": np.sum((force[1:] > 1e-9) & (force[:-1] <= 1e-9)),
+    }
+    assert wanted["wall_hits"] >= 1
+    assert {key: found[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
+    for joint, key in enumerate(("q1_rad", "q2_rad")):
+        assert found[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
+
+
+def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
+    (run,), (logged,) = measure_virtual_run(log.scenario).windows, measure_log(log).windows
+    assert run.keys() == set(WINDOW_QUANTITIES)
+    for key in WINDOW_QUANTITIES:
+        assert run[key] == pytest.approx(logged[key], rel=1e-12)
+
+
+def test_a_window_of_all_sites_has_the_largest_of_them(log: Log) -> None:
+    everywhere = {"from_s": 0.5, "to_s": 1.5, "error_peak_rad": [0.0, 1.0], "torque_peak_nm": [0.0, 1.0]}
+    (found,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
+    inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
+    assert found["error_peak_rad"].most == max(np.abs(log[n].e[k]).max() for n, k in inside.items())
+    assert found["torque_peak_nm"].least == max(np.abs(log[n].tau[k]).max() for n, k in inside.items())
+
+
+def test_a_run_that_ended_before_measures_nothing() -> None:
+    assert measure_virtual_run(windowed(**{"limits.qd_limit_rad_s": 0.05})).windows == ({},)

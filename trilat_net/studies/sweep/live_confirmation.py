@@ -124,14 +124,12 @@ def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridInde
     """Returns rows by the numbers of their values along the axes, then law and seed."""
     values = [sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one)) for key in axes]
     numbers = [{value: n for n, value in enumerate(some)} for some in values]
-    return {
-        (
-            *(number[row[key]] for key, number in zip(axes, numbers, strict=True)),
-            row.get("law"),
-            row.get("seed"),
-        ): row
-        for row in rows
-    }
+
+    def index(row: ResultRow) -> GridIndex:
+        places = (number[row[key]] for key, number in zip(axes, numbers, strict=True))
+        return (*places, row.get("law"), row.get("seed"))
+
+    return {index(row): row for row in rows}
 
 
 def _steps_away(places: Mapping[GridIndex, ResultRow], axes: int) -> dict[GridIndex, int]:

@@ -205,10 +205,8 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
     others = [key for key in axes if key not in drawn and len({row[key] for row in rows}) > 1]
     settings = list(dict.fromkeys(tuple((key, row[key]) for key in others) for row in rows))
     if len(settings) > MAX_PANELS:
-        raise UsageError(
-            f"a map has at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}: "
-            "sweep fewer values of what is not drawn"
-        )
+        found = f"at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}"
+        raise UsageError(f"a map has {found}: sweep fewer values of what is not drawn")
     shape = len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)
     panels = [MapPanel(_title(one, scenario), one, np.zeros(shape, dtype=np.int64)) for one in settings]
     of = dict(zip(settings, panels, strict=True))

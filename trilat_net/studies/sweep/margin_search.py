@@ -175,9 +175,8 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
     if not 0.0 < tolerance < 1.0:
         raise UsageError(f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}")
     if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
-        raise UsageError(
-            f"--margin reads KEY=FROM:TO with FROM below TO, as in control.d=0.2:3, not {text!r}"
-        )
+        form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
+        raise UsageError(f"--margin reads {form}, not {text!r}")
     return found
 
 

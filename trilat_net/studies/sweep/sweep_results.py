@@ -44,7 +44,7 @@ _PLAN_KEY = "trilat_net.sweep"
 _ROWS_OF_A_GROUP = 16_384
 
 ResultRow = Mapping[str, Any]
-"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, every field of `Outcome`,
+"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, every field of `CellResult`,
 `scenario_sha256`, `command` and `scenario`, its canonical text. Verdict and motion are their words."""
 
 

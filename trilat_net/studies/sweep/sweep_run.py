@@ -63,11 +63,6 @@ class SweepSpeed(NamedTuple):
     wall_s: float
     jobs: int
 
-    @property
-    def times_real_time(self) -> float:
-        """Simulated seconds per second of one process."""
-        return self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
-
 
 class FinishedSweep(NamedTuple):
     """A finished sweep, and the speed of what was run this time."""
@@ -257,11 +252,9 @@ def _describe_grid_point(plan: SweepPlan, place: GridPoint) -> str:
 def describe_sweep_speed(speed: SweepSpeed) -> str:
     """Returns the speed in words."""
     on = "1 process" if speed.jobs == 1 else f"{speed.jobs} processes"
-    return (
-        f"{speed.runs} runs, {speed.simulated_s:.4g} s simulated, "
-        f"in {format_wall_time(speed.wall_s)} by {on}: "
-        f"{speed.times_real_time:.0f} times real time per process"
-    )
+    took = f"{speed.simulated_s:.4g} s simulated, in {format_wall_time(speed.wall_s)} by {on}"
+    times = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
+    return f"{speed.runs} runs, {took}: {times:.0f} times real time per process"
 
 
 def list_next_commands(folder: Path) -> list[str]:

@@ -291,11 +291,10 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
     parts = [stretch.figures() for stretch in stretches if stretch is not None]
     if len(parts) == 1:
         return parts[0]
-    known = set.intersection(*map(set, parts)) & set(ALL_SITES_QUANTITIES)
     return {
         key: Range(*(max(part[key][n] for part in parts) for n in (0, 1)))
         for key in ALL_SITES_QUANTITIES
-        if key in known
+        if all(key in part for part in parts)
     }
 
 

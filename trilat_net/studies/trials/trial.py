@@ -41,11 +41,8 @@ class TrialResult(NamedTuple):
     @property
     def failures(self) -> list[str]:
         """Unmet expectations, a sentence each."""
-        words = [
-            f"{outcome.key}: {outcome.measured}, asked {outcome.limit}"
-            for outcome in self.outcomes
-            if not outcome.held
-        ]
+        missed = [outcome for outcome in self.outcomes if not outcome.held]
+        words = [f"{outcome.key}: {outcome.measured}, asked {outcome.limit}" for outcome in missed]
         return [f"no result: {self.error}", *words] if self.error else words
 
 
@@ -183,11 +180,8 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
         verdict = verify(log)
     except LogError as error:
         return TrialResult(trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept)
-    outcomes = [
-        *result.outcomes,
-        ExpectationResult("session", not problems, "; ".join(problems) or "ended in order", "ends in order"),
-        ExpectationResult(
-            "executed again", verdict.passed, f"{verdict.identical} identical", f"{verdict.records} records"
-        ),
-    ]
-    return result._replace(outcomes=outcomes, log=kept)
+    ended = "; ".join(problems) or "ended in order"
+    session = ExpectationResult("session", not problems, ended, "ends in order")
+    identical, records = f"{verdict.identical} identical", f"{verdict.records} records"
+    again = ExpectationResult("executed again", verdict.passed, identical, records)
+    return result._replace(outcomes=[*result.outcomes, session, again], log=kept)

@@ -67,11 +67,8 @@ class TrialReport(NamedTuple):
 
     def remarks(self) -> list[str]:
         """Returns what else there is to know: what ran once, and how fast it went."""
-        once = [
-            name
-            for name, results in self.scenarios.items()
-            if not (results[0].trial.scenario.random or results[0].trial.live)
-        ]
+        first = {name: results[0].trial for name, results in self.scenarios.items()}
+        once = [name for name, trial in first.items() if not (trial.scenario.random or trial.live)]
         changed = self.results[0].trial.overrides if self.results else ()
         remarks = [f"changed in all: {', '.join(changed)}"] if changed else []
         if once:
@@ -80,10 +77,8 @@ class TrialReport(NamedTuple):
         how = "ran live" if any(result.trial.live for result in self.results) else "simulated"
         runs = "run" if len(self.results) == 1 else "runs"
         speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
-        return [
-            *remarks,
-            f"{len(self.results)} {runs}, {simulated_s:.6g} s {how} in {self.wall_s:.1f} s{speed}",
-        ]
+        took = f"{simulated_s:.6g} s {how} in {self.wall_s:.1f} s{speed}"
+        return [*remarks, f"{len(self.results)} {runs}, {took}"]
 
     def table(self) -> list[str]:
         """Returns the table as aligned lines; the first holds the heads."""
@@ -112,8 +107,7 @@ def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
         ExpectationRow(name, key, min(outcomes, key=order), sum(o.held for o in outcomes), len(outcomes))
         for key, outcomes in by_key.items()
     ]
-    broken = [result.error for result in results if result.error]
-    if broken:
+    if broken := [result.error for result in results if result.error]:
         outcome = ExpectationResult("a result", False, broken[0], "")
         rows.append(ExpectationRow(name, outcome.key, outcome, len(results) - len(broken), len(results)))
     return rows

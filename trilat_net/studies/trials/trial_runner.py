@@ -47,12 +47,8 @@ def run_trials(
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    laws = [
-        site.control
-        for trial in batch
-        for site in trial.scenario.sites.values()
-        if isinstance(site.control, ImportedLaw)
-    ]
+    controls = [site.control for trial in batch for site in trial.scenario.sites.values()]
+    laws = [control for control in controls if isinstance(control, ImportedLaw)]
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:

@@ -105,6 +105,7 @@ def _run(scenario: Scenario) -> _Run:
     mean = q.mean(axis=0)
     apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
     largest = np.abs(e).max(axis=(0, 2))
+    apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
     efforts, saturated = zip(*map(_effort, records, scenario.sites.values()), strict=True)
     return _Run(
         trend=fit_envelope(t_s, largest).trend,
@@ -112,7 +113,7 @@ def _run(scenario: Scenario) -> _Run:
         spread_rad=_rms(apart),
         pose_rad=_rms(off),
         effort_nm=float(np.sqrt(np.mean(efforts))),
-        settled_s=_settled_s(t_s, largest),
+        settled_s=float(apart_at_s) if largest[-1] < SETTLED_ERROR_RAD else None,
         saturated=float(np.mean(saturated)),
         diverged_s=diverged_s,
     )
@@ -140,13 +141,6 @@ def _effort(record: _Record, site: SiteSpec) -> tuple[float, float]:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _settled_s(t_s: Array, largest: Array) -> float | None:
-    apart = np.flatnonzero(largest >= SETTLED_ERROR_RAD)
-    if not len(apart):
-        return 0.0
-    return None if apart[-1] == len(t_s) - 1 else float(t_s[apart[-1]])
 
 
 def _ending(t_s: Array, apart: Array, off: Array, e: Array) -> CandidateEnd:

@@ -28,7 +28,6 @@ from ...log.log_reader import Log
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.operators import JointSpring, Wall
-from ...scenario.scenario_types import SiteSpec
 
 CONFLICT_RAD = 0.02
 """Operators whose targets are further from the consensus than this hold the arms apart."""
@@ -87,16 +86,12 @@ def _refuse_conflict(scenario: Scenario) -> None:
 
 def build_twin(scenario: Scenario) -> Scenario | None:
     """Returns the same without torques that have no target, and without walls; None where it has neither."""
-    sites = {name: _without_untargeted(spec) for name, spec in scenario.sites.items()}
+    sites = {}
+    for name, spec in scenario.sites.items():
+        hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
+        environment = tuple(one for one in spec.environment if not isinstance(one, Wall))
+        sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
     return None if sites == scenario.sites else msgspec.structs.replace(scenario, sites=sites)
-
-
-def _without_untargeted(spec: SiteSpec) -> SiteSpec:
-    return msgspec.structs.replace(
-        spec,
-        hands=tuple(hand for hand in spec.hands if isinstance(hand, JointSpring)),
-        environment=tuple(one for one in spec.environment if not isinstance(one, Wall)),
-    )
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
@@ -119,12 +114,8 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
 
 
 def _springs(scenario: Scenario) -> list[tuple[str, JointSpring]]:
-    return [
-        (name, hand)
-        for name, spec in scenario.sites.items()
-        for hand in spec.hands
-        if isinstance(hand, JointSpring)
-    ]
+    hands = ((name, hand) for name, spec in scenario.sites.items() for hand in spec.hands)
+    return [(name, hand) for name, hand in hands if isinstance(hand, JointSpring)]
 
 
 def _target(hand: JointSpring, t_s: Array) -> tuple[Array, Array]:

@@ -144,6 +144,12 @@ _GAMMA = GainRange("Gamma", "", 0.01, 10.0)
 _K = GainRange("K", "N m/rad", 1.0, 1000.0)
 _D = GainRange("d", "N m s/rad", 0.5, 200.0)
 _ADAPTING = (_LAMBDA, _KP, _KD, _GAMMA)
+_REFLECTING = (
+    _K._replace(where="slave"),
+    _D._replace(name="d_slave", where="slave"),
+    _D._replace(name="d_master", where="master"),
+    GainRange("k_f", "", 0.05, 2.0, "master"),
+)
 _AS_FIRST = "gravity, as its first estimate"
 
 SEARCH_SPACES: dict[str, SearchSpace] = {
@@ -153,20 +159,8 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("adaptive_box", _ADAPTING, f"{_AS_FIRST}; the box is around it", _adaptive_box),
         SearchSpace("p_d", (_K, _D), "gravity", _knowing_gravity("p_d")),
         SearchSpace("pd_d", (_K, _KD, _D), "gravity", _knowing_gravity("pd_d")),
-        SearchSpace(
-            "p_f",
-            (
-                _K._replace(where="slave"),
-                _D._replace(name="d_slave", where="slave"),
-                _D._replace(name="d_master", where="master"),
-                GainRange("k_f", "", 0.05, 2.0, "master"),
-            ),
-            "gravity",
-            _p_f,
-        ),
-        SearchSpace(
-            "known", (_LAMBDA, _KP, _KD), "gravity, AND inertia exactly: more than the others", _known
-        ),
+        SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
+        SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
     )
 }
 """The laws that can be tuned, by name; `known` is `adaptive` with Gamma = 0 and the true inertia."""

@@ -57,22 +57,13 @@ def _law_row(tuned: TuningResult, found: SearchResult) -> tuple[str, ...]:
 
 def tabulate_search(plan: TuningPlan) -> TextTable:
     """Returns a row per law and gain: its range, and the information the law gets."""
-    return TextTable(
-        ("law", "gain", "unit", "from", "to", "told"),
-        [
-            (
-                space.law,
-                f"{knob.name} ({knob.where})" if knob.where else knob.name,
-                knob.unit or "-",
-                f"{knob.low:g}",
-                f"{knob.high:g}",
-                space.told if n == 0 else "",
-            )
-            for space in plan.spaces
-            for n, knob in enumerate(space.knobs)
-        ],
-        align="lllrrl",
-    )
+    rows = []
+    for space in plan.spaces:
+        for n, knob in enumerate(space.knobs):
+            name = f"{knob.name} ({knob.where})" if knob.where else knob.name
+            told = space.told if n == 0 else ""
+            rows.append((space.law, name, knob.unit or "-", f"{knob.low:g}", f"{knob.high:g}", told))
+    return TextTable(("law", "gain", "unit", "from", "to", "told"), rows, align="lllrrl")
 
 
 def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUDGET) -> TextTable:
