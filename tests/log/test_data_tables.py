@@ -161,15 +161,6 @@ def test_a_number_that_64_bits_do_not_hold_is_refused() -> None:
         log.table("events")
 
 
-def test_times_are_the_files() -> None:
-    every = messages(recorded("paper"))
-    moved = [(topic, payload, log_ns + 5, sent + 3, number) for topic, payload, log_ns, sent, number in every]
-    table = opened(a_file(recorded("paper"), moved)).table("m1")
-    t_ns = np.round(table["t_s"].values * 1e9).astype(np.int64)
-    assert (table["log_time_ns"].values == t_ns + 5).all()
-    assert (table["publish_time_ns"].values == t_ns + 3).all()
-
-
 def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
     known = np.array([True, False])
     column = Column("x_us", np.array([3, 4]), known=known)

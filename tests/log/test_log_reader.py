@@ -29,7 +29,7 @@ def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
         stream = io.BytesIO()
-        virtual.write_virtual_log(load_scenario(name, {"duration_s": 0.3}), stream)
+        virtual.write_virtual_log(load_scenario(name, {"duration_s": 0.3}), stream, views_hz=100.0)
         digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
     assert len(digests) == 1
 

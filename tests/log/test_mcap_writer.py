@@ -3,7 +3,6 @@
 import io
 from typing import Any
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -121,8 +120,3 @@ def test_the_index_of_a_chunk_takes_bytes_and_no_objects() -> None:
             file.add_message(channel, k, b"x", k)
         file.flush()
     assert (file.owed - before) / 100 < 250
-
-
-def test_a_message_of_no_channel_is_refused() -> None:
-    with pytest.raises(KeyError):
-        McapWriter(io.BytesIO(), "lib").add_message(1, 0, b"", 0)

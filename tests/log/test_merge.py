@@ -135,14 +135,11 @@ def test_a_record_that_no_part_has_is_missing_and_a_torn_part_shows_it() -> None
     assert sum("missing 1" in log.account(name) for name in log.sites) == 1
 
 
-def test_a_part_that_is_not_named_leaves_the_whole_incomplete() -> None:
+def test_a_part_that_is_not_named_or_has_no_end_leaves_the_whole_incomplete() -> None:
     parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
     assert joined(*parts).complete
     assert not joined(parts[0], parts[2]).complete
     assert not opened(parts[2]).complete
-
-
-def test_an_unfinished_end_leaves_the_whole_incomplete() -> None:
     every = messages(whole())
     assert not joined(a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)).complete
 

@@ -164,26 +164,22 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     assert result.output == tmp_path / "run.recovered.mcap"
     assert messages(saved) == messages(data)
     assert result.sites == {"m1": 120, "m2": 120, "s": 120}
-    before, after = (make_reader(io.BytesIO(each)) for each in (data, saved))
-    assert list(before.iter_attachments()) == list(after.iter_attachments())
-    old, new = ({e.name: e.metadata for e in each.iter_metadata()} for each in (before, after))
-    assert new["trilat.session"] == old["trilat.session"]
-    assert new["trilat.recovered"]["lost"] == "nothing"
-    assert new["trilat.recovered"]["from"] == "run.mcap"
-    for topic, account in new["trilat.accounts"].items():
-        assert "missing 0" in account, topic
-    assert set(new["trilat.accounts"]) == set(old["trilat.accounts"])
-    summaries = [each.get_summary() for each in (before, after)]
-    for summary in summaries:
-        assert summary is not None
-    kinds = [
-        sorted((c.topic, c.message_encoding, sorted(c.metadata.items())) for c in s.channels.values())
-        for s in summaries
-        if s
+    old, new = (make_reader(io.BytesIO(each)) for each in (data, saved))
+    assert list(old.iter_attachments()) == list(new.iter_attachments())
+    before, after = ({e.name: e.metadata for e in each.iter_metadata()} for each in (old, new))
+    assert after["trilat.session"] == before["trilat.session"]
+    assert (after["trilat.recovered"]["lost"], after["trilat.recovered"]["from"]) == ("nothing", "run.mcap")
+    assert set(after["trilat.accounts"]) == set(before["trilat.accounts"])
+    assert all("missing 0" in account for account in after["trilat.accounts"].values())
+    defined = [
+        (
+            sorted((c.topic, c.message_encoding, sorted(c.metadata.items())) for c in s.channels.values()),
+            sorted((c.name, c.encoding, c.data) for c in s.schemas.values()),
+        )
+        for s in (old.get_summary(), new.get_summary())
+        if s is not None
     ]
-    assert kinds[0] == kinds[1]
-    schemas = [sorted((c.name, c.encoding, c.data) for c in s.schemas.values()) for s in summaries if s]
-    assert schemas[0] == schemas[1]
+    assert defined[0] == defined[1]
 
 
 def test_what_is_missing_is_counted_afresh_and_named_by_site(tmp_path: Path) -> None:
