@@ -37,15 +37,6 @@ def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: 
     assert matches_key(expression, key) == known.includes(zenoh.KeyExpr(key))
 
 
-@given(include=st.lists(PATTERNS, max_size=2), exclude=st.lists(PATTERNS, max_size=2), key=KEYS)
-def test_taken_is_what_is_included_and_not_excluded(include: list[str], exclude: list[str], key: str) -> None:
-    taken = ChannelFilter(tuple(include), tuple(exclude)).takes(key)
-    assert taken == (
-        (not include or any(matches_key(text, key) for text in include))
-        and not any(matches_key(text, key) for text in exclude)
-    )
-
-
 @pytest.mark.parametrize("text", ["", "a//b", "a*", "***", "a/$", "a?", "#", "*m1/**"])
 def test_what_is_no_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is a key expression like"):

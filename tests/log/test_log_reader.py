@@ -231,17 +231,3 @@ def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) 
     data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
     with pytest.raises(LogError, match="record of m1"):
         _ = opened(data)["m1"].states
-
-
-class FullDisk(io.BytesIO):
-    """A disk with no room left after some bytes."""
-
-    def write(self, data: bytes) -> int:
-        if self.tell() > 20_000:
-            raise OSError(28, "No space left on device")
-        return super().write(data)
-
-
-def test_a_disk_that_is_full_is_a_log_error() -> None:
-    with pytest.raises(LogError, match="No space left"):
-        virtual.write_virtual_log(load_scenario("paper", {"duration_s": 5.0}), FullDisk())

@@ -155,8 +155,6 @@ class LogFile:
         now_ns: the clock.
 
     Attributes:
-        path: its name once it is complete.
-        working: its name until then.
         size: its bytes; all of them were flushed.
         trouble: the first error of the disk, or None.
 

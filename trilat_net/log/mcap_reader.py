@@ -99,8 +99,7 @@ class McapReader:
         kept: True if the caller keeps the messages: then what they take, decoded, is limited (`KEPT_RATIO`).
 
     Attributes:
-        metadata: metadata records seen so far, by name.
-        attachments: attachments seen so far, by name.
+        metadata, attachments: what was seen of them so far, by name.
         channels: channels seen so far, by topic; the first definition of one holds.
         library: what wrote the file, as its header states.
         chunks: chunks read so far, by compression ("" for none).
@@ -243,8 +242,7 @@ class ChannelMessages:
 
     Attributes:
         payloads: the messages as published.
-        log_ns: when each came, Unix ns.
-        publish_ns: when each was sent, by its own stamp, Unix ns.
+        log_ns, publish_ns: when each came, and was sent by its own stamp, Unix ns.
     """
 
     __slots__ = ("log_ns", "payloads", "publish_ns")
@@ -269,13 +267,11 @@ class ChannelMessages:
 
 @dataclass
 class LogContents:
-    """Contents of a file, or of several that are one session's.
+    """Contents of a file, or of several that are one session's; `sources` are the files' names.
 
     Attributes:
-        sources: the files' names.
-        session: metadata of the session.
+        session, metadata: metadata of the session; all metadata, by name.
         scenario: text of the scenario.
-        metadata: all metadata, by name.
         channels: messages, by topic.
         complete: True if all of it is there, finished and readable throughout; a later part alone is not.
         ended: True if the last one was finished.

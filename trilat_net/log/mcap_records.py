@@ -174,8 +174,7 @@ class RecordScanner:
 
     Attributes:
         size: bytes of the file.
-        begins: True if it begins as an MCAP file does.
-        ends: True if it ends as a finished file does: with the last record and the end mark.
+        begins, ends: True if it begins as an MCAP file does, and ends as a finished one: with the end mark.
         finished: True once all was read, to the end of a file that was finished.
         damaged: parts that could not be read, so far; a torn end is none of them.
         torn: the end that was cut off, once all before it was read; None if there is none.

@@ -31,8 +31,13 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
     """
     if len(parts) == 1:
         return parts[0]
+    ours = _common_facts(parts[0])
     for other in parts[1:]:
-        _refuse_other_session(parts[0], other)
+        theirs = _common_facts(other)
+        differ = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if ours[name] != theirs[name]]
+        if differ:
+            session = f"the session in {parts[0].source}: {'; '.join(differ)}"
+            raise LogError(f"{other.source}: is no part of {session}")
     ordered = sorted(parts, key=_first_time)
     first, last = ordered[0], ordered[-1]
     names = dict.fromkeys(topic for part in ordered for topic in part.channels)
@@ -87,13 +92,6 @@ def _recorder_boot(part: LogContents) -> int:
                 return message.boot
             return 0
     return 0
-
-
-def _refuse_other_session(part: LogContents, other: LogContents) -> None:
-    ours, theirs = _common_facts(part), _common_facts(other)
-    differ = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if ours[name] != theirs[name]]
-    if differ:
-        raise LogError(f"{other.source}: is no part of the session in {part.source}: {'; '.join(differ)}")
 
 
 def _common_facts(part: LogContents) -> dict[str, str]:

@@ -64,15 +64,13 @@ class Recovery:
     """Result of a recovery.
 
     Attributes:
-        path: the source file.
-        output: the file that was made.
+        path, output: the source file, and the file that was made.
         finished: True if the source had been finished.
         messages: number of messages.
         sites: per site the number of records; empty if it is no trilat-net log.
         duration_s: from the first message to the last, by the times at which they were logged, s.
         salvaged: messages out of a last chunk that was cut off.
-        lost: what was lost, a sentence each.
-        lost_bytes: number of bytes that could not be read.
+        lost, lost_bytes: what was lost, a sentence each, and how many bytes could not be read.
         missing: per site which records are not in the file, be they lost here or never recorded.
     """
 

@@ -344,24 +344,26 @@ class SessionCheck:
             if not channel.schema:
                 problems.add(self._file, None, f"{topic[:80]}: has no schema")
             return None
-        check = self.channels.get(topic)
-        if check is None:
-            check = self.channels[topic] = self._make_channel_check(topic, key)
-        check.begin(self._file, channel)
-        return check
+        if topic not in self.channels:
+            self.channels[topic] = self._make_channel_check(topic, key)
+        self.channels[topic].begin(self._file, channel)
+        return self.channels[topic]
 
     def _make_channel_check(self, topic: str, key: topics.KeyParts) -> ChannelCheck:
         sites = self._scenario.sites if self._scenario else {}
         if self._scenario and key.member not in (*sites, topics.RECORDER):
-            text = f"{topic[:80]}: the scenario has no such member"
-            self._problems["schema"].add(self._file, None, text)
+            self._problems["schema"].add(self._file, None, f"{topic[:80]}: the scenario has no such member")
         rate_hz = sites[key.member].rate_hz if key.member in sites else 0
         epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
         return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, self._problems)
 
     def findings(self) -> Iterator[CheckFinding]:
         """Yields the results, once all files were read."""
-        self._expect_all()
+        ticks = {check.member: check.ticks for check in self.channels.values() if check.ticks is not None}
+        for check in self.channels.values():  # what a member published in the ticks that it stated
+            if check.kind in (topics.STATE, topics.LINK) and check.member in ticks:
+                most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
+                check.expect(min(ticks[check.member], most))
         yield self._check_sequence()
         yield self._check_accounts()
         kinds = f"every message is one of version {self._session_number('schema_version')}"
@@ -373,14 +375,6 @@ class SessionCheck:
         scenario = self._scenario.name if self._scenario else ""
         text = f"{scenario}, SHA-256 {self._about.get('scenario_sha256', '')[:16]}, as the session names it"
         yield self._problems["scenario"].finding("scenario", text)
-
-    def _expect_all(self) -> None:
-        """Counts as missing what members that stated their number of ticks published and is not there."""
-        ticks = {check.member: check.ticks for check in self.channels.values() if check.ticks is not None}
-        for check in self.channels.values():
-            if check.kind in (topics.STATE, topics.LINK) and check.member in ticks:
-                most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
-                check.expect(min(ticks[check.member], most))
 
     def _check_sequence(self) -> CheckFinding:
         problems, missing, reordered = self._problems["sequence"], 0, 0
