@@ -109,21 +109,18 @@ def replay_command(
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
     name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    connection = options.resolve_connection(
-        listen, connect, router, zenoh_config, [default_endpoint(name, 0)], []
-    )
+    first = [default_endpoint(name, 0)]
+    connection = options.resolve_connection(listen, connect, router, zenoh_config, first, [])
     play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
     console = terminal.err if as_json else terminal.out
     tell = partial(console.print, markup=False, soft_wrap=True)
-    for line in _opening_lines(facts, name, speed):
-        tell(line)
+    _announce(facts, name, speed, tell)
     reported = set(facts.torn)  # playing may add to them
     _warn_torn(facts.torn)
     clock = SystemClock()
-    show = _line(clock)
     with Interrupt() as interrupt:
         outcome = play_log(
-            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, show
+            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, _line(clock)
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
@@ -131,8 +128,7 @@ def replay_command(
         terminal.print_json({"session": name, **_facts(outcome, speed)})
     else:
         _show(outcome)
-    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
-    _warn_undelivered(outcome)
+    _warn_of(outcome, reported)
     if interrupt.requested():
         terminal.err.print("interrupted")
         raise typer.Exit(interrupt.exit_code)
@@ -146,17 +142,16 @@ def _time(text: str) -> Literal["publish", "log"]:
     return "publish" if text == "publish" else "log"
 
 
-def _opening_lines(facts: "SessionHeader", name: str, rate: float) -> list[str]:
+def _announce(facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]) -> None:
     from ..net.messages import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
-    lines = [f"playing {', '.join(facts.boots)} as session {name}, {speed}; Ctrl-C ends it"]
+    tell(f"playing {', '.join(facts.boots)} as session {name}, {speed}; Ctrl-C ends it")
     if facts.version != VERSION:
-        lines.append(
+        tell(
             f"note: these messages are of schema version {facts.version}: recorders and sites of today take "
             f"{VERSION} and count others as dropped; any other Zenoh subscriber gets them"
         )
-    return lines
 
 
 def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
@@ -224,7 +219,9 @@ def _warn_torn(torn: dict[Path, str]) -> None:
         )
 
 
-def _warn_undelivered(outcome: "PlaybackSummary") -> None:
+def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
+    """Warns of damage that was not `reported` before, and of messages that did not arrive or arrived late."""
+    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
         terminal.print_error(
             f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "
