@@ -127,7 +127,9 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
         loop = linearise_loop(conditions, rest)
-        free = _movable_states(loop)
+        effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
+        # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
+        free = [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(effects[n])]
         step = np.zeros(len(loop.names))
         step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
         share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
@@ -143,16 +145,6 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     return rest._replace(residual=float(np.abs(residual).max()))
 
 
-def _movable_states(loop: LinearLoop) -> list[int]:
-    """Returns the states that an equilibrium may be moved along.
-
-    Velocities are zero, and a state that nothing moves (an estimate without a gain, one held at an end of
-    its box) keeps its value.
-    """
-    effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
-    return [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(effects[n])]
-
-
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
     mask = find_loop_states(conditions)
@@ -161,13 +153,15 @@ def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step:
     return rest._replace(q=rest.q + states[:, Q], theta_hat=rest.theta_hat + states[:, ESTIMATE])
 
 
-def predict_from_start(conditions: OperatingConditions, start: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium that the linear loop reaches from a start at rest if its other modes decay.
+def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
+    """Returns the equilibrium that the linear loop reaches from the start poses if its other modes decay.
 
     A loop with roots at zero keeps part of its history: with null vectors W' S = 0 and S V = 0 of S = A
     + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x). Hale
     and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993), chapter 7.
     """
+    q = np.array([spec.q0_rad for spec in scenario.sites.values()])
+    start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
     rest = find_nearest_equilibrium(conditions, start)
     for _ in range(3):
         moved = np.hstack([start.q - rest.q, np.zeros_like(rest.q), start.theta_hat - rest.theta_hat])
@@ -215,7 +209,7 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
     """
     conditions = derive_operating_conditions(scenario)
-    return _require_equilibrium(scenario, predict_from_start(conditions, _start(conditions, scenario)))
+    return _require_equilibrium(scenario, predict_from_start(conditions, scenario))
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
@@ -244,12 +238,6 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
     return predict_equilibrium(scenario) if known else find_equilibrium(scenario)
 
 
-def _start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Returns the start poses, at rest, with true estimates."""
-    q = np.array([spec.q0_rad for spec in scenario.sites.values()])
-    return Equilibrium(q, _complete_estimates(conditions), "", 0.0)
-
-
 def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None = None) -> Array:
     """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters."""
     truth = [site.theta for site in conditions.sites]
@@ -273,7 +261,7 @@ def _take_pose(pose: tuple[float, float], conditions: OperatingConditions) -> Eq
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
     end = run_to_equilibrium(scenario)
     if end.diverged:
-        rest = predict_from_start(conditions, _start(conditions, scenario))
+        rest = predict_from_start(conditions, scenario)
         how = f"the run diverges at {end.t_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
     how = (
