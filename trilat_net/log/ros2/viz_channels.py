@@ -79,54 +79,44 @@ class _BucketOutput:
             self._write(*row, log_ns)
 
 
-class _SiteVizWriter:
-    """Writer of the messages of one site with its peers in scenario order; has its channels by topic."""
+class _SiteBuckets:
+    """Buckets of one site with its peers, in scenario order, at `views_hz` messages a second of the joints.
 
-    def __init__(self, site: str, peers: Sequence[str], put: PutMessage) -> None:
-        self._put = put
+    `channels` are those of the site, by topic.
+    """
+
+    def __init__(
+        self, site: str, peers: Sequence[str], rate_hz: int, views_hz: float, epoch_ns: int, put: PutMessage
+    ) -> None:
+        self._put, self._rate_hz, self._epoch_unix_ns = put, rate_hz, epoch_ns
         self._shapes = shapes = Ros2SiteChannels(site, peers)
-        root = f"{VIZ_ROOT}{site}/"
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
-        self._states_topic, self._states = f"{root}joint_states", JointStatePacker(names)
-        self._error_topic, self._error = f"{root}error", shapes.arrays["error"].pack
+        self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
         self._none = [math.nan] * len(shapes.joints)  # velocity, effort of a reference: size is dear
-        self._topics = {name: f"{root}{name}" for name in shapes.arrays}
+        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in shapes.arrays}
         self.channels: dict[str, Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
             **{self._topics[name]: array.channel for name, array in shapes.arrays.items()},
         }
+        self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
+        self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
+        self._fast, self._slow = _BucketOutput(self._write_fast), _BucketOutput(self._write_slow)
+        self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
+        self._open: list[Record] = []
+        self._slow_open: list[StampedRow] = []
+        self._late: list[Record] = []
 
-    def fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
+    def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the joint states, the angles of the reference as joints of their own; and the error."""
         none, n = self._none, len(self._none)
         velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : JOINT_ROW.stop], *none]
         data = self._states.pack(stamp_ns, row[: 2 * n], velocity, effort)
         self._put(self._states_topic, data, stamp_ns, log_ns)
-        self._put(self._error_topic, self._error(*row[ERROR_ROW]), stamp_ns, log_ns)
+        self._put(self._topics["error"], self._shapes.arrays["error"].pack(*row[ERROR_ROW]), stamp_ns, log_ns)
 
-    def slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
-        """Writes an array for each of the others."""
+    def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         for name, data in self._shapes.slow(row):
             self._put(self._topics[name], data, stamp_ns, log_ns)
-
-    def statistics(self, stamp_ns: int, stats: LinkStats, log_ns: int) -> None:
-        """Writes the arrays of one statistics."""
-        for name, data in self._shapes.statistics(stats):
-            self._put(self._topics[name], data, stamp_ns, log_ns)
-
-
-class _SiteBuckets:
-    """Buckets of one site at `views_hz` messages a second of the joints."""
-
-    def __init__(self, writer: _SiteVizWriter, rate_hz: int, views_hz: float, epoch_unix_ns: int) -> None:
-        self._writer, self._rate_hz, self._epoch_unix_ns = writer, rate_hz, epoch_unix_ns
-        self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
-        self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
-        self._fast, self._slow = _BucketOutput(writer.fast), _BucketOutput(writer.slow)
-        self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
-        self._open: list[Record] = []
-        self._slow_open: list[StampedRow] = []
-        self._late: list[Record] = []
 
     def record(self, message: Record, log_ns: int) -> None:
         """Takes the record of one tick."""
@@ -147,7 +137,9 @@ class _SiteBuckets:
 
     def statistics(self, stats: LinkStats, log_ns: int) -> None:
         """Takes the statistics of the site's loop."""
-        self._writer.statistics(max(0, self._epoch_unix_ns + stats.t_ns), stats, log_ns)
+        stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
+        for name, data in self._shapes.statistics(stats):
+            self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
         """Writes all that is open."""
@@ -237,10 +229,10 @@ class VizChannels:
         }
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
-            writer = _SiteVizWriter(site, scenario.peers(site), put)
-            buckets = _SiteBuckets(writer, scenario.sites[site].rate_hz, views_hz, epoch_unix_ns)
+            peers, rate_hz = scenario.peers(site), scenario.sites[site].rate_hz
+            buckets = _SiteBuckets(site, peers, rate_hz, views_hz, epoch_unix_ns, put)
             self._buckets.append(buckets)
-            self.channels |= writer.channels
+            self.channels |= buckets.channels
             self.takers[topics.key(session, site, topics.STATE)] = buckets.record
             self.takers[topics.key(session, site, topics.LINK)] = buckets.statistics
 
