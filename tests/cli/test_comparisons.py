@@ -27,16 +27,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
     lines = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
-    assert next(line for line in lines if "every link" in line).split() == [
-        "every",
-        "link",
-        "200",
-        "ms",
-        "50",
-        "ms",
-    ]
-    spread = next(line for line in lines if "RMS spread, undelayed" in line)
-    assert " rad " in spread
+    assert next(line.split() for line in lines if "every link" in line)[2:] == ["200", "ms", "50", "ms"]
+    assert any("RMS spread, undelayed" in line and " rad " in line for line in lines)
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
 
 
@@ -72,12 +64,8 @@ def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path
     assert "18 runs on 1 core: about " in printed
     assert "torques clamped at 60 N m" in printed
     assert "trilat sim trio.toml --set duration_s=5.0 --set 'control={law = " in printed
-    assert sorted(path.name for path in (logs / "fronts").iterdir()) == [
-        "front.json",
-        "front.md",
-        "front.pdf",
-        "front.png",
-    ]
+    written = sorted(path.name for path in (logs / "fronts").iterdir())
+    assert written == ["front.json", "front.md", "front.pdf", "front.png"]
     again = trilat("compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs).succeeds()
     assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
     trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses("fronts: holds something", "--force")

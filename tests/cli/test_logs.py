@@ -1,45 +1,17 @@
 """`sim`, `verify` and `report`: files that are the same, files that were changed, files that are torn."""
 
-import io
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
+from tests.log_editing import edited
 from trilat_net.log.log_reader import open_log
 
 from .running import trilat
-
-
-def changed(log: bytes, find: bytes, replace: bytes, *, attachment: bool = False) -> bytes:
-    """A log in which one payload, or its scenario, has been edited; otherwise whole and well-formed."""
-    reader = make_reader(io.BytesIO(log))
-    stream = io.BytesIO()
-    writer = Writer(stream, compression=CompressionType.ZSTD)
-    writer.start()
-    summary = reader.get_summary()
-    for one in reader.iter_metadata():
-        writer.add_metadata(one.name, one.metadata)
-    for one in reader.iter_attachments():
-        data = one.data.replace(find, replace, 1) if attachment else one.data
-        assert not attachment or data != one.data
-        writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, data)
-    schemas = {s.id: writer.register_schema(s.name, s.encoding, s.data) for s in summary.schemas.values()}
-    channels = {
-        c.id: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
-        for c in summary.channels.values()
-    }
-    edited = attachment
-    for _, channel, m in reader.iter_messages(log_time_order=False):
-        data = m.data
-        if not edited and find in data:
-            data, edited = data.replace(find, replace, 1), True
-        writer.add_message(channels[channel.id], m.log_time, data, m.publish_time, m.sequence)
-    assert edited
-    writer.finish()
-    return stream.getvalue()
 
 
 def test_two_runs_of_one_scenario_and_seed_are_the_same_file(tmp_path: Path) -> None:
@@ -78,11 +50,12 @@ def test_verify_compares_with_virtual_time_too(log_file: Path) -> None:
 
 
 def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: bytes) -> None:
-    log = open_log(log_file)
-    record = log["m2"].payloads[300]
-    place = record.index(b"\xa3tau\x92\xcb") + 6 + 7  # the last bit of the first torque
-    spoilt = record[:place] + bytes([record[place] ^ 1]) + record[place + 1 :]
-    log_file.write_bytes(changed(short_log, record, spoilt))
+    def record(r: dict[str, Any]) -> dict[str, Any]:
+        if (r["site"], r["tick"]) == ("m2", 300):
+            r["tau"][0] = math.nextafter(r["tau"][0], math.inf)  # the last bit of the first torque
+        return r
+
+    log_file.write_bytes(edited(short_log, record=record))
     done = trilat("verify", log_file, cwd=log_file.parent)
     assert done.code == 1, done
     assert "1499/1500 records identical" in done.err
@@ -92,7 +65,11 @@ def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: b
 
 
 def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: bytes) -> None:
-    log_file.write_bytes(changed(short_log, b"Kd = [3.0, 3.0]", b"Kd = [3.5, 3.0]", attachment=True))
+    def gain(text: str) -> str:
+        assert "Kd = [3.0, 3.0]" in text
+        return text.replace("Kd = [3.0, 3.0]", "Kd = [3.5, 3.0]", 1)
+
+    log_file.write_bytes(edited(short_log, scenario=gain))
     done = trilat("verify", log_file, cwd=log_file.parent)
     assert done.code == 1, done
     assert "tau" in done.err

@@ -21,16 +21,12 @@ def work() -> None:
             told(done, 100)
 
 
-def test_nothing_is_drawn_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = terminal(monkeypatch, interactive=False)
-    monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
-    work()
-    assert stream.getvalue() == ""
-
-
-def test_nothing_is_drawn_of_what_is_done_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = terminal(monkeypatch, interactive=True)
-    monkeypatch.setattr(terminal_output, "PATIENCE_S", 1e6)
+@pytest.mark.parametrize(("interactive", "patience_s"), [(False, -1.0), (True, 1e6)])
+def test_nothing_is_drawn_where_nobody_looks_or_of_what_is_done_at_once(
+    interactive: bool, patience_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = terminal(monkeypatch, interactive=interactive)
+    monkeypatch.setattr(terminal_output, "PATIENCE_S", patience_s)
     work()
     assert stream.getvalue() == ""
 

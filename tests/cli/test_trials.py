@@ -55,12 +55,8 @@ def test_one_scenario_that_fails_among_others_is_1(folder: Path) -> None:
     (folder / "bad.toml").write_text(QUICK.replace("100.0", "1.0"))
     done = trilat("test", "./quick.toml", "./bad.toml", "--jobs", "1", cwd=folder)
     assert done.code == 1, done
-    assert [line[:4] for line in done.out.splitlines() if ".toml  " in line] == [
-        "ok  ",
-        "ok  ",
-        "ok  ",
-        "FAIL",
-    ]
+    marks = [line[:4] for line in done.out.splitlines() if ".toml  " in line]
+    assert marks == ["ok  ", "ok  ", "ok  ", "FAIL"]
 
 
 def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
@@ -72,21 +68,22 @@ def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
         assert (root.get("tests"), root.get("failures")) == ("2", failures)
 
 
-def test_bad_input_is_2_before_anything_runs(folder: Path) -> None:
-    def refused(*arguments: str) -> None:
-        *words, fact = arguments
-        trilat("test", *words, cwd=folder).refuses(fact)
-
-    refused("papr", "did you mean 'paper'")
-    refused("./missing.toml", "missing.toml")
-    refused("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'")
-    refused("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "its sites are m, s")
-    refused("./quick.toml", "--set", "expect.peak_error_min_rad=3.0", "peak_error_max_rad")
-    refused("./quick.toml", "--seeds", "5..1", "1..20 or 1,5,9")
-    refused("./quick.toml", "--seeds", "x", "1..20 or 1,5,9")
-    refused("./quick.toml", "--junit", "no/folder.xml", "no/folder.xml")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("papr", "did you mean 'paper'"),
+        ("./missing.toml", "missing.toml"),
+        ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
+        ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "its sites are m, s"),
+        ("./quick.toml", "--set", "expect.peak_error_min_rad=3.0", "peak_error_max_rad"),
+        ("./quick.toml", "--seeds", "5..1", "1..20 or 1,5,9"),
+        ("./quick.toml", "--junit", "no/folder.xml", "no/folder.xml"),
+        ("./mute.toml", "[expect]"),
+    ],
+)
+def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Path) -> None:
     (folder / "mute.toml").write_text(QUICK.partition("[expect]")[0])
-    refused("./mute.toml", "[expect]")
+    trilat("test", *words[:-1], cwd=folder).refuses(words[-1])
 
 
 def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
