@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -29,6 +29,7 @@ def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.
     return largest
 
 
+@settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, phase: float) -> None:
     found = fit_envelope(T_S, oscillation(rate, omega, phase))
@@ -36,16 +37,19 @@ def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, pha
     assert found.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
 
 
+@settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_decay_is_decay(rate: float, omega: float, phase: float) -> None:
     assert fit_envelope(T_S, oscillation(-rate, omega, phase)).trend is EnvelopeTrend.DECAYS
 
 
+@settings(max_examples=40)
 @given(omega=quick, phase=phases, scale=scales)
 def test_a_sustained_oscillation_of_whatever_size_is_steady(omega: float, phase: float, scale: float) -> None:
     assert fit_envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is EnvelopeTrend.STEADY
 
 
+@settings(max_examples=40)
 @given(rate=st.floats(-0.3, 0.3), omega=st.floats(0.0, 40.0), phase=phases, scale=scales)
 def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: float, scale: float) -> None:
     error = np.maximum(oscillation(rate, omega, phase), 1e-3)
@@ -56,6 +60,7 @@ def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: flo
     assert slower.rate_per_s == pytest.approx(found.rate_per_s / 60.0, rel=1e-6, abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(rate=st.floats(-1.0, 1.0), omega=st.floats(0.0, 40.0), phase=phases)
 @example(rate=0.0, omega=0.015625, phase=1.3125)
 def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> None:
@@ -65,6 +70,7 @@ def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> Non
     }
 
 
+@settings(max_examples=40)
 @given(turn_s=st.floats(16.5, 23.5), power=st.floats(0.3, 3.0), scale=scales)
 def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, scale: float) -> None:
     """A quarter of a swing before the middle of a run and one behind it: nobody knows how it goes on."""
@@ -72,6 +78,7 @@ def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, 
     assert trend in (EnvelopeTrend.UNDECIDED, EnvelopeTrend.STEADY)
 
 
+@settings(max_examples=40)
 @given(decay=st.floats(0.05, 2.0), rate=st.floats(0.03, 0.3), share=st.floats(0.01, 1.0))
 def test_growth_under_a_start_that_dies_is_growth_once_it_has_gone_on(
     decay: float, rate: float, share: float
@@ -82,6 +89,7 @@ def test_growth_under_a_start_that_dies_is_growth_once_it_has_gone_on(
     assert fit_envelope(t_s, error).trend is EnvelopeTrend.GROWS
 
 
+@settings(max_examples=40)
 @given(at_s=st.floats(20.0, 39.0), height=st.floats(10.0, 1e4), decay=st.floats(0.1, 5.0))
 def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float, decay: float) -> None:
     since_s = np.maximum(0.0, T_S - at_s)
@@ -89,6 +97,7 @@ def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float,
     assert fit_envelope(T_S, 1e-3 * (1.0 + kick)).trend is not EnvelopeTrend.GROWS
 
 
+@settings(max_examples=40)
 @given(time_constant_s=st.floats(0.5, 1e3))
 def test_a_response_that_settles_is_not_growth(time_constant_s: float) -> None:
     assert fit_envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not EnvelopeTrend.GROWS

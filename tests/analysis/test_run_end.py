@@ -56,8 +56,7 @@ def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None
 
 @pytest.mark.parametrize(
     ("d", "motion"),
-    [(0.9, EndBehaviour.GROWS), (1.1, EndBehaviour.DECAYS)],
-    ids=["below the margin", "above it"],
+    [(0.9, EndBehaviour.GROWS), pytest.param(1.1, EndBehaviour.DECAYS, marks=pytest.mark.long)],
 )
 def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> None:
     """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
@@ -81,16 +80,12 @@ def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
 
 def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:
     short, long = (
-        classify_log_end(trilat_net.simulate("contact", {"rate_hz": 200, "duration_s": s}))
+        classify_log_end(trilat_net.simulate("contact", {"rate_hz": 100, "duration_s": s}))
         for s in (15.0, 30.0)
     )
     assert short.behaviour is EndBehaviour.UNDECIDED
     assert long.behaviour is EndBehaviour.BOUNDED
     assert "bounded oscillation at 0.5 Hz" in long.text
-    near = classify_log_end(
-        trilat_net.simulate("contact", {"rate_hz": 200, "link.delay_ms": 20.0, "duration_s": 12.0})
-    )
-    assert near.text.startswith("at rest, and the sites do not agree")
 
 
 def test_a_site_without_records_leaves_it_undecided() -> None:

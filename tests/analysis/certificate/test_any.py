@@ -49,7 +49,7 @@ CHANGES: dict[str, list[Any]] = {
 changes = st.dictionaries(st.sampled_from(sorted(CHANGES)), st.integers(0, 2), max_size=4)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.sampled_from(SCENARIOS), changes, st.sampled_from([0.02, 0.5, 1.5]))
 def test_every_run_is_certified(name: str, picks: dict[str, int], duration_s: float) -> None:
     overrides = {key: CHANGES[key][pick % len(CHANGES[key])] for key, pick in picks.items()}

@@ -6,7 +6,7 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 
 from .written import simulated
 
-SLOW = {"rate_hz": 100}
+SLOW = {"rate_hz": 50}
 
 
 def test_a_hand_feels_what_the_shares_say() -> None:
@@ -33,7 +33,7 @@ def test_three_loaded_sites_balance() -> None:
 
 
 def test_where_gravity_is_learnt_nothing_is_expected() -> None:
-    found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 100}))
+    found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
     assert found.sharing_ratios
     for pair in found.sharing_ratios:
         assert pair.pushed == "s"

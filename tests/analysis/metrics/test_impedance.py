@@ -89,7 +89,7 @@ def shaken() -> dict[str, object]:
         "control.d": 10.0,
         "arm.g_m_s2": 0.0,
         "link.delay_ms": 100.0,
-        "rate_hz": 200,
+        "rate_hz": 100,
         "duration_s": 30.0,
         "sites.m.q0_rad": [0.3, 1.2],
         "sites.s.q0_rad": [0.3, 1.2],

@@ -29,7 +29,7 @@ def test_the_work_of_a_torque_that_is_held_is_torque_times_way() -> None:
 def test_ports_make_up_the_mechanical_energy_to_second_order(scheme: str) -> None:
     """1/2 qd'M qd + U grows by what controller and hands give; the held torque's work is exact."""
     rests = []
-    for rate_hz in (200, 400):
+    for rate_hz in (100, 200):
         log = simulated("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme})
         found = compute_log_metrics(log).sites
         for site in log.sites:
@@ -50,7 +50,7 @@ def _mechanical(log, site: str):
 
 def test_a_lossless_wall_gives_back_no_more_than_it_took() -> None:
     found = compute_log_metrics(
-        simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 500})
+        simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250})
     ).sites["s"]
     assert found["walls_j"].value <= 0.0
     assert found["walls_most_j"].value <= 1e-6

@@ -8,7 +8,7 @@ from .written import simulated
 
 ANCHORED = {
     "control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0],
-    "rate_hz": 100,
+    "rate_hz": 50,
     "duration_s": 20.0,
     "sites.m2.hands": [],
     "sites.m1.hands": [{"kind": "recorded", "points": [[2.0, 0.0, 0.0], [3.0, 5.0, 5.0], [60.0, 5.0, 5.0]]}],
@@ -30,6 +30,6 @@ def test_learning_gravity_is_a_spring_that_ties_the_arms_to_a_pose() -> None:
 
 def test_where_something_else_moves_the_arm_the_ratio_would_be_the_hands_own() -> None:
     """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
-    found = compute_log_metrics(simulated("training", {"rate_hz": 100}))
+    found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
     assert found.static_windows.value == 2.0
     assert found.stiffness == []

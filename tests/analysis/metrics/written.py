@@ -1,7 +1,6 @@
 """Logs whose records are prescribed: written by the real writer, read by the real reader."""
 
 import io
-import json
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
@@ -9,12 +8,13 @@ from typing import Any
 import msgspec
 
 import trilat_net
+from tests.analysis.certificate import runs
 from tests.analysis.logs import rewritten
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.wire import encode
-from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.scenario import parse_scenario
 
 Fields = Mapping[str, Any]
 
@@ -45,32 +45,18 @@ def _base(seconds: float, more: str) -> Log:
     return trilat_net.simulate(parse_scenario(PAIR.format(seconds=seconds, more=more)))
 
 
-def pair(
-    motion: Callable[[str, float], Fields], seconds: float = 4.0, more: str = "", driver: str = "virtual"
-) -> Log:
-    """A log of a pair whose records are as `motion` says, by site and time.
-
-    Args:
-        motion: what becomes of a record's fields.
-        seconds: how long it is.
-        more: text of the scenario, about the slave.
-        driver: what drove it.
-    """
+def pair(motion: Callable[[str, float], Fields], seconds: float = 4.0, more: str = "") -> Log:
+    """A log of a pair whose records are as `motion` says, by site and time; `more` is of the slave."""
 
     def change(state: Any) -> Any:
         return msgspec.structs.replace(state, **motion(state.site, state.t_ns * 1e-9))
 
-    return rewritten(_base(seconds, more), change=change, driver=driver)
-
-
-@cache
-def _simulated(name: str, overrides: str) -> Log:
-    return trilat_net.simulate(load_scenario(name, json.loads(overrides)))
+    return rewritten(_base(seconds, more), change=change)
 
 
 def simulated(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
     """A virtual run of a shipped scenario, made once per test session."""
-    return _simulated(name, json.dumps(overrides or {}, sort_keys=True))
+    return runs.run(name, overrides).log
 
 
 def under(log: Log, overrides: Mapping[str, Any]) -> Log:
