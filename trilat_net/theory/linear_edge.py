@@ -1,8 +1,8 @@
 """Values of a scenario's key at which the linear loop changes between stable and unstable.
 
 Invariant: a scan brackets each edge, and bisection of the rightmost root's real part closes it: of the
-sampled loop for the scheme `digital`, of the continuous loop otherwise. The equilibrium is found once and
-followed along the key.
+sampled loop for the scheme `digital` and for sampled actors, of the continuous loop otherwise. The
+equilibrium is found once and followed along the key.
 """
 
 from collections.abc import Iterator, Sequence
@@ -96,7 +96,7 @@ def iterate_linear_edges(
     """Yields all edges that a scan of a key such as "control.d" finds, by rising value.
 
     The equilibrium `rest` is that of the scenario, if known; it is followed along the key. The loop is the
-    sampled one if asked for, by default if the scheme is `digital`.
+    sampled one if asked for, by default if the scheme is `digital`, or an actor in force is sampled.
 
     Raises:
         ScenarioError: a value is not valid for that key, or the scenario has no linear loop.
@@ -133,7 +133,7 @@ class _GrowthRate:
         scenario = load_scenario(self._scenario, {self._key: round(value) if self.integer else value})
         conditions = derive_operating_conditions(scenario)
         self._rest = follow_equilibrium(scenario, self._rest)
-        sampled = conditions.digital if self._sampled is None else self._sampled
+        sampled = conditions.held if self._sampled is None else self._sampled
         self._root = find_rightmost_root(conditions, self._rest, sampled=sampled)
         return -np.inf if self._root is None else self._root.s.real
 
@@ -182,7 +182,7 @@ def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], li
         try:
             rest, remark = _assume_equilibrium(scenario, rest)
             conditions = derive_operating_conditions(scenario)
-            root = find_rightmost_root(conditions, rest, sampled=conditions.digital)
+            root = find_rightmost_root(conditions, rest, sampled=conditions.held)
             growth_per_s.append(-np.inf if root is None else root.s.real)
         except ScenarioError as error:
             remark = f"no linear analysis: {error.problem}"

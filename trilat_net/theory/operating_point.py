@@ -82,6 +82,11 @@ class OperatingConditions(NamedTuple):
         """True if the controllers are plain digital ones, which the continuous loop only approximates."""
         return self.sites[0].scheme is Scheme.DIGITAL
 
+    @property
+    def held(self) -> bool:
+        """True if the sampled loop alone tells what the tick does: digital controllers, sampled actors."""
+        return self.digital or any(actor.sampled for site in self.sites for actor in site.actors)
+
     def rates(self, x: Numbers) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
         return [evaluate_site_rates(site, own) for site, own in zip(self.sites, x, strict=True)]

@@ -34,6 +34,7 @@ from .premises import (
     find_unjudged_spans,
     rise_above_minimum,
 )
+from .wall_energy import check_sampled_walls
 
 BROKEN_BALANCE_SHARE = 2e-4
 """Largest unexplained energy as a share of the scale, beyond the uncertainty of the trapezoid rule."""
@@ -148,6 +149,7 @@ def certify(log: Log) -> Certificate:
         LogError: a record cannot be read, or names a change that is none.
     """
     premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
+    premises += check_sampled_walls(log)
 
     def without_functional(why: str) -> Certificate:
         return Certificate(premises, _undecided(why), end, {}, None)

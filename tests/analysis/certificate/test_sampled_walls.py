@@ -1,0 +1,73 @@
+"""Walls that are held over a tick: what they give, the damping that takes it, and the premise by its name."""
+
+import numpy as np
+import pytest
+
+import trilat_net
+from trilat_net.analysis.certificate.premises import Premise
+from trilat_net.analysis.certificate.wall_energy import check_sampled_walls, find_wall_energies
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
+
+SITE = "sites.s.environment"
+SAMPLED = {f"{SITE}.0.sampled": True, "rate_hz": 200, "duration_s": 8.0}
+
+
+def run(**changes: object) -> Log:
+    return trilat_net.simulate("windup", {**SAMPLED, **{k.replace("__", "."): v for k, v in changes.items()}})
+
+
+def premise(log: Log) -> Premise | None:
+    return next((one for one in check_sampled_walls(log)), None)
+
+
+def damper(b: float, **more: object) -> list[dict[str, object]]:
+    """The wall of `windup`, and a damper of the arm."""
+    wall = load_scenario("windup").sites["s"].environment[0]
+    place = {"point_m": list(wall.point_m), "normal": list(wall.normal), "stiffness_n_m": wall.stiffness_n_m}
+    return [{"kind": "wall", "sampled": True, **place}, {"kind": "viscous", "damping_nm_s_rad": b, **more}]
+
+
+def test_a_sampled_wall_gives_half_k_dx_squared_of_every_tick_in_contact() -> None:
+    log = run()
+    wall, s = log.scenario.sites["s"].environment[0], log["s"]
+    x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
+    depth = np.maximum(x - wall.point_m[0], 0.0)
+    inside = (depth[:-1] > 0.0) & (depth[1:] > 0.0)
+    leaves = (depth[:-1] > 0.0) & (depth[1:] == 0.0)
+    gives = 0.5 * wall.stiffness_n_m * float((np.diff(x)[inside] ** 2).sum())
+    gives += wall.stiffness_n_m * float((depth[:-1] * -np.diff(x) - 0.5 * depth[:-1] ** 2)[leaves].sum())
+    enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)  # the spring is there, and nobody pressed it
+    gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
+    found = find_wall_energies(log)[0]
+    assert found.site == "s"
+    assert found.gave_j == pytest.approx(gives, rel=0.02)
+    assert found.needed_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
+    assert found.damping_n_s_m == 0.0
+
+
+def test_it_fails_the_premise_by_name() -> None:
+    found = premise(run())
+    assert found is not None
+    assert (found.name, found.holds) == ("walls", False)
+
+
+@pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
+def test_a_damper_of_the_arm_takes_what_the_wall_gives(b: float, *, holds: bool) -> None:
+    found = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    assert found is not None
+    assert found.holds is holds
+
+
+def test_a_damper_that_is_sampled_or_gone_takes_nothing() -> None:
+    for more in ({"sampled": True}, {"end_s": 1.0}):
+        found = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
+        assert found is not None
+        assert found.holds is False
+
+
+def test_a_wall_out_of_reach_or_not_sampled_gives_nothing() -> None:
+    away = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
+    assert away is not None
+    assert away.holds
+    assert premise(run(**{f"{SITE}.0.sampled": False})) is None
