@@ -19,6 +19,7 @@ from .processes import BEGUN, Session, Stage, connections, equal_to_virtual_time
 PAPER = ("m1", "m2", "s")
 
 
+@pytest.mark.long  # on a push `make live` does the same with the commands
 def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3")
     session.all()

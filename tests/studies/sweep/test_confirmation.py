@@ -176,7 +176,8 @@ def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> N
 
 
 @pytest.mark.live
-@pytest.mark.parametrize("scenario", [CALM, pytest.param(WILD, marks=pytest.mark.long)], ids=["calm", "wild"])
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
 def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(scenario: Scenario, tmp_path: Path) -> None:
     from rich.console import Console
 
