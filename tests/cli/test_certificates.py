@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from .running import trilat
+from .running import simulated, trilat
 
 PAIRS = """
 name = "pairs"
@@ -28,14 +28,8 @@ d = { c = 1.0 }
 """
 
 
-def recorded(folder: Path, *settings: str) -> str:
-    options = [word for setting in settings for word in ("--set", setting)]
-    trilat("sim", "free", "--duration", "2", "-o", "run.mcap", *options, cwd=folder)
-    return "run.mcap"
-
-
 def test_a_covered_run_ends_with_0(tmp_path: Path) -> None:
-    file = recorded(tmp_path, "rate_hz=200")
+    file = simulated(tmp_path, "free", "rate_hz=200")
     printed = trilat("certify", file, cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
@@ -46,7 +40,7 @@ def test_a_covered_run_ends_with_0(tmp_path: Path) -> None:
 
 
 def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
-    file = recorded(tmp_path, "rate_hz=200", "limits.qd_limit_rad_s=0.5")
+    file = simulated(tmp_path, "free", "rate_hz=200", "limits.qd_limit_rad_s=0.5")
     done = trilat("certify", file, cwd=tmp_path)
     assert done.code == 1
     assert done.err == ""
@@ -54,7 +48,7 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
 
 
 def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
-    done = trilat("certify", recorded(tmp_path, "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
+    done = trilat("certify", simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
     assert done.code == 1
     assert "open e and qd: undecided, record longer: " in done.out
     assert "law p_d, for which there is no such V" in done.out
@@ -69,9 +63,3 @@ def test_two_closed_groups_are_named_for_people_and_programs(tmp_path: Path) -> 
     facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)
     assert facts["closed_groups"] == [["a", "b"], ["c", "d"]]
     assert facts["functional"] is None
-
-
-def test_what_is_no_log_ends_with_2(tmp_path: Path) -> None:
-    (tmp_path / "no.mcap").write_bytes(b"no log")
-    trilat("certify", "no.mcap", cwd=tmp_path).refuses("no.mcap")
-    trilat("certify", "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")

@@ -83,12 +83,7 @@ def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path
         (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
         (["--tune", "fre"], ["no scenario of that name", "free"]),
         (["--tune", "free", "--law", "adaptve"], ["no law 'adaptve'", "did you mean 'adaptive'"]),
-        (["--tune", "free", "--law", "p_f"], ["p_f", "one master and one slave", "3 sites"]),
         (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
-        (["--tune", "free", "--objective", "rank"], ["--objective is error or settling"]),
-        (["--tune", "free", "--gravity", "5"], ["--gravity is from 50 to 150 %"]),
-        (["--tune", "free", "--set", "link.model=measured"], ["links.m2->m1", "is measured"]),
-        (["--tune", "free", "--set", "sites.s.plant=external"], ["sites.s.plant", "outside of the program"]),
         (["--tune", "training"], ["keep one of the operators"]),
     ],
 )

@@ -40,20 +40,11 @@ def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
 
 
 REFUSED = {
-    "no scenario": (["papre"], ["papre", "did you mean 'paper'"]),
     "a pose with letters": (["free", "--pose", "up"], ["--pose is two angles in rad", "'up'"]),
-    "a pose of three": (["free", "--pose", "1,2,3"], ["--pose", "1,2,3"]),
-    "no roots": (["free", "--roots", "0"], ["--roots", "1 to 60"]),
     "a range without a colon": (["free", "--over", "control.Kd=5"], ["--over reads KEY=LOW:HIGH"]),
-    "a range the wrong way round": (
-        ["free", *AT, "--over", "control.Kd=5:1"],
-        ["from a value to a larger one"],
-    ),
-    "a key that is none": (["free", *AT, "--over", "control.Kq=1:5"], ["control.Kq", "did you mean"]),
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),
     "a measured link": (["free", "--set", "link.model=measured"], ["links.", "its delay is not known"]),
-    "an arm outside": (["free", "--set", "sites.s.plant=external"], ["sites.s.plant", "simulated"]),
 }
 
 

@@ -34,9 +34,3 @@ def test_what_is_shown_can_be_kept(log_file: Path, tmp_path: Path) -> None:
     assert "run.rrd: open it with: rerun run.rrd" in text
     assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")
     trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).refuses("run.rrd: exists", "--force")
-
-
-def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"nonsense")
-    trilat("log", "view", "x.mcap", "--save", "x.rrd", cwd=tmp_path).refuses("x.mcap: is no MCAP file")
-    trilat("log", "view", "none.mcap", "--save", "x.rrd", cwd=tmp_path).refuses("none.mcap", "No such file")

@@ -76,13 +76,6 @@ def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: 
     assert "scenario" in done.err
 
 
-@pytest.mark.parametrize("content", [b"", b"garbage", b"\x89MCAP0\r\n", b"\x00" * 10_000])
-@pytest.mark.parametrize("command", ["verify", "report"])
-def test_a_file_that_is_no_log_is_bad_input(command: str, content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "bad.mcap").write_bytes(content)
-    trilat(command, "bad.mcap", cwd=tmp_path).refuses("bad.mcap")
-
-
 def test_a_log_of_another_program_is_bad_input(tmp_path: Path) -> None:
     with (tmp_path / "other.mcap").open("wb") as stream:
         writer = Writer(stream)

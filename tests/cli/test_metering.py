@@ -3,17 +3,11 @@
 import json
 from pathlib import Path
 
-from .running import trilat
-
-
-def recorded(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
-    options = [word for setting in settings for word in ("--set", setting)]
-    trilat("sim", scenario, "--duration", seconds, "-o", "run.mcap", *options, cwd=folder)
-    return "run.mcap"
+from .running import simulated, trilat
 
 
 def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
-    file = recorded(tmp_path, "contact", "rate_hz=200", seconds="4")
+    file = simulated(tmp_path, "contact", "rate_hz=200", seconds="4")
     printed = trilat("metrics", file, cwd=tmp_path).succeeds()
     lines = printed.splitlines()
     heads = [line.split() for line in lines]
@@ -27,7 +21,7 @@ def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
 
 
 def test_json_is_for_programs(tmp_path: Path) -> None:
-    file = recorded(tmp_path, "free", "rate_hz=100")
+    file = simulated(tmp_path, "free", "rate_hz=100")
     found = json.loads(trilat("metrics", "--json", file, cwd=tmp_path).succeeds())
     assert found["version"] == 1
     assert found["scenario"] == "free"
@@ -36,13 +30,7 @@ def test_json_is_for_programs(tmp_path: Path) -> None:
 
 
 def test_who_felt_what_is_told(tmp_path: Path) -> None:
-    file = recorded(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
+    file = simulated(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
     printed = trilat("metrics", file, cwd=tmp_path).succeeds()
     (line,) = (line for line in printed.splitlines() if line.startswith("14.0 - 15.0 s"))
     assert line.split()[4:9] == ["1", "s", "5", "m1", "4.792"]
-
-
-def test_what_is_no_log_ends_with_2(tmp_path: Path) -> None:
-    (tmp_path / "no.mcap").write_bytes(b"no log")
-    trilat("metrics", "no.mcap", cwd=tmp_path).refuses("no.mcap")
-    trilat("metrics", "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")

@@ -9,53 +9,22 @@ from trilat_net.net.zenoh_bus import ZenohBus
 
 from .running import trilat
 
-COMMANDS = [
-    ("site", "m", "--scenario", "two_sites"),
-    ("record", "--session", "t"),
-    ("router",),
-]
+COMMANDS = [("site", "m", "--scenario", "two_sites"), ("record", "--session", "t"), ("router",)]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
-@pytest.mark.parametrize(
-    ("text", "facts"),
-    [
-        (None, ["No such file or directory"]),
-        ("{mode: ", ["line 2, column 1: no JSON5"]),
-        ("{mod: 'peer'}", ["mod: no key of Zenoh's; did you mean mode?"]),
-        (
-            "{transport: {link: {tx: {queue: {size: {real_time: 2}}}}}}",
-            ["transport/link/tx/queue/size/real_time: 2 must be 16"],
-        ),
-        ("{scouting: {multicast: {enabled: true}}}", ["scouting/multicast/enabled: true must be false"]),
-        (
-            "{transport: {link: {tls: {root_ca_certificate: 'none.pem'}}}}",
-            ["transport/link/tls/root_ca_certificate: none.pem cannot be read"],
-        ),
-    ],
-    ids=["missing", "torn", "unknown key", "short queue", "multicast", "no certificate"],
-)
-def test_a_bad_configuration_is_refused_in_one_line(
-    command: tuple[str, ...], text: str | None, facts: list[str], tmp_path: Path
-) -> None:
-    if text is not None:
-        (tmp_path / "mine.json5").write_text(text)
+def test_a_bad_configuration_is_refused_in_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
+    trilat(*command, "--zenoh-config", "none.json5", cwd=tmp_path).refuses("none.json5", "No such file")
+    (tmp_path / "mine.json5").write_text("{transport: {link: {tls: {root_ca_certificate: 'none.pem'}}}}")
     done = trilat(*command, "--zenoh-config", "mine.json5", cwd=tmp_path)
-    done.refuses("mine.json5: ", *facts)
+    done.refuses("mine.json5: transport/link/tls/root_ca_certificate: none.pem cannot be read")
     assert done.out == ""
 
 
 @pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda words: words[0])
-@pytest.mark.parametrize(
-    ("options", "fact"),
-    [
-        (["--router", "tcp/127.0.0.1:1", "--listen", "tcp/127.0.0.1:2"], "listens nowhere"),
-        (["--router", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"], "leave out --connect"),
-        (["--router", "nonsense"], "an endpoint is like tcp/192.0.2.1:7447, not 'nonsense'"),
-    ],
-)
-def test_a_router_goes_alone(command: tuple[str, ...], options: list[str], fact: str, tmp_path: Path) -> None:
-    trilat(*command, *options, cwd=tmp_path).refuses("--router: ", fact)
+def test_a_router_goes_alone(command: tuple[str, ...], tmp_path: Path) -> None:
+    options = ("--router", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2")
+    trilat(*command, *options, cwd=tmp_path).refuses("--router: ", "leave out --connect")
 
 
 def test_a_router_that_does_not_answer_is_named(tmp_path: Path) -> None:

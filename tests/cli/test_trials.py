@@ -71,7 +71,6 @@ def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ("papr", "did you mean 'paper'"),
         ("./missing.toml", "missing.toml"),
         ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
         ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "its sites are m, s"),
