@@ -1,9 +1,6 @@
 """What a channel does to each sample: loss, bursts, copies, outages, order; golden fates (L4)."""
 
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -11,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
+from tests.core.compiled import printed
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.channel import LOST
 from trilat_net.scenario.delay_models import ConstantDelay, GammaDelay, LinkBase, NoDelay, UniformDelay
@@ -223,14 +221,7 @@ for name in KINDS:
 
 
 def test_without_the_compiler_draws_and_fates_have_the_same_bits() -> None:
-    def text(disabled: str) -> str:
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
-        done = subprocess.run(
-            [sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True
-        )
-        return done.stdout
-
-    plain = text("1")
+    plain = printed(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
     assert plain.count("[") == len(KINDS)
-    assert plain == text("0")
+    assert plain == printed(_PROGRAM, compiled=True)

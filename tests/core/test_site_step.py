@@ -1,16 +1,14 @@
 """The step: pure, resumable, bounded, and finite whatever comes (L1, L3)."""
 
 import math
-import os
 import struct
-import subprocess
-import sys
 import zlib
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.core.compiled import printed
 from tests.core.sites import sample, setup, stepped
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
@@ -79,18 +77,9 @@ for scheme in ("second_order", "digital"):
 
 
 def test_without_the_compiler_a_run_has_the_same_bits() -> None:
-    """Both schemes, some hundred ticks of three sites."""
-
-    def text(disabled: str) -> str:
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
-        done = subprocess.run(
-            [sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True
-        )
-        return done.stdout
-
-    plain = text("1")
+    plain = printed(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250
-    assert plain == text("0")
+    assert plain == printed(_PROGRAM, compiled=True)
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])

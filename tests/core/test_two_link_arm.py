@@ -101,18 +101,14 @@ def test_the_regressor_takes_the_two_velocities_apart(
     assert near(Y_of(g, q, qd, v, acceleration) @ theta, wanted, 1000 * size(a))
 
 
-@given(a=links, g=g_values, q=angles, qd=speeds, qdd=speeds)
-def test_with_one_velocity_it_is_the_printed_one(
-    a: ArmLinks, g: float, q: Array, qd: Array, qdd: Array
-) -> None:
+@given(g=g_values, q=angles, qd=speeds, qdd=speeds)
+def test_with_one_velocity_it_is_the_printed_one(g: float, q: Array, qd: Array, qdd: Array) -> None:
     """Eq. (5), with Y12 and Y22 as Section IV prints them."""
     Y = Y_of(g, q, qd, qd, qdd)
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     y12 = c2 * (2 * qdd[0] + qdd[1]) - s2 * qd[1] * qd[1] - 2 * s2 * qd[0] * qd[1]
     assert Y[0, 1] == pytest.approx(y12, abs=1e-11)
     assert Y[1, 1] == pytest.approx(c2 * qdd[0] + s2 * qd[0] * qd[0], abs=1e-11)
-    wanted = physics.inertia(a, q) @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q)
-    assert near(Y @ theta_from_links(a), wanted, 1000 * size(a))
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, torque=physics.vectors(st.floats(-200, 200)))

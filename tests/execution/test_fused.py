@@ -1,8 +1,5 @@
 """The fused driver is the per-tick driver, bit for bit; what is reduced is reduced from the same records."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.core.compiled import printed
 from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
@@ -146,14 +144,9 @@ for scheme in ("second_order", "digital"):
 
 
 def test_without_the_compiler_it_has_the_same_bits() -> None:
-    def text(disabled: str) -> str:
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
-        command = [sys.executable, "-c", _PROGRAM]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-
-    plain = text("1")
+    plain = printed(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8
-    assert plain == text("0")
+    assert plain == printed(_PROGRAM, compiled=True)
 
 
 def test_what_the_compiled_loop_cannot_run_is_refused() -> None:

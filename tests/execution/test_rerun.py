@@ -164,14 +164,7 @@ def test_a_log_that_diverged_is_executed_to_its_end() -> None:
         lambda r: r["rx"].insert(0, [1, r["tick"] + 9, 0]),  # of a tick that needs this one
         lambda r: r.update(rx=r["rx"] * 3000),
     ],
-    ids=[
-        "no peer",
-        "a peer before the first",
-        "far ahead",
-        "before the epoch",
-        "from the future",
-        "too many",
-    ],
+    ids=["no peer", "before the first peer", "far ahead", "before the epoch", "from the future", "too many"],
 )
 def test_strange_arrivals_end_nothing(change: object) -> None:
     def record(r: dict[str, object]) -> dict[str, object]:

@@ -161,10 +161,6 @@ def external_log() -> bytes:
     """A log as a live session with an arm outside writes it: s moved as nobody here computes."""
     scenario = load_scenario("two_sites", {**SHORT, "sites.s.plant": "external", "sites.s.arm.known": False})
     moves = {k: PlantState([0.01 * k, -0.3], [0.25 * (k % 3), 1e-3 * k]) for k in range(TICKS)}
-    return moved(scenario, moves)
-
-
-def moved(scenario: Any, moves: dict[int, Any]) -> bytes:
     stream = io.BytesIO()
     run = virtual.execute_virtual
     with pytest.MonkeyPatch.context() as patch:

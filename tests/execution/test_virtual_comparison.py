@@ -23,9 +23,7 @@ links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integer
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, DUE), max_size=30))
-def test_a_run_without_late_samples_equals_plain_virtual_time(
-    delays: dict[Sample, int],
-) -> None:
+def test_a_run_without_late_samples_equals_plain_virtual_time(delays: dict[Sample, int]) -> None:
     twins = compare_with_virtual(opened_delivered(delays))
     assert twins.late == []
     assert twins.fed == (360, 360, None)
@@ -34,9 +32,7 @@ def test_a_run_without_late_samples_equals_plain_virtual_time(
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, 39), min_size=1, max_size=30))
-def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
-    delays: dict[Sample, int],
-) -> None:
+def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(delays: dict[Sample, int]) -> None:
     log = opened_delivered(delays)
     twins = compare_with_virtual(log)
     assert twins.fed == (360, 360, None)

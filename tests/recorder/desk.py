@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 
 from recorder.inbound_queue import InboundQueue
 from recorder.session_recording import RecorderReport, Recording
+from tests.net import parties
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
@@ -34,16 +35,8 @@ TICKS = SCENARIO.ticks("m")
 
 def told(name: str, **facts: object) -> Info:
     """What a member says of itself."""
-    info = Info(
-        member=name,
-        boot=BOOTS[name],
-        scenario_sha256=SCENARIO.sha256,
-        scenario=SCENARIO.text,
-        host="h",
-        clock="c",
-        fingerprint="f",
-    )
-    return msgspec.structs.replace(info, **facts)
+    scenario = {"scenario_sha256": SCENARIO.sha256, "scenario": SCENARIO.text}
+    return parties.told(name, BOOTS[name], **{**scenario, **facts})
 
 
 def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from recorder.record_process import Recorder
-from sites import realtime
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
 from tests.sites.sessions import Session, in_log, in_virtual_time
@@ -72,11 +71,8 @@ def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 5 * S])
-def test_a_recorder_takes_over_from_one_that_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead_ns: int
-) -> None:
+def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int) -> None:
     """Real sites, real recorders, in one process; the second one with another clock, too."""
-    monkeypatch.setattr(realtime, "prepare", lambda _cpu: {"scheduling": "as it was", "memory": "as it was"})
     scenario = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 100})
     session = Session(scenario, tmp_path / "first.mcap")
     for name in scenario.names:
@@ -96,7 +92,7 @@ def test_a_recorder_takes_over_from_one_that_ended(
         return recorder.record(epoch).problem()
 
     session.relay.add("second", second, begun_ns + 3 * S // 2)
-    session.relay.run()
+    session.play()
     assert session.relay.results["second"] is None
     log = open_log(later)
     assert in_log(log) == in_virtual_time(scenario)

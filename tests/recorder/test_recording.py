@@ -263,11 +263,3 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
 def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) -> None:
     recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256
-
-
-OUT_OF_RANGE = {
-    "a record after the end": ("state", after_the_end()),
-    "statistics after the end": ("link", statistics("m", 100)),
-    "an end after the end": ("event", end("m", TICKS + 1)),
-    "an end before the beginning": ("event", end("m", -1)),
-}

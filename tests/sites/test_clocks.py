@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from sites import realtime
 from tests.truth import judged, members, offset_errors
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -30,9 +29,7 @@ def run(
 @pytest.fixture(scope="module")
 def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Log]:
     """A session of all members on clocks of their own but the leader."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(realtime, "prepare", lambda _cpu: {"scheduling": "as it was", "memory": "as it was"})
-        return run(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
+    return run(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
 
 
 def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log]) -> None:
@@ -43,7 +40,6 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
     assert not compare_with_virtual(log).late
 
 
-@pytest.mark.usefixtures("unprepared")
 @pytest.mark.parametrize("names", [("m2",), pytest.param(("m1", "recorder"), marks=pytest.mark.long)])
 def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Path) -> None:
     skews = {**SKEWS, "m1": (7 * S, 60_000)}
@@ -93,7 +89,6 @@ def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log])
     assert "skewed by 3000000000 ns" in setups["m2"].clock
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) -> None:
     session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.2)
     assert not any(event.kind == "clock" for event in log.events)
@@ -116,7 +111,6 @@ class Stepping(Relay):
         return super().unix_ns() + (-1) ** self.readings * self.readings * 3600 * S
 
 
-@pytest.mark.usefixtures("unprepared")
 def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: Path) -> None:
     (tmp_path / "steady").mkdir()
     _, steady = run(tmp_path / "steady", SKEWS, 0.3)
@@ -130,7 +124,6 @@ def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: 
     assert log.session["epoch_unix_ns"] != steady.session["epoch_unix_ns"]
 
 
-@pytest.mark.usefixtures("unprepared")
 @pytest.mark.parametrize("at_ns", [1_050_000_000, 1_250_000_000])
 def test_a_member_on_another_clock_that_hangs_while_joining_is_waited_for(at_ns: int, tmp_path: Path) -> None:
     session = Session.whole(

@@ -28,7 +28,6 @@ from trilat_net.scenario import load_scenario
 from .relay import RelayClock
 from .sessions import SESSION, Session
 
-pytestmark = pytest.mark.usefixtures("unprepared")
 OUTSIDE = {"duration_s": 1.0, "sites.s.plant": "external", "sites.s.arm.known": False}
 PERIOD_NS = 1_000_000
 A_SECOND = 1_000_000_000
@@ -125,7 +124,7 @@ def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tm
             session.live("s", clock)
 
     session.relay.add("s", alone)
-    session.relay.run()
+    session.play()
 
 
 def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: Path) -> None:

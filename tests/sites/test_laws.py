@@ -13,8 +13,6 @@ from trilat_net.scenario import load_scenario
 
 from .sessions import Session, in_log, in_virtual_time
 
-pytestmark = pytest.mark.usefixtures("unprepared")
-
 
 def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
     """The log of a session, and per site its exit code or what it was ended by."""

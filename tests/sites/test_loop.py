@@ -25,7 +25,6 @@ from trilat_net.scenario import load_scenario
 from .relay import RelayClock
 from .sessions import SESSION, Session, in_log, in_virtual_time
 
-pytestmark = pytest.mark.usefixtures("unprepared")
 EPOCH_NS = 5_000_000_123
 
 

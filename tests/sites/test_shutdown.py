@@ -9,7 +9,6 @@ from trilat_net.scenario import load_scenario
 from .relay import RelayClock
 from .sessions import Session
 
-pytestmark = pytest.mark.usefixtures("unprepared")
 S = 1_000_000_000
 
 
@@ -19,27 +18,21 @@ def ending(folder: Path, stay_s: float) -> Session:
     return Session.whole(scenario, folder, stay_s=stay_s, works_ns=30 * S, ends={})
 
 
-def test_a_site_that_stays_leaves_when_the_recorder_has_left(tmp_path: Path) -> None:
-    session = ending(tmp_path, 120.0)
-    session.run()
-    assert session.ends == {"m": 0, "s": 0}
-    for name in ("m", "s"):  # a process needs a moment to end: the recorder's shall be the first
-        assert S < session.left_ns[name] - session.left_ns["recorder"] < 3 * S
-
-
-def test_without_a_wish_to_stay_a_site_leaves_when_its_records_are_stored(tmp_path: Path) -> None:
-    session = ending(tmp_path, 0.0)
-    session.run()
-    assert session.ends == {"m": 0, "s": 0}
-    assert max(session.left_ns["m"], session.left_ns["s"]) - session.left_ns["log"] < S
-
-
-def test_a_site_stays_no_longer_than_it_shall(tmp_path: Path) -> None:
-    session = ending(tmp_path, 4.0)
+@pytest.mark.parametrize(
+    ("stay_s", "after", "least_s", "most_s"),
+    [
+        (120.0, "recorder", 1, 3),  # a process needs a moment to end: the recorder's shall be the first
+        (0.0, "log", -1, 1),
+        (4.0, "log", 3, 5),
+    ],
+    ids=["it stays until the recorder has left", "until its records are stored", "no longer than it shall"],
+)
+def test_how_long_a_site_stays(stay_s: float, after: str, least_s: int, most_s: int, tmp_path: Path) -> None:
+    session = ending(tmp_path, stay_s)
     session.run()
     assert session.ends == {"m": 0, "s": 0}
     for name in ("m", "s"):
-        assert 3 * S < session.left_ns[name] - session.left_ns["log"] < 5 * S
+        assert least_s * S < session.left_ns[name] - session.left_ns[after] < most_s * S
 
 
 def test_a_signal_ends_the_wait_and_spoils_no_run_that_was_complete(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from trilat_net.scenario import load_scenario
 from .relay import RelayClock
 from .sessions import SESSION, Session, computed
 
-pytestmark = pytest.mark.usefixtures("unprepared")
 MS = 1_000_000
 SITES = ("m", "s")
 

@@ -13,6 +13,7 @@ from recorder.play.message_source import MessageSource
 from recorder.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions, map_key_to_session
 from recorder.play.player import PlayProgress
 from recorder.play.session_reader import PlaySelection, preload_messages
+from tests.net.parties import told
 from tests.net.waiting import drained
 from trilat_net.errors import SessionError
 from trilat_net.execution.virtual import virtual_boot
@@ -90,7 +91,7 @@ class Scribe:
     def __init__(self, hall: Hall, *, stores: bool = True) -> None:
         bus = hall.network.join()
         session = hall.options.session
-        info = _info(topics.RECORDER)
+        info = told(topics.RECORDER, RECORDER_BOOT)
         bus.respond(topics.key(session, topics.RECORDER, topics.INFO), lambda _: encode(info))
         bus.announce(liveliness_token(session, topics.RECORDER, RECORDER_BOOT))
         publish = bus.publisher(topics.key(session, topics.RECORDER, topics.EVENT))
@@ -188,7 +189,7 @@ def test_a_recorder_that_comes_in_the_middle_learns_when_tick_0_was(log_file: Pa
     """By the code of the recorder's own way into a session."""
     hall = Hall(log_file)
     bus = hall.network.join()
-    info = _info(topics.RECORDER)
+    info = told(topics.RECORDER, RECORDER_BOOT)
     epochs: list[Epoch] = []
     begun: list[int] = []
     joining: list[SessionJoin] = []
@@ -247,25 +248,15 @@ def test_it_shows_where_it_is_twice_a_second(tmp_path: Path) -> None:
 def test_a_session_that_is_there_already_is_refused() -> None:
     network, clock = LocalNetwork(), LookedAt()
     visitor, there = network.join(), network.join()
-    there.respond(topics.key("other", "m1", topics.INFO), lambda _: encode(_info("m1")))
+    there.respond(topics.key("other", "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT)))
     there.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
-    there.respond(topics.key(SESSION, "recorder", topics.INFO), lambda _: encode(_info("recorder")))
+    there.respond(
+        topics.key(SESSION, "recorder", topics.INFO), lambda _: encode(told("recorder", RECORDER_BOOT))
+    )
     refuse_running_session(visitor, clock, SESSION, lambda: False)
-    there.respond(topics.key(SESSION, "m1", topics.INFO), lambda _: encode(_info("m1")))
+    there.respond(topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT)))
     with pytest.raises(SessionError, match="session 'replay-paper' is there already and waits to begin"):
         refuse_running_session(visitor, clock, SESSION, lambda: False)
-
-
-def _info(member: str) -> Info:
-    return Info(
-        member=member,
-        boot=RECORDER_BOOT,
-        scenario_sha256="",
-        scenario="",
-        host="",
-        clock="looked at",
-        fingerprint="",
-    )
 
 
 @pytest.mark.parametrize(

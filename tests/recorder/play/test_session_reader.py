@@ -120,13 +120,3 @@ def test_a_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path
     path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)])
     _, block = loaded(path)
     assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]
-
-
-def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
-    missing = tmp_path / "missing.mcap"
-    with pytest.raises(LogError, match=r"missing\.mcap: cannot be read"):
-        preload_messages([missing], PlaySelection(), LARGE)
-    garbage = tmp_path / "garbage.mcap"
-    garbage.write_bytes(b"garbage" * 100)
-    with pytest.raises(LogError, match="is no MCAP file"):
-        preload_messages([garbage], PlaySelection(), LARGE)

@@ -1,0 +1,12 @@
+"""Programs that print what they compute, with the compiler and without it."""
+
+import os
+import subprocess
+import sys
+
+
+def printed(program: str, *, compiled: bool) -> str:
+    """What a program prints in a process of its own."""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if compiled else "1"}
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
