@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import subprocess
 import sys
 from pathlib import Path
 from unittest import mock
@@ -38,6 +39,12 @@ class Done:
         assert lines[0].startswith("error: "), self
         for fact in facts:
             assert fact in self.err, self
+
+
+def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    """Starts a command as a process of its own, with pipes for what it prints."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([*COMMAND, *arguments], cwd=cwd, env=PLAIN, text=True, **pipes)
 
 
 def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:

@@ -96,12 +96,9 @@ def test_a_file_of_others_is_checked_for_how_it_is_built_and_that_is_said(tmp_pa
     assert "no log of trilat-net" in done.err
 
 
-@pytest.mark.parametrize("command", ["info", "check"])
-def test_a_file_that_is_not_there_is_bad_input(command: str, tmp_path: Path) -> None:
-    trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
-
-
-def test_info_of_what_is_no_mcap_file_is_bad_input_and_check_says_it(tmp_path: Path) -> None:
+def test_what_is_no_mcap_file_is_bad_input_for_info_and_a_finding_for_check(tmp_path: Path) -> None:
+    for command in ("info", "check"):
+        trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
     path = written(tmp_path, b"text")
     trilat("log", "info", path, cwd=tmp_path).refuses("is no MCAP file")
     assert trilat("log", "check", path, cwd=tmp_path).code == 1

@@ -41,7 +41,6 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
 
 
 def test_what_a_page_says_of_a_law_is_what_a_law_gets() -> None:
-    """Every name in the table is one of `core.own`, and every one of those is in the table."""
     from trilat_net.core.user_law import LawContext, LawInput
 
     page = DOC.read_text(encoding="utf-8")
@@ -120,13 +119,6 @@ def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
     trilat("rerun", "two_sites.mcap", "--replace", "s", *FAILING, cwd=tmp_path).refuses(
         "tests.laws:Failing of s failed at tick 40", code=1
     )
-
-
-@pytest.mark.parametrize("command", ["sim", "test"])
-def test_virtual_time_has_no_arm_outside(command: str, tmp_path: Path) -> None:
-    done = trilat(command, "two_sites", "--set", "sites.s.plant=external", cwd=tmp_path)
-    done.refuses("sites.s.plant", "virtual time has none; run it live")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])

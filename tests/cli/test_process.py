@@ -9,29 +9,20 @@ import pytest
 
 from tests.net.waiting import until
 
-from .running import COMMAND, PLAIN, trilat
+from .running import PLAIN, started, trilat
 
 
 @pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["sim", "--help"]])
 def test_a_reader_that_had_enough_is_no_error(command: list[str], tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, *command], cwd=tmp_path, env=PLAIN, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    process = started(*command, cwd=tmp_path)
     assert process.stdout is not None
     process.stdout.close()
     _, err = process.communicate(timeout=60)
-    assert err == b""
+    assert err == ""
 
 
 def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "sim", "paper", "--duration", "2000", "-o", "long.mcap"],
-        cwd=tmp_path,
-        env=PLAIN,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started("sim", "paper", "--duration", "2000", "-o", "long.mcap", cwd=tmp_path)
     path = tmp_path / "long.mcap.active"
     until(lambda: path.exists() and path.stat().st_size > 100_000, timeout_s=60)
     process.send_signal(signal.SIGINT)

@@ -103,21 +103,6 @@ def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
     assert sorted(folder.rglob("*")) == before
 
 
-def test_results_and_a_sweep_of_ones_own_do_not_go_together(folder: Path) -> None:
-    def refused(*words: str) -> None:
-        *arguments, fact = words
-        trilat("sweep", *arguments, cwd=folder).refuses(fact)
-
-    refused("done", "--over", "control.Kd=1,2", "--over is of the sweep already")
-    refused("--resume", "done", "--seeds", "3", "--seeds is of the sweep already")
-    refused("trio.toml", "--resume", "done", "--resume goes on with the sweep of its folder")
-    refused("done", "--cell", "12", "numbered from 0 to 11")
-    refused("--cell", "1", "--cell is of results")
-    refused("--resume", "none", "no sweep was begun there")
-    refused("none.parquet", "no results of a sweep")
-    refused("--over", "control.Kd=1,2", "name a scenario")
-
-
 def test_a_map_lies_beside_the_results_and_names_the_command_that_makes_it(folder: Path) -> None:
     names = sorted(path.name for path in (folder / "done").iterdir())
     assert {"map.md", "map.png", "map.svg", "results.parquet"} <= set(names)
@@ -151,6 +136,14 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
+        (("done", "--over", "control.Kd=1,2"), "--over is of the sweep already"),
+        (("--resume", "done", "--seeds", "3"), "--seeds is of the sweep already"),
+        (("trio.toml", "--resume", "done"), "--resume goes on with the sweep of its folder"),
+        (("done", "--cell", "12"), "numbered from 0 to 11"),
+        (("--cell", "1"), "--cell is of results"),
+        (("--resume", "none"), "no sweep was begun there"),
+        (("none.parquet",), "no results of a sweep"),
+        (("--over", "control.Kd=1,2"), "name a scenario"),
         (("done", "--map", "--confirm", "1"), "--map and --confirm exclude each other"),
         (("done", "--map", "--cell", "1"), "--map and --cell exclude each other"),
         (("done", "--width", "7"), "--width is of a map"),

@@ -1,7 +1,6 @@
 """`trilat test`: exit codes in every direction, what it prints, what it refuses, how Ctrl-C ends it."""
 
 import signal
-import subprocess
 import sys
 import xml.etree.ElementTree as Xml
 from pathlib import Path
@@ -16,7 +15,7 @@ from trilat_net.cli.test import parse_seeds
 from trilat_net.errors import UsageError
 from trilat_net.scenario import list_shipped, load_scenario
 
-from .running import COMMAND, PLAIN, trilat
+from .running import started, trilat
 
 TOO_MUCH = ("--set", "expect.mean_age_max_ms=1.0")
 
@@ -112,14 +111,7 @@ def test_other_texts_name_no_seeds(text: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
-    process = subprocess.Popen(
-        [*COMMAND, "test", "long.toml", "--seeds", "1..9", "--jobs", "2"],
-        cwd=folder,
-        env=PLAIN,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
 
     def workers() -> list[Path]:
         threads = Path(f"/proc/{process.pid}/task").glob("*/children")
@@ -128,11 +120,11 @@ def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
 
     try:
         until(lambda: len(workers()) == 2, timeout_s=60)
-        started = workers()
+        begun = workers()
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
         assert process.returncode == 130, err
         assert "Traceback" not in err
-        until(lambda: not any(path.exists() for path in started), timeout_s=20)
+        until(lambda: not any(path.exists() for path in begun), timeout_s=20)
     finally:
         process.kill()

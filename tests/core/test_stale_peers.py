@@ -38,13 +38,17 @@ def moving(peer: int, tick: int) -> Arrival:
     return Arrival(peer, tick, *at(peer, tick))
 
 
-def cut(rule: StaleRule, start: int, end: int, count: int = 200) -> list[TickRecord]:
-    """Both peers heard every tick, but not peer 1 in samples from `start` to `end`."""
-    ticks = [
-        TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and start <= k - 1 < end)])
+def cut_ticks(count: int = 200) -> list[TickInput]:
+    """Both peers heard every tick, but not peer 1 in samples from 50 to 90."""
+    return [
+        TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and 50 <= k - 1 < 90)])
         for k in range(count)
     ]
-    return stepped(site(rule), ticks)
+
+
+def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
+    """What a site makes of that."""
+    return stepped(site(rule), cut_ticks(count))
 
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
@@ -66,12 +70,12 @@ def followed(output: TickRecord, shares: Sequence[float] = (0.5, 0.5)) -> tuple[
 @pytest.mark.parametrize(("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)])
 def test_a_cut_leads_to_hold_or_brake_and_back_by_a_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
-    outputs = cut(RULE._replace(action=action), 50, 90)
+    outputs = cut(RULE._replace(action=action))
     assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
 
 
 def test_to_use_is_to_go_on() -> None:
-    assert runs_of(cut(RULE._replace(action=StaleAction.USE), 50, 90)) == [(Mode.RUN, 0)]
+    assert runs_of(cut(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
 
 
 def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() -> None:
@@ -169,7 +173,7 @@ def test_modes_and_references_are_those_of_the_law(
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
-    outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 50, 90, 700)
+    outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     assert runs_of(outputs)[2:] == [(Mode.RETURN, 95), (Mode.RUN, 495)]
     assert (q[95] == q[94]).all()
@@ -184,18 +188,14 @@ def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own
 def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: StaleAction, k: int) -> None:
     """Whatever its mode was: the records hold what it remembers."""
     rule = RULE._replace(action=action)
-    whole = cut(rule, 50, 90)
+    whole = cut(rule)
     made = site(rule)
     last = whole[k - 1]
     in_use = [moving(j, m) for j, m in enumerate(last.used)]
     heard = [(j, m) for j in (0, 1) for m in range(last.used[j] + 1, k - 1) if not (j and 50 <= m < 90)]
     made.prime(k, in_use, [moving(j, m) for j, m in heard])
     made.resume(whole[k - 2], last)
-    ticks = [
-        TickInput(n, [moving(j, n - 1) for j in (0, 1) if not (j and 50 <= n - 1 < 90)])
-        for n in range(k, 200)
-    ]
-    assert stepped(made, ticks) == whole[k:]
+    assert stepped(made, cut_ticks()[k:]) == whole[k:]
 
 
 # What it is good for.

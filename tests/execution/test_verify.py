@@ -20,6 +20,7 @@ from tests.execution.deliveries import (
 )
 from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded, without
+from trilat_net.execution.difference import RecordDifference
 from trilat_net.execution.verify import verify
 from trilat_net.net.messages import STATE_VECTORS as VECTORS
 from trilat_net.scenario import list_shipped
@@ -41,6 +42,13 @@ def at(site: str, tick: int, change: Callable[[Record], Any]) -> Callable[[Recor
         return r
 
     return record
+
+
+def first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
+    """The first difference of the log of a scenario that was changed as `edited` says."""
+    first = verify(opened(edited(recorded(name), **changes))).first
+    assert first is not None
+    return first
 
 
 @pytest.mark.parametrize("name", list_shipped())
@@ -85,11 +93,9 @@ def test_one_bit_of_a_vector_is_found_and_named(
     def change(r: Record) -> None:
         r[field][index] = flipped(r[field][index], bit)
 
-    verdict = verify(opened(edited(recorded("paper"), record=at(site, tick, change))))
-    assert not verdict.passed
-    assert verdict.first is not None
-    assert verdict.first[:3] == (site, tick, f"{field}[{index}]")
-    assert verdict.first.logged.hex() != verdict.first.computed.hex()
+    first = first_difference(record=at(site, tick, change))
+    assert first[:3] == (site, tick, f"{field}[{index}]")
+    assert first.logged.hex() != first.computed.hex()
 
 
 @settings(max_examples=15)
@@ -100,18 +106,14 @@ def test_one_bit_of_used_is_found_and_named(site: str, tick: int, peer: int, bit
     def change(r: Record) -> None:
         r["used"][name] ^= 1 << bit
 
-    first = verify(opened(edited(recorded("paper"), record=at(site, tick, change)))).first
-    assert first is not None
-    assert first[:3] == (site, tick, f"used[{name}]")
+    assert first_difference(record=at(site, tick, change))[:3] == (site, tick, f"used[{name}]")
 
 
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize("tick", [0, 1, 50, TICKS - 1])
 def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
     record = at(site, tick, lambda r: r.update(mode="diverged"))
-    first = verify(opened(edited(recorded("paper"), record=record))).first
-    assert first is not None
-    assert first[:3] == (site, tick, "mode")
+    assert first_difference(record=record)[:3] == (site, tick, "mode")
 
 
 @settings(max_examples=20)
@@ -122,8 +124,7 @@ def test_one_bit_of_an_arrivals_tick_is_found_and_named(site: str, tick: int, ar
     def change(r: Record) -> None:
         r["rx"][arrival][1] ^= 1 << bit
 
-    first = verify(opened(edited(recorded("paper"), record=at(site, tick, change)))).first
-    assert first is not None
+    first = first_difference(record=at(site, tick, change))
     assert first[:2] == (site, tick)
     assert first.field.startswith("rx")
 
@@ -142,8 +143,7 @@ def test_one_bit_of_an_arrivals_tick_is_found_and_named(site: str, tick: int, ar
 )
 @pytest.mark.parametrize("tick", [1, 50, TICKS - 1])
 def test_other_arrivals_are_found_and_named(change: Callable[[Record], Any], tick: int) -> None:
-    first = verify(opened(edited(recorded("paper"), record=at("m2", tick, change)))).first
-    assert first is not None
+    first = first_difference(record=at("m2", tick, change))
     assert first[:2] == ("m2", tick)
     assert first.field.startswith("rx")
 
@@ -152,9 +152,7 @@ def test_other_arrivals_are_found_and_named(change: Callable[[Record], Any], tic
 def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
     value = {"cmd": ["stop"], "mem": [1.0], "t_ns": 50_000_001, "boot": 1}[field]
     record = at("m2", 50, lambda r: r.update({field: value}))
-    first = verify(opened(edited(recorded("paper"), record=record))).first
-    assert first is not None
-    assert first[:3] == ("m2", 50, field)
+    assert first_difference(record=record)[:3] == ("m2", 50, field)
 
 
 @pytest.mark.parametrize(
@@ -174,9 +172,7 @@ def test_one_other_number_in_the_embedded_scenario_is_found(old: str, new: str) 
         assert old in text
         return text.replace(old, new, 1)
 
-    first = verify(opened(edited(recorded("free"), scenario=scenario))).first
-    assert first is not None
-    assert first.tick <= 25
+    assert first_difference("free", scenario=scenario).tick <= 25
 
 
 def ranges(lost: set[int]) -> list[tuple[int, int]]:
@@ -256,17 +252,14 @@ def test_a_change_behind_a_gap_is_still_found() -> None:
             r["tau"][0] = flipped(r["tau"][0], 0)
         return without("m2", {40, 41})(r)
 
-    first = verify(opened(edited(recorded("paper"), record=record))).first
-    assert first is not None
-    assert first[:3] == ("m2", 90, "tau[0]")
+    assert first_difference(record=record)[:3] == ("m2", 90, "tau[0]")
 
 
 def test_a_record_that_stands_twice_is_found() -> None:
     def record(r: Record) -> Record:
         return {**r, "tick": 50} if r["site"] == "m2" and r["tick"] == 51 else r
 
-    verdict = verify(opened(edited(recorded("paper"), record=record)))
-    assert not verdict.passed
+    assert first_difference(record=record)
 
 
 @pytest.mark.parametrize("name", list_shipped())
@@ -284,9 +277,7 @@ def test_on_another_platform_a_change_beyond_the_tolerance_is_found(field: str, 
     def change(r: Record) -> None:
         r[field][1] += 1e-6 * (1 + abs(r[field][1]))
 
-    data = edited(recorded("free"), record=at("m2", tick, change), session=OTHER_PLATFORM)
-    first = verify(opened(data)).first
-    assert first is not None
+    first = first_difference("free", record=at("m2", tick, change), session=OTHER_PLATFORM)
     assert first[:3] == ("m2", tick, f"{field}[1]")
 
 

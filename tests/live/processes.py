@@ -15,6 +15,7 @@ from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.connection import find_free_endpoints
 
+PAPER = ("m1", "m2", "s")
 BEGUN = "the session begins"
 PATIENCE_S = 60.0
 

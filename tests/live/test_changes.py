@@ -5,9 +5,8 @@ import pytest
 from tests.cli.running import trilat
 from trilat_net.core.ticks import Mode
 
-from .processes import Session, Stage, connections
+from .processes import PAPER, Session, Stage, connections
 
-PAPER = ("m1", "m2", "s")
 SCRIPT = """
 timeline=[
 {at_s=0.5, link="m1->s", to={delay_ms=250.0, loss=0.1}},

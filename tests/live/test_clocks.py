@@ -11,9 +11,8 @@ import pytest
 from tests.cli.running import trilat
 from tests.truth import judged, offset_errors
 
-from .processes import Session, Stage, connections
+from .processes import PAPER, Session, Stage, connections
 
-PAPER = ("m1", "m2", "s")
 SKEWS = {
     "m2": ("--clock-offset-s", "3", "--clock-drift-ppm", "100"),
     "s": ("--clock-offset-s", "-2", "--clock-drift-ppm", "-50"),

@@ -24,9 +24,7 @@ def test_a_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool,
     assert done.kept == done.flushed
     assert done.log.complete
     assert all(len(done.log[name]) for name in SITES)
-    verdict = verify(done.log)
-    assert verdict.passed
-    assert verdict.identical == verdict.records == sum(len(done.log[name]) for name in SITES)
+    executed_again(done.log)
     # no bar, which stands in the benchmarks: a second would mean that flushing was forgotten
     assert done.lost_ms < 1000
 

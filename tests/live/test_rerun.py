@@ -8,9 +8,8 @@ from tests.cli.running import trilat
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.virtual_comparison import find_late_samples
 
-from .processes import Session, Stage, connections, whole
+from .processes import PAPER, Session, Stage, connections, whole
 
-PAPER = ("m1", "m2", "s")
 LINKS = (
     "link.delay_ms=1",  # some samples come late
     "links.m2->s.model=measured",

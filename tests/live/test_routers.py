@@ -30,15 +30,7 @@ class Routed(Session):
 
 @pytest.mark.long
 def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) -> None:
-    made = Certificates(stage.folder)
-    own = stage.folder / "zenoh.json5"
-    own.write_text(
-        f"""{{ transport: {{ link: {{ tls: {{
-            root_ca_certificate: "{made.authority}", enable_mtls: true,
-            listen_certificate: "{made.certificate}", listen_private_key: "{made.key}",
-            connect_certificate: "{made.certificate}", connect_private_key: "{made.key}",
-        }} }} }} }}"""
-    )
+    own = Certificates(stage.folder).zenoh_file()
     session = Routed(stage, "1", "tls", "--zenoh-config", str(own))
     router = session.router()
     session.all()

@@ -26,24 +26,24 @@ class Certificates:
             *("req", "-x509", *new, "-days", "2", "-subj", "/CN=trilat test authority"),
             *("-keyout", folder / "ca.key", "-out", self.authority),
         )
+        openssl("req", *new, "-subj", "/CN=machine", "-keyout", self.key, "-out", request)
         openssl(
-            *("req", *new, "-subj", "/CN=machine", "-keyout", self.key, "-out", request),
-        )
-        openssl(
-            *(
-                "x509",
-                "-req",
-                "-in",
-                request,
-                "-days",
-                "2",
-                "-CA",
-                self.authority,
-                "-CAkey",
-                folder / "ca.key",
-            ),
+            *("x509", "-req", "-in", request, "-days", "2"),
+            *("-CA", self.authority, "-CAkey", folder / "ca.key"),
             *("-CAcreateserial", "-extfile", extension, "-out", self.certificate),
         )
+
+    def zenoh_file(self) -> Path:
+        """Writes a configuration by which members prove to each other who they are."""
+        file = self.authority.with_name("zenoh.json5")
+        file.write_text(
+            f"""{{ transport: {{ link: {{ tls: {{ // both show a certificate of the same authority
+                root_ca_certificate: "{self.authority}", enable_mtls: true,
+                listen_certificate: "{self.certificate}", listen_private_key: "{self.key}",
+                connect_certificate: "{self.certificate}", connect_private_key: "{self.key}",
+            }} }} }} }}"""
+        )
+        return file
 
 
 def openssl(*arguments: str | Path) -> None:

@@ -36,17 +36,13 @@ class Local:
             member.close()
 
 
-class Mesh:
-    """A full mesh of Zenoh sessions on loopback, at most SEATS of them."""
+class Connected:
+    """Zenoh sessions, each of which has met those before it."""
 
-    def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
-        self.own = own
-        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)]
+    def __init__(self) -> None:
         self._members: list[Bus] = []
 
-    def join(self) -> Bus:
-        seat = len(self._members)
-        bus = ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own)
+    def _enter(self, bus: Bus) -> Bus:
         greet(bus, self._members)
         self._members.append(bus)
         return bus
@@ -56,19 +52,29 @@ class Mesh:
             member.close()
 
 
-class Routed:
-    """Zenoh sessions that reach a router and nothing else."""
+class Mesh(Connected):
+    """A full mesh on loopback, of at most SEATS members."""
 
-    def __init__(self) -> None:
-        self._endpoints = find_free_endpoints(1)
-        self._router = ZenohBus(self._endpoints, mode="router")
-        self._members: list[Bus] = []
+    def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
+        super().__init__()
+        self.own = own
+        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)]
 
     def join(self) -> Bus:
-        bus = ZenohBus([], self._endpoints, "client")
-        greet(bus, self._members)
-        self._members.append(bus)
-        return bus
+        seat = len(self._members)
+        return self._enter(ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own))
+
+
+class Routed(Connected):
+    """Members that reach a router and nothing else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._endpoints = find_free_endpoints(1)
+        self._router = ZenohBus(self._endpoints, mode="router")
+
+    def join(self) -> Bus:
+        return self._enter(ZenohBus([], self._endpoints, "client"))
 
     def restart(self) -> None:
         """The router ends, and another one begins at its place."""
@@ -76,25 +82,13 @@ class Routed:
         self._router = ZenohBus(self._endpoints, mode="router")
 
     def close(self) -> None:
-        for member in (*self._members, self._router):
-            member.close()
+        super().close()
+        self._router.close()
 
 
 def encrypted(protocol: str, folder: Path) -> Mesh:
     """A mesh whose members prove to each other who they are, by a person's own configuration."""
-    made = Certificates(folder)
-    file = folder / "zenoh.json5"
-    file.write_text(
-        f"""{{ // both sides show a certificate of the same authority
-            transport: {{ link: {{ tls: {{
-                root_ca_certificate: "{made.authority}",
-                enable_mtls: true,
-                listen_certificate: "{made.certificate}", listen_private_key: "{made.key}",
-                connect_certificate: "{made.certificate}", connect_private_key: "{made.key}",
-            }} }} }},
-        }}"""
-    )
-    return Mesh(protocol, read_zenoh_file(file).settings)
+    return Mesh(protocol, read_zenoh_file(Certificates(folder).zenoh_file()).settings)
 
 
 def greet(newcomer: Bus, members: Sequence[Bus]) -> None:

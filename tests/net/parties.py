@@ -28,6 +28,17 @@ def told(name: str, boot: int, **facts: object) -> Info:
     return Info(**{"member": name, "boot": boot, **own, **facts})
 
 
+class Elsewhere(ManualClock):
+    """The clock of another machine: both of its readings are other ones than here."""
+
+    def __init__(self, start_ns: int, unix_ns: int, name: str) -> None:
+        super().__init__(start_ns, unix_ns)
+        self._name = name
+
+    def identity(self) -> str:
+        return self._name
+
+
 class Member:
     """One start of one member."""
 
@@ -60,12 +71,19 @@ class Party:
     def __init__(self, sites: Sequence[str]) -> None:
         self.sites = tuple(sites)
         self.clock = ManualClock(10**9, 1_700_000_000_000_000_000)
+        self._clocks = [self.clock]
         self.network = LocalNetwork()
         self.members: dict[str, Member] = {}
         self.stranger = self.network.join()
         self._ear = self.network.join().inbox(topics.key(SESSION, "*", topics.EVENT))
         self.said: list[Event] = []
         self._boot = 100
+
+    def elsewhere(self, ahead_ns: int, unix_ns: int = 0, name: str = "elsewhere") -> Elsewhere:
+        """The clock of another machine, which goes on as the one here does."""
+        made = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
+        self._clocks.append(made)
+        return made
 
     def member(self, name: str, **facts: object) -> Member:
         """A new start of a member, beside those that are there."""
@@ -102,7 +120,8 @@ class Party:
         """Lets members poll once each, then time go on."""
         for name in names or tuple(self.members):
             self.members[name].poll()
-        self.clock.sleep_until(self.clock.monotonic_ns() + STEP_NS)
+        for clock in self._clocks:
+            clock.sleep_until(clock.monotonic_ns() + STEP_NS)
 
     def rounds(self, count: int) -> None:
         for _ in range(count):

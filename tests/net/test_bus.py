@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork, StampedInbox, StampingRing
 
 from .networks import NETWORKS, Network
-from .waiting import drained, received, until
+from .waiting import answered, drained, received, until
 
 
 @pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.long] * (name == "tls")) for name in NETWORKS])
@@ -155,15 +155,7 @@ def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None
 def test_a_responder_answers_at_once_while_nobody_polls(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     other.respond("t/a/ping", lambda sent: sent[::-1])
-
-    def answered() -> tuple[str, bytes] | None:
-        replies = asker.ask("t/*/ping", b"123")
-        try:
-            return until(replies.poll, timeout_s=0.5)
-        except AssertionError:  # the responder is not known yet
-            return None
-
-    assert until(answered) == ("t/a/ping", b"321")
+    assert until(lambda: answered(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
 
 
 def test_a_responder_may_keep_silent_and_then_only_the_others_are_heard(network: Network) -> None:

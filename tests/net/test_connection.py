@@ -55,15 +55,10 @@ def test_a_place_that_is_named_replaces_the_one_on_this_machine() -> None:
     assert member(listen=[], connect=[]) == Connection([], [])
     assert member(own=file(listen={"endpoints": [A]})).listen == [A]
     assert member(own=file(connect={"endpoints": [A]})).connect == [A]
-
-
-def test_connections_of_both_sides_are_united_those_of_the_command_first() -> None:
-    assert member(connect=[B], own=file(connect={"endpoints": [A, B]})).connect == [B, A]
-
-
-def test_places_to_listen_at_are_given_in_one_place() -> None:
-    with pytest.raises(UsageError, match=r"mine\.json5: listen/endpoints: given by --listen too"):
-        member(listen=[A], own=file(listen={"endpoints": [B]}))
+    assert member(connect=[B], own=file(connect={"endpoints": [A, B]})).connect == [
+        B,
+        A,
+    ]  # --connect first
 
 
 def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> None:
@@ -77,6 +72,7 @@ def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> 
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
+        ({"listen": [A], "own": file(listen={"endpoints": [B]})}, "listen/endpoints: given by --listen too"),
         ({"routers": [A], "listen": [B]}, "--router: a client of a router listens nowhere"),
         ({"routers": [A], "connect": [B]}, "--router: a client connects to a router only"),
         ({"routers": [A], "own": file(listen={"endpoints": [B]})}, "--router: a client .* listens nowhere"),

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
-from trilat_net.net.clock import ManualClock
 from trilat_net.net.membership import LATE_GATHER_NS, Epoch
 
 from .parties import STEP_NS, Party
@@ -18,32 +17,21 @@ SITES = ("m1", "m2", "s")
 RECORDER = topics.RECORDER
 
 
-def running(*, recorder: bool = False, on_clock: ManualClock | None = None) -> tuple[Party, Epoch]:
-    """A session that runs, whose sites say so, and its epoch; on a clock of their own, if one is given."""
+def running(*others: str) -> tuple[Party, Epoch]:
+    """A session of all sites, and of others, that runs, and its epoch."""
     session = Party(SITES)
-    for name in (*SITES, RECORDER) if recorder else SITES:
-        session.start(name, **({"on_clock": on_clock} if on_clock else {}))
-    for _ in range(100):
-        step(session, on_clock)
-    epochs = [member.epoch for member in session.members.values()]
-    assert epochs[0] is not None
-    assert all(epoch == epochs[0] for epoch in epochs)
-    return session, epochs[0]
+    session.start(*SITES, *others)
+    epoch = session.agreed()
+    session.rounds(60)
+    return session, epoch
 
 
-def step(session: Party, *clocks: ManualClock | None) -> None:
-    session.round()
-    for clock in clocks:
-        if clock is not None:
-            clock.sleep_until(clock.monotonic_ns() + STEP_NS)
-
-
-def joined(session: Party, within_ns: int, *clocks: ManualClock) -> Epoch | None:
+def joined(session: Party, within_ns: int) -> Epoch | None:
     """The epoch of the recorder, once it has one."""
     for _ in range(within_ns // STEP_NS):
         if session.members[RECORDER].epoch is not None:
             break
-        step(session, *clocks)
+        session.round()
     return session.members[RECORDER].epoch
 
 
@@ -59,15 +47,8 @@ def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
 @settings(max_examples=30, deadline=None)
 def test_on_a_clock_of_its_own_it_finds_the_same_instant(ahead_ns: int, unix_ns: int) -> None:
     session, epoch = running()
-    here = session.clock
-
-    class Elsewhere(ManualClock):
-        def identity(self) -> str:
-            return "elsewhere"
-
-    own = Elsewhere(here.monotonic_ns() + ahead_ns, unix_ns)
-    session.start(RECORDER, on_clock=own)
-    late = joined(session, 4 * LATE_GATHER_NS, own)
+    session.start(RECORDER, on_clock=session.elsewhere(ahead_ns, unix_ns))
+    late = joined(session, 4 * LATE_GATHER_NS)
     assert late is not None
     assert late.mono_ns == epoch.mono_ns + ahead_ns
     assert late.unix_ns == epoch.unix_ns
@@ -84,21 +65,17 @@ def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
 
 def test_of_two_recorders_at_the_start_one_is_a_member_and_one_comes_late() -> None:
     session = Party(SITES)
-    session.start(*SITES)
+    session.start(*SITES, RECORDER)
+    first = session.members["first"] = session.members.pop(RECORDER)
     session.start(RECORDER)
-    first = session.members.pop(RECORDER)
-    session.members["first"] = first
-    session.start(RECORDER)
-    for _ in range(100):
-        session.round()
+    session.rounds(100)
     sites = [session.members[name] for name in SITES]
     epoch = sites[0].epoch
     assert epoch is not None
     assert all(site.epoch == epoch for site in sites)
     both = (first, session.members[RECORDER])
     assert [member.epoch for member in both if member.info.boot == epoch.boots[RECORDER]] == [epoch]
-    for _ in range(100):
-        session.round()
+    session.rounds(100)
     assert [member.epoch.mono_ns for member in both if member.epoch] == [epoch.mono_ns] * 2
 
 
@@ -121,13 +98,7 @@ def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "forged",
-    [
-        {"boots": {"m1": 5}},
-        {"boots": {}},
-        {"scenario": ""},
-        {"running": False},
-    ],
+    "forged", [{"boots": {"m1": 5}}, {"boots": {}}, {"scenario": ""}, {"running": False}]
 )
 def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> None:
     session, _ = running()
@@ -141,9 +112,8 @@ def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> N
 
 
 def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
-    session, epoch = running(recorder=True)
-    other = session.members.pop(RECORDER)
-    session.members["other"] = other
+    session, epoch = running(RECORDER)
+    session.members["other"] = session.members.pop(RECORDER)
     session.start(RECORDER)
     assert joined(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
     assert RECORDER not in session.members[RECORDER].joining.membership.met

@@ -253,24 +253,6 @@ def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(nam
     assert {str(member.epoch) for member in session.members.values()} == {str(epoch)}
 
 
-class Elsewhere(ManualClock):
-    """The clock of another machine: both of its readings are other ones than here."""
-
-    def __init__(self, here: ManualClock, ahead_ns: int, unix_ns: int, name: str = "elsewhere") -> None:
-        super().__init__(here.monotonic_ns() + ahead_ns, unix_ns)
-        self._name = name
-
-    def identity(self) -> str:
-        return self._name
-
-
-def round_of_all(session: Party, *elsewhere: ManualClock) -> None:
-    """One round in which the clocks of all machines go on by as much."""
-    session.round()
-    for clock in elsewhere:
-        clock.sleep_until(clock.monotonic_ns() + STEP_NS)
-
-
 @given(
     ahead_ns=st.dictionaries(
         st.sampled_from([*SITES, RECORDER]), st.integers(-(10**9) + 1, 10**15), min_size=1, max_size=4
@@ -283,13 +265,11 @@ def test_members_on_other_clocks_get_the_same_instant_whatever_their_wall_clocks
 ) -> None:
     session = Party(SITES)
     clocks = {
-        name: Elsewhere(session.clock, ns, unix_ns + ns, f"machine of {name}")
-        for name, ns in ahead_ns.items()
+        name: session.elsewhere(ns, unix_ns + ns, f"machine of {name}") for name, ns in ahead_ns.items()
     }
     for name in (*SITES, RECORDER):
         session.start(name, **({"on_clock": clocks[name]} if name in clocks else {}))
-    for _ in range(200):
-        round_of_all(session, *clocks.values())
+    session.rounds(200)
     epochs = {name: member.epoch for name, member in session.members.items()}
     assert all(epochs.values())
     here_ns = epochs["m1"].mono_ns - ahead_ns.get("m1", 0)
@@ -303,31 +283,26 @@ def test_members_on_other_clocks_get_the_same_instant_whatever_their_wall_clocks
 
 def test_nobody_is_ready_before_the_other_clocks_are_known() -> None:
     session = party("m1", "m2")
-    remote = Elsewhere(session.clock, 5_000_000_000, 0)
-    session.start("s", on_clock=remote)
+    session.start("s", on_clock=session.elsewhere(5_000_000_000))
     bus, deaf = session.members["m2"].bus, LocalNetwork().join().inbox("nothing")
     ask = bus.ask
     bus.ask = lambda key: deaf if key.endswith(topics.PING) else ask(key)
-    for _ in range(300):
-        round_of_all(session, remote)
+    session.rounds(300)
     assert session.kinds().count("epoch") > 1
     assert {event.member for event in session.listen() if event.kind == "ready"} == {"s"}
     assert [member.epoch for member in session.members.values()] == [None] * 3
     bus.ask = ask
-    for _ in range(100):
-        round_of_all(session, remote)
+    session.rounds(100)
     assert all(member.epoch for member in session.members.values())
 
 
 def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
     """Announcement, answer and start each need a way: the margin grows with the leader's round trips."""
     session = party("m1", "m2")
-    remote = Elsewhere(session.clock, 5_000_000_000, 0)
-    session.start("s", on_clock=remote)
+    session.start("s", on_clock=session.elsewhere(5_000_000_000))
     trip_ns = 15 * STEP_NS
     session.members["m1"].bus.ask = later(session.members["m1"].bus.ask, session.clock, trip_ns)
-    for _ in range(200):
-        round_of_all(session, remote)
+    session.rounds(200)
     (announced,) = (event for event in session.listen() if event.kind == "epoch")
     assert re.search(rf"tick 0 is {(EPOCH_AHEAD_NS + 2 * trip_ns) // 1_000_000} ms from now", announced.text)
     assert all(member.epoch for member in session.members.values())
@@ -356,16 +331,8 @@ def test_a_recorder_without_the_scenario_is_not_ready() -> None:
     assert "start" not in session.kinds()
 
 
-GARBAGE = [
-    b"",
-    b"\xc1",
-    b"\x80",
-    b"\xff" * 100,
-    b"\x81\xa1v\x02",
-    b"\x93\x01\x02\x03",
-    b"\x91" * 5_000,
-    bytes(70_000),
-]
+GARBAGE = [b"", b"\xc1", b"\x80", b"\xff" * 100, b"\x81\xa1v\x02", b"\x93\x01\x02\x03", b"\x91" * 5_000]
+GARBAGE.append(bytes(70_000))
 
 
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])

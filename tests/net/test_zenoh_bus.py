@@ -6,12 +6,11 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.net.bus import Bus
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 
 from .networks import Routed, encrypted, meet
-from .waiting import received, until
+from .waiting import answered, received, until
 
 
 def test_a_busy_port_is_the_callers_error_and_named() -> None:
@@ -145,14 +144,6 @@ def test_members_meet_again_through_a_router_that_was_started_again(routed: Rout
 
     until(heard)
     assert until(lambda: answered(other, "t/*/ping")) == ("t/one/ping", b"?")
-
-
-def answered(asker: Bus, key: str) -> tuple[str, bytes] | None:
-    replies = asker.ask(key, b"?")
-    try:
-        return until(replies.poll, timeout_s=0.3)
-    except AssertionError:
-        return None
 
 
 def test_routers_that_connect_to_each_other_are_one() -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from trilat_net.net.bus import Inbox, PolledRing
+from trilat_net.net.bus import Bus, Inbox, PolledRing
 from trilat_net.net.clock import Clock, SystemClock
 
 T = TypeVar("T")
@@ -24,6 +24,15 @@ def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | No
 def drained(ring: PolledRing[T]) -> list[T]:
     """Everything that waits in a ring, oldest first."""
     return list(iter(ring.poll, None))
+
+
+def answered(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
+    """The first answer to a question; None where nobody is known yet who answers."""
+    replies = asker.ask(key, payload)
+    try:
+        return until(replies.poll, timeout_s=0.5)
+    except AssertionError:
+        return None
 
 
 def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:

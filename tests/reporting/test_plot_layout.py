@@ -2,17 +2,10 @@
 
 from pathlib import Path
 
-import pytest
-
-from tests.log.standard_files import SCENARIO, made
+from tests.log.standard_files import SCENARIO
 from trilat_net.log.ros2.cdr import JOINT_STATE
 from trilat_net.log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
 from trilat_net.reporting.plot_layout import PlotLayout, build_plot_layout
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return made(tmp_path_factory.mktemp("files"))
 
 
 def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:

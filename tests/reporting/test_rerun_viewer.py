@@ -8,17 +8,11 @@ from pathlib import Path
 import pytest
 
 from tests.log.programs import RERUN, printed
-from tests.log.standard_files import made
 from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.reporting import rerun_viewer
 from trilat_net.reporting.rerun_viewer import ViewerOptions, make_application_id, open_rerun
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return made(tmp_path_factory.mktemp("files"))
 
 
 class Rerun:

@@ -34,13 +34,14 @@ class Desk:
         return decode(reply[1], Backfill)
 
 
-@given(
-    capacity=st.integers(1, 200),
-    size_bytes=st.integers(3000, 40_000),
-    sizes=st.lists(st.integers(0, 3000), max_size=300),
-    first=st.integers(0, 400),
-    length=st.integers(1, 400),
-)
+memories = {
+    "capacity": st.integers(1, 200),
+    "size_bytes": st.integers(3000, 40_000),
+    "sizes": st.lists(st.integers(0, 3000), max_size=300),
+}
+
+
+@given(**memories, first=st.integers(0, 400), length=st.integers(1, 400))
 def test_a_ring_tells_what_it_still_has_in_chunks(
     capacity: int, size_bytes: int, sizes: list[int], first: int, length: int
 ) -> None:
@@ -63,11 +64,7 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
     assert told == [(n, payloads[n]) for n in left]
 
 
-@given(
-    capacity=st.integers(1, 200),
-    size_bytes=st.integers(3000, 40_000),
-    sizes=st.lists(st.integers(0, 3000), max_size=300),
-)
+@given(**memories)
 def test_a_ring_forgets_no_more_than_it_must(capacity: int, size_bytes: int, sizes: list[int]) -> None:
     """What is left fills the memory, but for the piece of a message at its end, or the places."""
     ring = ChannelBuffer(capacity, size_bytes)

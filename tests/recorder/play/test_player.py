@@ -86,6 +86,13 @@ class Stage:
             low_cpu=low_cpu,
         )
 
+    def play(self, rate: float = 1.0, later_ns: int = 0, *, loop: bool = False) -> Pace:
+        """Plays from 0 on, beginning so much later; returns what was due when."""
+        pace = Pace(self.clock.now_ns + later_ns, 0, rate)
+        self.player.prepare()
+        self.player.play(pace, loop=loop)
+        return pace
+
     def _hear(self, channel: int, payload: bytes) -> None:
         self.heard.append((self.clock.now_ns, channel, payload[0]))
         self.clock.now_ns += self.stall_ns.get(len(self.heard), 0)
@@ -123,9 +130,7 @@ def test_a_late_message_makes_no_later_one_late() -> None:
     """A publisher that waits for 30 ms: what was due meanwhile follows at once, the rest is in time."""
     stage = Stage(given_at_once((t, 0) for t in range(60)))
     stage.stall_ns[10] = 30 * MS
-    pace = Pace(stage.clock.now_ns, 0)
-    stage.player.prepare()
-    stage.player.play(pace)
+    pace = stage.play()
     late_ms = [round((ns - pace.due_ns(n * MS)) / MS) for ns, _, n in stage.heard]
     assert late_ms == [0] * 10 + list(range(29, 0, -1)) + [0] * 21
     assert 28_900 <= stage.player.lateness.max_us <= 29_100
@@ -136,16 +141,13 @@ def test_a_late_message_makes_no_later_one_late() -> None:
 def test_who_makes_a_publisher_wait_for_seconds_is_counted() -> None:
     stage = Stage(given_at_once([(0, 0), (1, 0)]))
     stage.stall_ns[1] = CUT_NS
-    stage.player.prepare()
-    stage.player.play(Pace(stage.clock.now_ns, 0))
+    stage.play()
     assert stage.player.stalls == 1
 
 
 def test_rounds_follow_each_other_with_the_same_messages() -> None:
     stage = Stage(given_at_once([(0, 0), (5, 1), (7, 0)]), stop_at=7)
-    stage.player.prepare()
-    pace = Pace(stage.clock.now_ns + MS, 0)
-    stage.player.play(pace, loop=True)
+    pace = stage.play(later_ns=MS, loop=True)
     assert [n for _, _, n in stage.heard] == [0, 1, 2, 0, 1, 2, 0]
     assert stage.player.rounds == 3
     round_ns = 7 * MS + LOOP_PAUSE_NS
@@ -160,8 +162,7 @@ def test_rounds_follow_each_other_with_the_same_messages() -> None:
 def test_it_stops_when_asked(count: int) -> None:
     """Between two messages, and no later than it looks at anything else."""
     stage = Stage(given_at_once((t % 60, 0) for t in range(250)), stop_at=count)
-    stage.player.prepare()
-    stage.player.play(Pace(stage.clock.now_ns, 0))
+    stage.play()
     assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
 
 
@@ -170,14 +171,12 @@ def test_everything_else_has_its_turn_even_where_no_time_is_left() -> None:
     stage = Stage(given_at_once((0, 0) for _ in range(200)))
     for n in range(200):
         stage.stall_ns[n] = MS
-    stage.player.prepare()
-    stage.player.play(Pace(stage.clock.now_ns, 0, math.inf))
+    stage.play(math.inf)
     looked = [ns for ns, _ in stage.looks]
     assert len(looked) >= 10
     assert max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
     quiet = Stage(given_at_once([(0, 0), (60, 0)]))
-    quiet.player.prepare()
-    quiet.player.play(Pace(quiet.clock.now_ns, 0))
+    quiet.play()
     assert len(quiet.looks) >= 40
     assert [progress.published for _, progress in quiet.looks][-1] == 1
 

@@ -1,0 +1,11 @@
+from pathlib import Path
+
+import pytest
+
+from tests.log.standard_files import made
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Logs with standard channels of every kind, by their kind."""
+    return made(tmp_path_factory.mktemp("files"))
