@@ -9,10 +9,10 @@ def test_what_is_passive_is_said_in_a_word_each() -> None:
     lines = describe_ports(section_of("p_d_margin_two"))
     assert lines[0].startswith("Ports of m, s, operators and environments off, 0.001-100 Hz")
     assert "evidence, no proof" in lines[0]
-    assert "  operators passive in qd: passive" in lines
+    assert "  operators passive in qd, coupled or not: passive" in lines
     assert "    Llewellyn, every pair and joint: holds (2 two-ports)" in lines
     assert not any(" r = " in line for line in lines)
-    assert sum("Z-width" in line for line in lines) == 2
+    assert sum("the ratio is" in line for line in lines) == 2
 
 
 def test_what_is_not_passive_says_where_and_by_how_much() -> None:
@@ -44,6 +44,7 @@ def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
         facts = json.loads(json.dumps(ports_to_json(section), allow_nan=False))
         assert facts["passive_qd"]["holds"] is section.velocity.passive
         assert facts["passive_qd"]["least"] == section.velocity.minima.least
-        assert facts["felt"][0]["width_db"] == section.transparency[0].width_db
+        assert facts["felt"][0]["ratio_db"] == section.transparency[0].ratio_db
+        assert facts["felt"][0]["difference_nm_s_rad"] == section.transparency[0].difference_nm_s_rad
         assert (facts["passive_r"] is None) is (section.proof is None)
     assert facts["passive_qd"]["lacking_nm_s_rad"] is None

@@ -112,7 +112,7 @@ def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
     near = (*bare, ("link.delay_ms", 1.0), ("sites.m.control.d", 30.0))
     section = section_of("contact", near)
     assert section.clamped_verdict == "stable"
-    assert section.transparency[0].width_db > 2.0
+    assert section.transparency[0].ratio_db > 2.0
 
 
 def test_a_network_that_passes_one_way_only_has_no_damping_that_saves_all_weights() -> None:

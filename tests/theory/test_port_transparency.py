@@ -21,6 +21,9 @@ def test_what_is_felt_of_p_d_is_as_on_paper(K: float, d: tuple[float, float], T:
     through = (K / S) ** 2 * np.exp(-S * sum(T))
     np.testing.assert_allclose(found.clamped, own, rtol=1e-8)
     np.testing.assert_allclose(found.free, own - through / other, rtol=1e-8)
+    inside = (found.w_rad_s >= 0.2 * np.pi) & (found.w_rad_s <= 20.0 * np.pi)  # the Z-width -h12 h21 / h22
+    sizes = np.abs(through / other)[inside]
+    assert sizes.min() * (1.0 - 1e-6) <= found.difference_nm_s_rad <= sizes.max() * (1.0 + 1e-6)
 
 
 def test_who_holds_the_third_site_counts() -> None:
@@ -38,7 +41,7 @@ def test_the_width_is_the_ratio_in_db_whatever_the_band_where_the_ratio_is_one(
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
     one = Transparency("a", "b", 1, w, to_imaginary_axis(free * w), to_imaginary_axis(clamped * w), band)
-    assert one.width_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
+    assert one.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
     middle_rad_s = 2.0 * np.pi * np.sqrt(band[0] * band[1])
     assert one.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
     assert one.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
@@ -47,7 +50,7 @@ def test_the_width_is_the_ratio_in_db_whatever_the_band_where_the_ratio_is_one(
 
 def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
     widths = [
-        measure_transparency(pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[0].width_db
+        measure_transparency(pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[0].ratio_db
         for K in (1.0, 10.0, 100.0)
     ]
     assert widths == sorted(widths)
@@ -56,7 +59,7 @@ def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
 
 def test_two_sites_that_do_not_know_each_other_feel_nothing_of_each_other() -> None:
     (one,) = measure_transparency(Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b")
-    assert one.width_db == pytest.approx(0.0, abs=1e-12)
+    assert one.ratio_db == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from tests.theory.figures_of_runs import Overrides, measured, printed, value
 from tests.virtual_runs import sampled
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
+from trilat_net.theory import analyse_linear_loop
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
 EDGE = {
@@ -16,11 +17,35 @@ EDGE = {
 }
 
 
-@pytest.mark.parametrize(("delay_ms", "settled_s"), [(0.0, 22.2), (200.0, 11.9), (400.0, 5.5)])
-def test_some_delay_helps_free_motion(delay_ms: float, settled_s: float) -> None:
+SETTLED_S = {0.0: 22.2, 20.0: 23.3, 50.0: 24.3, 100.0: 17.8, 200.0: 11.9, 400.0: 5.5, 800.0: 11.4}
+
+
+@pytest.mark.parametrize(("delay_ms", "settled_s"), SETTLED_S.items())
+def test_settling_of_free_motion_is_no_monotone_function_of_the_delay(
+    delay_ms: float, settled_s: float
+) -> None:
     made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
     made.advance(30.0)
     assert made.settled_s == printed(settled_s, 0.1)
+
+
+def test_the_error_of_free_motion_grows_with_every_delay_and_each_run_learns_something_else() -> None:
+    times_s = np.arange(0.02, 20.01, 0.02)
+    runs = [sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s) for delay_ms in SETTLED_S]
+    rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
+    assert rms == sorted(rms)
+    assert (rms[0], rms[-1]) == (printed(0.1085, 0.0005), printed(0.1277, 0.0005))
+    inertia = [run[0, -1, 12] for run in runs]  # theta_hat_1 of the first site
+    assert np.ptp(inertia) > 0.1
+
+
+@pytest.mark.parametrize(("delay_ms", "rate_per_s"), [(0.0, -0.159), (200.0, -0.499), (1600.0, -0.171)])
+def test_about_one_rest_with_true_estimates_some_delay_damps_common_motion(
+    delay_ms: float, rate_per_s: float
+) -> None:
+    found = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
+    assert found.decisive.rightmost is not None
+    assert found.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
 
 
 @pytest.mark.parametrize(("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)])

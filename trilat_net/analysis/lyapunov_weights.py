@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.dominance import perron_vector
+from ..core.dominance import find_reach, perron_vector
 from ..core.vectors import Array
 
 KD_SHAPE_TOLERANCE = 1e-9
@@ -33,9 +33,7 @@ class LyapunovWeights(NamedTuple):
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     """Returns the groups of sites that reach each other and no other along shares, alpha shape (N, N)."""
-    reach = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
-    for _ in range(len(alpha).bit_length()):
-        reach = reach @ reach
+    reach = find_reach(alpha)
     groups = []
     for site in range(len(alpha)):
         group = tuple(np.flatnonzero(reach[site] & reach[:, site]).tolist())

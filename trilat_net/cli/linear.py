@@ -51,7 +51,7 @@ def linear_command(
     """Linearises the loop about its equilibrium: stability of small motions, and the operators' impedances.
 
     With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators and
-    environments off, passivity, Llewellyn's criterion, impedance and Z-width (docs/ports.md). Exit code 0 for
+    environments off, passivity, Llewellyn's criterion, and impedance (docs/ports.md). Exit code 0 for
     any verdict.
     """
     if picture is not None:

@@ -113,10 +113,10 @@ def damped_torque(
 ) -> Pair:
     """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, within +-limit: the laws of known gravity.
 
-    P+d has Kd = k_f = 0. For N sites with equal K and d per joint and one constant delay T its linearised
-    loop is stable from d = abs(lambda_min(alpha)) K T on, whatever the masses, for two sites with 4 d_1 d_2 >
-    (T_1 + T_2)^2 K_1 K_2. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the slave, d and
-    k_f at the master.
+    P+d has Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay T its
+    linearised loop is stable from d = max(abs(lambda_min(alpha)), 0.2172) K T on, whatever the masses, for
+    two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2; for other shares no such bound holds. PD+d has k_f = 0.
+    Direct force reflection has Kd = 0: K and d at the slave, d and k_f at the master.
 
     Args:
         theta: the parameters that the law takes the arm to have, shape (5,).

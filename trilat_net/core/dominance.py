@@ -11,6 +11,7 @@ vector, positive and unique up to its length.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .jit import leaf
 from .site_setup import StaleAction
@@ -39,12 +40,42 @@ def upsilon(alpha: Array) -> Array:
     return alpha - np.eye(len(alpha))
 
 
-def is_irreducible(alpha: Array) -> bool:
-    """True if every site reaches every other along links with a factor above 0, alpha of shape (N, N)."""
-    reach = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
+def find_reach(alpha: Array) -> NDArray[np.bool_]:
+    """Returns which site reaches which along links with a factor above 0, shape (N, N), for alpha so."""
+    reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
     for _ in range(len(alpha).bit_length()):
         reach = reach @ reach
-    return bool(reach.all())
+    return reach
+
+
+def is_irreducible(alpha: Array) -> bool:
+    """True if every site reaches every other along links with a factor above 0, alpha of shape (N, N)."""
+    return bool(find_reach(alpha).all())
+
+
+def find_balancing_weights(alpha: Array) -> Array | None:
+    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), shape (N,); None if there is none.
+
+    Shares that have such weights are reversible: their products are the same along every circle and against
+    it (Kolmogorov), alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three sites, and the eigenvalues of
+    alpha are real. Links out of a group of sites that reach each other are left out: no circle has them.
+    """
+    reach = find_reach(alpha)
+    followed = reach & reach.T & (alpha > 0.0)
+    D = np.zeros(len(alpha))
+    for first in range(len(alpha)):
+        waiting = [] if D[first] else [first]
+        D[first] = D[first] or 1.0
+        while waiting:
+            i = waiting.pop()
+            for j in np.flatnonzero(followed[i]).tolist():
+                here, there = D[i] * alpha[i, j], alpha[j, i]
+                if not D[j] and there:
+                    D[j] = here / there
+                    waiting.append(j)
+                elif abs(here - D[j] * there) > ROW_SUM_TOLERANCE * here:
+                    return None
+    return D
 
 
 def perron_vector(alpha: Array) -> Array:

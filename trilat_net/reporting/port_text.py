@@ -6,12 +6,15 @@ proof.
 
 import math
 
+import numpy as np
+
 from ..theory.frequency_search import FrequencyBand
 from ..theory.port_analysis import PortAnalysis
 from ..theory.port_passivity import Passivity
 from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
 
 _SHOWN_BANDS = 3
+WEIGHTS_ALIKE = 1e-9
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
@@ -29,12 +32,12 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     if ports.pole.order:
         kind = "as of free masses" if ports.pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
-    lines.append(f"  operators passive in qd: {_describe_passivity(ports.velocity)}")
+    lines.append(f"  operators passive in qd, coupled or not: {_describe_passivity(ports.velocity)}")
     lines += [f"    joint {joint} alone: {_describe_passivity(one)}" for joint, one in ports.joints.items()]
     if ports.proof is not None:
         proof = _describe_proof(ports, ports.proof)
         lines.append(f"  operators passive in r = qd + Lambda e, the proof's premise: {proof}")
-    lines.append(f"  any passive operators in qd, best weights: {_describe_absolute_stability(ports)}")
+    lines.append(f"  a passive operator in qd per site, best weights: {_describe_absolute_stability(ports)}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].of
@@ -45,6 +48,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
 def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
     text = f"{_describe_passivity(proof, damping=False)}; sites weighted {beta}"
+    if np.ptp(ports.beta) > WEIGHTS_ALIKE:
+        text += ", which is nothing for operators coupled to one another"
     if proof.passive or ports.estimates_true:
         return text
     return f"{text}; estimates here are not true, and the proof counts the energy that they store"
@@ -99,5 +104,6 @@ def _describe_transparency(one: Transparency) -> str:
     low, high = one.band_hz
     return (
         f"{one.at} feels of {one.of}, joint {one.joint}: {free:.4g} N m s/rad free and {clamped:.4g} "
-        f"clamped at {QUOTED_AT_HZ:g} Hz; Z-width {one.width_db:.3g} dB over {low:g}-{high:g} Hz"
+        f"clamped at {QUOTED_AT_HZ:g} Hz; over {low:g}-{high:g} Hz the ratio is {one.ratio_db:.3g} dB, the "
+        f"difference {one.difference_nm_s_rad:.3g} N m s/rad"
     )

@@ -9,8 +9,32 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
+from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
+from .laws import Adaptive, AdaptiveBox, ControlLaw, ProportionalDamped, ProportionalDerivativeDamped
 from .scenario_types import Scenario
+
+COUPLED_OPERATORS = (
+    "beta differs between sites: it weighs operators of one site each, and says nothing of hands that are "
+    "coupled to one another (one user at two handles)"
+)
+IRREVERSIBLE_SHARES = (
+    "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj alpha_ji): some "
+    "passive operators make the loop unstable, whatever its damping (docs/errata.md, 14)"
+)
+
+
+def lacks_detailed_balance(scenario: Scenario) -> bool:
+    """True if all sites exchange positions and know gravity, and no D > 0 makes D (I - alpha) symmetric."""
+    laws = [spec.control for spec in scenario.sites.values()]
+    return all(map(_exchanges_positions, laws)) and find_balancing_weights(scenario.alpha) is None
+
+
+def _exchanges_positions(law: ControlLaw) -> bool:
+    if isinstance(law, Adaptive | AdaptiveBox):
+        return not any(law.Gamma)
+    return isinstance(law, ProportionalDamped | ProportionalDerivativeDamped) and law.gravity == 1.0
 
 
 def describe_scenario(scenario: Scenario) -> list[str]:
@@ -29,6 +53,8 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
         *(links if len(set(words.values())) > 1 else [f"every link: {next(iter(words.values()))}"]),
         f"beta, the left null vector of Upsilon: {weights}",
+        *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
+        *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
         *(f"assumed: {text}" for text in scenario.assumed),
     ]
 

@@ -246,8 +246,9 @@ class Adaptive(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive"):
 class AdaptiveBox(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive_box"):
     """The paper's law with every estimate held in a box.
 
-    A box that holds the truth strictly inside keeps V' <= 0 and removes the spring by which learning gravity
-    ties the arms to a pose. Projection after Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4.
+    A box that holds the truth, at its edge too, keeps V' <= 0; one that holds it strictly inside also removes
+    the spring by which learning gravity ties the arms to a pose. Projection after Ioannou and Sun, "Robust
+    Adaptive Control" (1996), 4.4.
 
     Attributes:
         theta_low: lower bound of each estimate.
@@ -286,8 +287,9 @@ class KnownGravity(Frozen, frozen=True):
 class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
     """P+d with known gravity: tau = G(q) - K e - d qd.
 
-    For equal gains and one constant delay T the linearised loop of N sites is stable if and only if
-    d > abs(lambda_min(alpha)) K T; two sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2.
+    For reversible shares, equal gains and one constant delay T the linearised loop of N sites is stable
+    whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some masses only then; two
+    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -322,8 +324,9 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
     `felt` is the torque of operators and environments on the peers' arms as received, weighted by dominance.
-    A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free motion; in contact no damping
-    makes it so for every stiffness and delay. It is for one master and one slave.
+    A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free motion; for any passive operator
+    and wall the master needs d >= k_f (2 K T + d_s)^2 / (4 d_s), K and d_s of the slave. It is for one master
+    and one slave.
 
     Attributes:
         K: stiffness per joint, N m/rad.

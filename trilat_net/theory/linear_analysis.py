@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..scenario import Scenario, load_scenario
+from ..scenario.describe import IRREVERSIBLE_SHARES, lacks_detailed_balance
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
@@ -73,6 +74,8 @@ class LinearAnalysis:
             notes.append(
                 f"{self.decisive.drifting} of the roots at zero only drift: their modes keep their speed"
             )
+        if lacks_detailed_balance(self.scenario):
+            notes.append(IRREVERSIBLE_SHARES)
         return tuple(notes)
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:

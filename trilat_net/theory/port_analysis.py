@@ -287,5 +287,7 @@ def _transparency_to_json(one: Transparency) -> dict[str, Any]:
         "band_hz": list(one.band_hz),
         "softest_nm_s_rad": one.softest_nm_s_rad,
         "stiffest_nm_s_rad": one.stiffest_nm_s_rad,
-        "width_db": one.width_db,
+        "width_db": one.ratio_db,
+        "ratio_db": one.ratio_db,
+        "difference_nm_s_rad": one.difference_nm_s_rad,
     }

@@ -1,13 +1,12 @@
 """Transparency: the impedance at one site's ports with another site free and clamped.
 
 Invariant: an impedance is along one joint, torque over velocity, N m s/rad, with no torque of the operator on
-the other joints. Z-widths are ratios on a logarithmic frequency axis, in dB over a named band.
+the other joints. Means are taken on a logarithmic frequency axis over a named band.
 
 Source: transmitted impedance after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE
-Trans. Robotics and Automation 9 (1993). Z-width after Colgate and Brown, "Factors affecting the Z-width of a
-haptic display", ICRA (1994), and its use for the impedances that teleoperators transmit after Hashtrudi-Zaad
-and Salcudean, "Analysis and evaluation of stability and performance robustness for teleoperation control
-architectures", ICRA (2000).
+Trans. Robotics and Automation 9 (1993). The difference of both ends is the Z-width of Hashtrudi-Zaad and
+Salcudean, "Analysis and evaluation of stability and performance robustness for teleoperation control
+architectures", ICRA (2000); the ratio is our own measure (docs/ports.md).
 """
 
 from collections.abc import Mapping
@@ -29,8 +28,8 @@ from .port_response import (
     select_ports,
 )
 
-Z_WIDTH_BAND_HZ = (0.1, 10.0)
-"""The band of Z-widths: below it operators drift, above it they do not move deliberately."""
+TRANSPARENCY_BAND_HZ = (0.1, 10.0)
+"""The band of the means: below it operators drift, above it they do not move deliberately."""
 QUOTED_AT_HZ = 1.0
 _SHOWN_HZ = (0.01, 100.0)
 _PER_DECADE = 100
@@ -55,7 +54,7 @@ class Transparency(NamedTuple):
     w_rad_s: Array
     free: Complex
     clamped: Complex
-    band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ
+    band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ
 
     @property
     def softest_nm_s_rad(self) -> float:
@@ -68,9 +67,15 @@ class Transparency(NamedTuple):
         return self._mean(self.clamped)
 
     @property
-    def width_db(self) -> float:
-        """Z-width: mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, dB."""
+    def ratio_db(self) -> float:
+        """Mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, dB."""
         return 20.0 * float(np.log10(self.stiffest_nm_s_rad / self.softest_nm_s_rad))
+
+    @property
+    def difference_nm_s_rad(self) -> float:
+        """Mean size of Z_clamped - Z_free over the band, on logarithmic axes; zero if they are one."""
+        apart = self.clamped - self.free
+        return self._mean(apart) if apart.all() else 0.0
 
     def size_at(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the sizes of the free and the clamped impedance at a frequency, N m s/rad."""
@@ -92,7 +97,7 @@ def measure_transparency(
     at: str,
     of: str,
     others: Mapping[str, PortLoad] | None = None,
-    band_hz: tuple[float, float] = Z_WIDTH_BAND_HZ,
+    band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ,
 ) -> tuple[Transparency, ...]:
     """Returns the transparency along each joint of site `at`, with site `of` free and clamped.
 

@@ -198,7 +198,7 @@ def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> N
 
 
 GAIN = st.floats(0.1, 50.0)
-DELAY_MS = st.integers(1, 5000)
+DELAY_MS = st.integers(2, 5000)  # of one tick the sampling asks for more
 
 
 def excess(scenario: Scenario) -> float:
@@ -267,6 +267,15 @@ def test_where_its_premises_do_not_hold_a_condition_says_nothing(name: str, sett
 
 def test_play_out_counts_as_delay() -> None:
     assert excess(load_scenario("p_d_margin", {"link.playout_ms": 400.0})) == pytest.approx(1.1 - 2.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"scheme": "digital"}, {"sites.s.rate_hz": 500}, {"control.d": 70.0}],
+    ids=["another scheme", "two rates", "d h above the least inertia"],
+)
+def test_where_the_ticks_are_not_those_it_was_derived_for_it_says_nothing(changes: dict[str, Any]) -> None:
+    assert evaluate_criterion(load_scenario("p_d_margin", changes)) is None
 
 
 def test_of_shares_that_turn_in_a_circle_the_roots_are_complex_and_nothing_is_said() -> None:

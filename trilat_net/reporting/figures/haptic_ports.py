@@ -38,7 +38,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         for column, joint in enumerate(joints):
             of_joint = [one for one in ports.transparency if one.joint == joint]
             _plot_impedance(ports, of_joint, *grid[:, column])
-            grid[0, column].set_title(f"joint {joint}" + ("" if size.narrow else _describe_widths(of_joint)))
+            grid[0, column].set_title(f"joint {joint}" + ("" if size.narrow else _describe_ratios(of_joint)))
             grid[1, column].set_xlabel("frequency (Hz)")
             if size.narrow:
                 grid[1, column].set_xticks((0.1, 1.0, 10.0))  # those at the ends meet the next panel's
@@ -50,7 +50,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
             *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
             (f"{of} free", {"color": style.REFERENCE}),
             (f"{of} clamped", {"color": style.REFERENCE, "linestyle": _CLAMPED}),
-            ("band of the Z-width", {**_BAND, "alpha": 0.4, "linewidth": 6.0}),
+            ("band of the ratio", {**_BAND, "alpha": 0.4, "linewidth": 6.0}),
         ]
         style.add_legend(figure, entries)
     return figure
@@ -71,9 +71,9 @@ def _plot_impedance(
         axes.set_xlim(hz[0], hz[-1])
 
 
-def _describe_widths(transparency: Sequence[Transparency]) -> str:
-    widths = ", ".join(f"{one.at} {one.width_db:+.1f} dB" for one in transparency)
-    return f"\nZ-width {widths}".replace("-", "\N{MINUS SIGN}").replace("Z\N{MINUS SIGN}", "Z-")
+def _describe_ratios(transparency: Sequence[Transparency]) -> str:
+    ratios = ", ".join(f"{one.at} {one.ratio_db:+.1f} dB" for one in transparency)
+    return f"\nclamped / free {ratios}".replace("-", "\N{MINUS SIGN}")
 
 
 def _colour(ports: PortAnalysis, site: str) -> str:

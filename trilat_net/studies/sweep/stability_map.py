@@ -5,8 +5,8 @@ marginal.
 
 Invariant: the runs come from the results and the lines from the plan alone; a line is the zero set of a
 quantity that theory gives at every grid point. A criterion applies only if all of its hypotheses hold, and
-its excess is positive where it is met. With scheme `digital` the loop counts as sampled, tick by tick,
-otherwise as continuous.
+its excess is positive where it is met. P+d counts as it is computed, from tick to tick; of the roots' line
+only those with scheme `digital` do.
 """
 
 import math
@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...core.dominance import find_balancing_weights
 from ...core.vectors import Array
 from ...errors import ScenarioError
-from ...scenario import Scenario
+from ...scenario import Scenario, SiteSpec
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.fields import is_number
 from ...scenario.laws import Adaptive, ProportionalDamped
@@ -32,7 +33,9 @@ from .sweep_results import SweepResults
 
 _GRAVITY = slice(3, 5)
 """The parameters of Eq. (24) that gravity's torque consists of."""
-_REAL = 1e-9
+_ROUNDING = 1e-6
+COMMON_MOTION_SHARE = 0.21723362821
+"""-min sin x / x: the share of K T that the common motion of all sites asks for, at its worst mass."""
 
 
 class StabilityCriterion(NamedTuple):
@@ -58,26 +61,80 @@ def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _damped(scenario: Scenario) -> StabilityCriterion | None:
-    """P+d: 4 d1 d2 > (T1 + T2)^2 K1 K2 for two sites, d > abs(lambda_min(alpha)) K T for N equal ones."""
-    delays_s = _delays_s(scenario)
-    laws = [one.control for one in scenario.sites.values() if isinstance(one.control, ProportionalDamped)]
-    if delays_s is None or len(laws) < len(scenario.sites) or any(law.gravity != 1.0 for law in laws):
+    """P+d: 4 d1 d2 > (T1 + T2)^2 K1 K2 for two sites, d > max(abs(lambda_min), 0.2172) K T for N equal ones.
+
+    Of N sites the shares must be reversible. It is the condition for no root on the unit circle whatever the
+    masses, down to d h: lighter arms no damping steadies at this tick rate (docs/errata.md, 13).
+    """
+    delays_s, rates_hz = _delays_s(scenario), {spec.rate_hz for spec in scenario.sites.values()}
+    gains = [_scalar_gains(spec) for spec in scenario.sites.values()]
+    K, d = [gain[0] for gain in gains if gain], [gain[1] for gain in gains if gain]
+    if delays_s is None or len(K) < len(gains) or len(rates_hz) > 1 or scenario.scheme != "second_order":
         return None
-    if any(len({*law.K}) > 1 or len({*law.d}) > 1 for law in laws):  # the arm couples its joints
+    rate_hz = rates_hz.pop()
+    if max(d) / rate_hz >= min(_least_inertia(spec.arm.theta) for spec in scenario.sites.values()):
         return None
-    K, d = [law.K[0] for law in laws], [law.d[0] for law in laws]
-    source = "P+d: sufficient whatever the arms weigh, and necessary where they are heavy: K T² << M"
-    if len(laws) == 2:
-        excess = 2.0 * np.sqrt(d[0] * d[1]) - sum(delays_s) * np.sqrt(K[0] * K[1])
+    ticks = [max(1, math.ceil(delay_s * rate_hz - _ROUNDING)) for delay_s in delays_s]
+    source = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
+    if len(K) == 2:
         symbol = r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$"
-        return StabilityCriterion(symbol, "4 d1 d2 = (T1 + T2)² K1 K2", source, float(excess))
-    roots = np.linalg.eigvals(scenario.alpha)
-    if len({*K}) > 1 or len({*d}) > 1 or len({*delays_s}) > 1 or np.abs(roots.imag).max() > _REAL:
+        excess = _excess_of_two(K, d, 0.5 * sum(ticks), rate_hz)
+        return StabilityCriterion(symbol, "4 d1 d2 = (T1 + T2)² K1 K2", source, excess)
+    if len({*K}) > 1 or len({*d}) > 1 or len({*ticks}) > 1 or find_balancing_weights(scenario.alpha) is None:
         return None
-    least = abs(float(roots.real.min()))
+    least = float(np.linalg.eigvals(scenario.alpha).real.min())
+    excess = d[0] - K[0] * _find_asked_share(least, ticks[0]) * ticks[0] / rate_hz
+    if -least < COMMON_MOTION_SHARE:
+        return StabilityCriterion(r"$d = 0.2172\,K\,T$", "d = 0.2172 K T", source, excess)
     symbol = r"$d = |\lambda_{\min}(\alpha)|\,K\,T$"
-    excess = d[0] - least * K[0] * delays_s[0]
     return StabilityCriterion(symbol, "d = abs(lambda_min(alpha)) K T", source, excess)
+
+
+def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
+    """Returns K and d of P+d with known gravity, if they are alike at both joints, which the arm couples."""
+    law = spec.control
+    if not isinstance(law, ProportionalDamped) or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
+        return None
+    return law.K[0], law.d[0]
+
+
+def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
+    """Returns angles phi = w h of z from almost 0 to almost pi, 2 tan(phi / 2), and the scheme's lag.
+
+    The first turn of a delay of so many ticks has the more of them.
+    """
+    first = np.linspace(0.0, min(2.0 * np.pi / ticks, 3.0), 400)[1:]
+    phi = np.concatenate([[1e-7 / ticks], first, np.linspace(0.0, np.pi, 400)[1:-1]])
+    t = np.tan(0.5 * phi)
+    return phi, 2.0 * t, 2.0 * t**3 / (1.0 + 3.0 * t**2)
+
+
+def _find_asked_share(least: float, ticks: int) -> float:
+    """Returns the share of K T that d must exceed, of reversible shares with that least eigenvalue."""
+    phi, w, lag = _tick_angles(ticks)
+    asked = [
+        (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks) for a in (least, 1.0)
+    ]
+    return float(np.max(asked))
+
+
+def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float) -> float:
+    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies, T1 + T2 = 2 ticks."""
+    phi, w, lag = _tick_angles(ticks)
+    first, second = (
+        np.maximum(damping - K_i * lag / (w * rate_hz), 0.0) for K_i, damping in zip(K, d, strict=True)
+    )
+    across = np.abs(np.sin(ticks * phi) + lag * np.cos(ticks * phi)) / (w * rate_hz)
+    return float(2.0 * np.min(np.sqrt(first * second) - math.sqrt(K[0] * K[1]) * across))
+
+
+def _least_inertia(theta: Array) -> float:
+    """Returns the least eigenvalue of M(q) over all poses, kg m^2: it lies at cos q2 = 1 or -1."""
+    ends = [
+        [[theta[0] + 2.0 * c * theta[1], theta[2] + c * theta[1]], [theta[2] + c * theta[1], theta[2]]]
+        for c in (-1.0, 1.0)
+    ]
+    return float(np.linalg.eigvalsh(np.array(ends)).min())
 
 
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:

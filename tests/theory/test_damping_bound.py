@@ -1,0 +1,132 @@
+"""Errata 13: how much damping P+d needs for N sites, against roots that are counted independently."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from tests.theory.position_networks import count_growing, position_network, rods
+from trilat_net.core.dominance import find_balancing_weights
+from trilat_net.studies.sweep.stability_map import COMMON_MOTION_SHARE, evaluate_criterion
+from trilat_net.theory import analyse_linear_loop
+
+LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]
+"""The lab sheet's first exercise: 0.1 0.2 0.8 = 0.016 along the circle, 0.9 0.2 0.8 = 0.144 back."""
+RING = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+POSE = (-0.1, 0.4)
+
+
+def equal(count: int) -> Any:
+    """Equal shares."""
+    return (np.ones((count, count)) - np.eye(count)) / (count - 1)
+
+
+def shares(rng: np.random.Generator, count: int, *, reversible: bool) -> Any:
+    """Random shares; reversible ones from weights that are the same both ways."""
+    weights = rng.uniform(0.0, 1.0, (count, count)) ** 2 * (1.0 - np.eye(count))
+    weights = weights + weights.T if reversible else weights
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def test_what_is_balanced_is_reversible() -> None:
+    """Kolmogorov's criterion for three sites, and weights that make D alpha symmetric for any number."""
+    rng = np.random.default_rng(1)
+    for count in (2, 3, 5, 8):
+        alpha = shares(rng, count, reversible=True)
+        D = find_balancing_weights(alpha)
+        assert D is not None
+        np.testing.assert_allclose(D[:, None] * alpha, (D[:, None] * alpha).T, rtol=1e-12)
+        assert np.abs(np.linalg.eigvals(alpha).imag).max() < 1e-9
+        assert count == 2 or find_balancing_weights(shares(rng, count, reversible=False)) is None
+    assert find_balancing_weights(np.array(LAB)) is None
+    assert find_balancing_weights(np.array(RING)) is None
+    follower = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.7, 0.0]])  # nobody follows the third
+    assert find_balancing_weights(follower) is not None
+
+
+def test_the_common_motion_asks_for_its_share_at_one_mass() -> None:
+    """-min sin x / x is at tan x = x; there m w^2 = K (1 - cos x): m = 1.2172 K T^2 / 20.19."""
+    x = float(sp.nsolve(sp.tan(sp.Symbol("x")) - sp.Symbol("x"), 4.5))
+    assert pytest.approx(-np.sin(x) / x, abs=1e-10) == COMMON_MOTION_SHARE
+    assert (1.0 - np.cos(x), x * x) == (pytest.approx(1.2172, abs=1e-4), pytest.approx(20.19, abs=0.005))
+
+
+@pytest.mark.parametrize(
+    ("alpha", "masses", "delay_ms", "d", "growth_per_s"),
+    [(LAB, (1.0, 0.5, 0.667), 20.0, 0.25, 0.127), (RING, (1.0, 1.0, 1.0), 200.0, 4.0, 0.134)],
+    ids=["lab sheet", "one way"],
+)
+def test_shares_that_are_not_reversible_have_no_bound_and_none_is_given(
+    alpha: Any, masses: Any, delay_ms: float, d: float, growth_per_s: float
+) -> None:
+    """d is above abs(lambda_min) K T for the first; the second has lambda = exp(2 pi j / 3)."""
+    scenario = position_network(alpha, d=d, delay_ms=delay_ms, masses=masses)
+    assert d > 10.0 * delay_ms / 1e3 * abs(np.linalg.eigvals(alpha).real.min()) * (1.0 + 1e-9)
+    assert evaluate_criterion(scenario) is None
+    found = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
+    assert found is not None
+    assert found.s.real == pytest.approx(growth_per_s, abs=1e-3)
+    assert count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
+
+
+def test_of_seven_equal_shares_the_common_motion_asks_for_more_than_their_least_eigenvalue() -> None:
+    """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
+    lacking, enough = (evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44))
+    assert lacking is not None
+    assert enough is not None
+    assert lacking.excess < 0.0 < enough.excess
+    worst = [np.eye(1) * 1.2172 * 10.0 * 0.2**2 / 20.19] * 7
+    below, above = (count_growing(equal(7), worst, 10.0, d, 200) for d in (0.36, 0.44))
+    assert below > 0 == above
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("seed", range(8))
+def test_it_is_the_edge_itself_at_the_worst_mass(count: int, seed: int) -> None:
+    """Within 2 %: heavy arms where abs(lambda_min) is 0.2172 and more, m = 1.2172 K T^2 / 20.19 below."""
+    rng = np.random.default_rng(100 * count + seed)
+    alpha = shares(rng, count, reversible=True) if seed else equal(count)
+    K, ticks = rng.uniform(2.0, 50.0), int(rng.integers(20, 800))
+    scenario = position_network(alpha, K=K, d=0.0, delay_ms=float(ticks))
+    criterion = evaluate_criterion(scenario)
+    assert criterion is not None
+    line, least = -criterion.excess, -np.linalg.eigvals(alpha).real.min()
+    mass = 60.0 if least >= COMMON_MOTION_SHARE else 1.2172 / 20.19
+    worst = [np.eye(1) * mass * K * (ticks * 1e-3) ** 2]
+    assert line == pytest.approx(max(least, COMMON_MOTION_SHARE) * K * ticks * 1e-3, rel=1e-3)
+    modes = np.linalg.eigvals(alpha).real  # of equal arms each is a loop of its own
+    below, above = (
+        sum(count_growing([[a]], worst, K, share * line, ticks) for a in modes) for share in (0.98, 1.02)
+    )
+    assert below > 0 == above
+
+
+def check_network(rng: np.random.Generator) -> bool | None:
+    """Asserts that a random network with damping to spare has no growing root; returns if it had some."""
+    count = int(rng.integers(2, 9))
+    alpha = shares(rng, count, reversible=bool(rng.integers(2)))
+    ticks, K = int(rng.integers(0, 1001)), float(10.0 ** rng.uniform(0.0, 1.5))
+    need = K * max(ticks, 1) * 1e-3 * max(-np.linalg.eigvals(alpha).real.min(), COMMON_MOTION_SHARE)
+    d: Any = need * rng.uniform(0.8, 1.3)
+    K_all: Any = K
+    if count == 2:  # of two sites gains may differ
+        K_all, d = K * rng.uniform(0.5, 2.0, 2), d * rng.uniform(0.5, 2.0, 2)
+    masses = 10.0 ** rng.uniform(-0.5, 0.5, count)
+    criterion = evaluate_criterion(position_network(alpha, K_all, d, float(ticks), masses))
+    if criterion is None:
+        return None
+    inertias = [rods(mass, q2) for mass, q2 in zip(masses, rng.uniform(-3.1, 3.1, count), strict=True)]
+    if criterion.excess > 0.0:
+        assert count_growing(alpha, inertias, K_all, d, max(ticks, 1)) == 0
+    return criterion.excess > 0.0
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 8))])
+def test_it_never_calls_enough_what_grows(seed: int) -> None:
+    """250 networks a seed: 2 to 8 sites, any shares, masses over a decade, delays to 1 s."""
+    rng = np.random.default_rng(seed)
+    found = [check_network(rng) for _ in range(250)]
+    assert found.count(True) > 40
+    assert found.count(False) > 40
+    assert found.count(None) > 40

@@ -1,0 +1,137 @@
+"""Errata 14 to 16 and 9: shares that a port allows, what force reflection needs, a box, coupled hands."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.theory.networks import Network, Wire
+from tests.theory.test_port_absolute import criterion
+from trilat_net.core.control import project_estimate
+from trilat_net.core.dominance import find_balancing_weights
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.describe import lacks_detailed_balance
+from trilat_net.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.theory.frequency_search import build_frequency_grid
+from trilat_net.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights
+from trilat_net.theory.port_response import build_admittance
+
+
+def one_factor(a: float) -> Any:
+    """Dominance by one factor: the first user's share in the slave is a, in the second user 1 - a."""
+    return np.array([[0.0, 1.0 - a, a], [a, 0.0, 1.0 - a], [a, 1.0 - a, 0.0]])
+
+
+def position_exchange(alpha: Any, d: float, masses: Any = (1.0, 1.5, 0.7), delay_s: float = 0.2) -> Network:
+    wires = tuple(
+        Wire(i, j, 10.0 * alpha[i][j], 0.0, delay_s) for i in range(3) for j in range(3) if alpha[i][j]
+    )
+    return Network(tuple(masses), (d,) * 3, (0.0,) * 3, wires)
+
+
+def least_margin(network: Network) -> float:
+    """The least eigenvalue under the best weights from 0.001 to 10 Hz."""
+    Y = build_admittance(network.loop)
+    grid = build_frequency_grid(1e-3, 10.0, 0.2)
+    return float(find_best_weights(Y(grid), np.arange(len(network.m))).margin.min())
+
+
+def test_shares_by_one_factor_are_reversible_at_its_ends_and_in_the_middle() -> None:
+    """Errata 14: a (1 - a)^2 along the circle and a^2 (1 - a) back."""
+    a = sp.Symbol("a")
+    alpha = sp.Matrix([[0, 1 - a, a], [a, 0, 1 - a], [a, 1 - a, 0]])
+    circle = alpha[0, 1] * alpha[1, 2] * alpha[2, 0] - alpha[0, 2] * alpha[2, 1] * alpha[1, 0]
+    assert sorted(sp.solve(circle, a)) == [0, sp.Rational(1, 2), 1]
+    assert {a: find_balancing_weights(one_factor(a)) is not None for a in (0.0, 0.25, 0.5, 0.75, 1.0)} == {
+        0.0: True,
+        0.25: False,
+        0.5: True,
+        0.75: False,
+        1.0: True,
+    }
+
+
+@pytest.mark.parametrize("d", [3.0, 30.0])
+def test_no_damping_makes_a_port_of_irreversible_shares_absolutely_stable(d: float) -> None:
+    """Errata 14: three times and thirty times what reversible shares need."""
+    assert least_margin(position_exchange(one_factor(0.5), d)) > -EIGENVALUE_ROUNDING
+    assert least_margin(position_exchange(one_factor(0.25), d)) < -1e-4 / d
+
+
+@pytest.mark.parametrize("d", [3.0, 30.0])
+def test_operators_that_only_add_mass_make_irreversible_shares_unstable(d: float) -> None:
+    """Errata 14: with w_i w_j a_ij a_ji alike, w = 1 / m, diag(w) alpha has complex eigenvalues."""
+    alpha = one_factor(0.25)
+    p = alpha * alpha.T
+    w = np.array([p[1, 2], p[0, 2], p[0, 1]])
+    assert np.ptp([w[i] * w[j] * p[i, j] for i, j in ((0, 1), (0, 2), (1, 2))]) < 1e-15
+    assert np.abs(np.linalg.eigvals(w[:, None] * alpha).imag).max() > 0.01
+    heavy = 1e5 / w
+    springs = tuple(20.0 * w.max() / w - 10.0)  # w (K + k) is one number
+    network = position_exchange(alpha, d, heavy, 0.0)._replace(k=springs)
+    assert compute_delay_spectrum(network.loop, 1).verdict == "unstable"
+
+
+def test_a_scenario_of_known_gravity_and_irreversible_shares_says_so() -> None:
+    rows: dict[str, Any] = {
+        "dominance.m1": {"m2": 0.75, "s": 0.25},
+        "dominance.m2": {"m1": 0.25, "s": 0.75},
+        "dominance.s": {"m1": 0.25, "m2": 0.75},
+    }
+    known = {"control.Gamma": 0.0, "control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]}
+    assert lacks_detailed_balance(load_scenario("p_d_margin", rows))
+    assert lacks_detailed_balance(load_scenario("free", {**rows, **known}))
+    assert not lacks_detailed_balance(load_scenario("free", rows))  # gravity is learnt
+    assert not lacks_detailed_balance(load_scenario("p_d_margin"))
+
+
+def reflecting(d_m: float, delay_s: float, slave_kg: float = 1.5) -> Network:
+    """A master that feels what pushes its slave: K = 100, d_s = 40, k_f = 1."""
+    wires = (Wire(0, 1, 0.0, 0.0, delay_s, 1.0), Wire(1, 0, 100.0, 0.0, delay_s))
+    return Network((1.0, slave_kg), (d_m, 40.0), (0.0, 0.0), wires)
+
+
+@pytest.mark.parametrize(("delay_s", "least"), [(0.02, 12.1), (0.2, 40.0), (1.0, 360.0)])
+def test_force_reflection_needs_damping_of_its_master_that_grows_with_delay(
+    delay_s: float, least: float
+) -> None:
+    """Errata 15: d_m >= k_f (2 K T + d_s)^2 / (4 d_s), K = 100 and d_s = 40; its edge within 1 %."""
+    assert (2.0 * 100.0 * delay_s + 40.0) ** 2 / 160.0 == pytest.approx(least)
+    assert criterion(reflecting(0.99 * least, delay_s)).below
+    assert not criterion(reflecting(1.01 * least, delay_s)).below
+
+
+def test_the_slave_s_damping_that_lets_the_master_have_least_is_twice_stiffness_times_delay() -> None:
+    """Errata 15: 2 k_f K T, at d_s = 2 K T; and a slave of much mass asks for k_f K M / d_s."""
+    K, T, d_s = sp.symbols("K T d_s", positive=True)
+    bound = (2 * K * T + d_s) ** 2 / (4 * d_s)
+    (best,) = sp.solve(sp.diff(bound, d_s), d_s)
+    assert (best, sp.simplify(bound.subs(d_s, best))) == (2 * K * T, 2 * K * T)
+    assert not criterion(reflecting(1.02 * 40.0, 0.2)).below
+    assert criterion(reflecting(1.02 * 40.0, 0.2, slave_kg=40.0)).below
+
+
+def test_hands_that_are_coupled_to_one_another_are_not_weighed_by_the_weights_of_independent_ones() -> None:
+    """Errata 9: K1 = 100, K2 = 1, 4 d1 d2 = 1.2 (2 T)^2 K1 K2 withstand any two operators.
+
+    Not one who holds both handles with a spring between one and the mirror image of the other.
+    """
+    d = float(np.sqrt(1.2 * 0.2**2 * 100.0))
+    wires = (Wire(0, 1, 100.0, 0.0, 0.2), Wire(1, 0, 1.0, 0.0, 0.2))
+    network = Network((1.0, 1.5), (d, d), (0.0, 0.0), wires)
+    assert not criterion(network).below
+    mirrored = (*wires, Wire(0, 1, -50.0), Wire(1, 0, -50.0))  # -50 (q1 + q2) on each, with the springs below
+    heavy = Network((1e4, 1e4 * 51.0 / 150.0), (d, d), (100.0, 100.0), mirrored)
+    assert compute_delay_spectrum(heavy.loop, 1).verdict == "unstable"
+
+
+@given(st.tuples(*[st.floats(-10.0, 10.0)] * 4))
+def test_a_clip_brings_no_estimate_further_from_a_truth_in_the_box_or_at_its_edge(some: Any) -> None:
+    """Errata 16: V of the estimates does not rise."""
+    estimate, (low, theta, high) = some[0], sorted(some[1:])
+    for truth in (low, theta, high):
+        after = project_estimate((estimate,) * 5, (low,) * 5, (high,) * 5)[0]
+        assert abs(after - truth) <= abs(estimate - truth)
