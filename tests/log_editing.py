@@ -42,7 +42,7 @@ def edited(
     session: Mapping[str, str] | None = None,
     chunk_bytes: int = 1 << 20,
 ) -> bytes:
-    """Writes a log again, changed.
+    """Writes a log again, changed, as a program did that knew no digest chain.
 
     Args:
         data: the log.
@@ -56,6 +56,8 @@ def edited(
     writer = Writer(stream, chunk_size=chunk_bytes)
     writer.start()
     metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
+    metadata.pop("trilat.chain", None)
+    metadata["trilat.session"].pop("digest_chain", None)
     metadata["trilat.session"].update(session or {})
     writer.add_metadata("trilat.session", metadata.pop("trilat.session"))
     for attachment in reader.iter_attachments():

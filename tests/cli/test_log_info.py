@@ -74,7 +74,7 @@ def test_info_of_a_log_that_cannot_be_opened_says_why_and_tells_the_rest(tmp_pat
 
 def test_a_sound_log_passes_every_check(tmp_path: Path) -> None:
     text = trilat("log", "check", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
-    assert [line.split()[0] for line in text.splitlines()] == ["ok"] * 10
+    assert [line.split()[0] for line in text.splitlines()] == ["ok"] * 11
 
 
 def test_a_log_that_lacks_records_fails_and_names_them(tmp_path: Path) -> None:
@@ -118,10 +118,13 @@ def test_verify_names_every_gap_and_goes_on_behind_it(tmp_path: Path) -> None:
     lost = {3 * n for n in range(10, 30)}
     path = written(tmp_path, edited(WHOLE, record=without("m2", lost)))
     done = trilat("verify", path, cwd=tmp_path)
-    assert done.code == 0, done
+    assert done.code == 1, done  # nothing differs, and too much is missing
     assert f"m2 {', '.join(map(str, sorted(lost)))}" in done.out
     facts = json.loads(trilat("verify", "--json", path, cwd=tmp_path).out)
-    assert facts["passed"]
+    assert not facts["passed"]
+    assert facts["first_difference"] is None
+    assert facts["coverage"] == facts["judged"]["m2"][0] / 120
+    assert facts["integrity"] == "changed"  # no account tells of these gaps
     assert facts["gaps"] == [{"site": "m2", "first": n, "last": n} for n in sorted(lost)]
     assert facts["records"] == 360 - len(lost)
     assert facts["identical"] + facts["unjudged"] == facts["records"]

@@ -92,11 +92,15 @@ def test_a_torn_log_is_verified_as_far_as_it_is_whole_and_says_so(tmp_path: Path
     records = sum(len(open_log(path)[name]) for name in ("m1", "m2", "s"))
     assert 0 < records < 6000
     done = trilat("verify", path, cwd=tmp_path)
-    assert done.code == 0, done
-    assert "the file was not finished" in done.out
+    assert done.code == 1, done
+    assert f"records: {records}/6000 in the file" in done.err
+    assert "the file was not finished" in done.err
+    assert "less than 99.9 %" in done.err
     assert f"{records}/{records} records identical" in done.out
     assert done.err.startswith("note: "), done
     assert f"trilat log recover {path}" in done.err
+    assert trilat("verify", path, "--min-coverage", "0.3", cwd=tmp_path).code == 0
+    trilat("verify", path, "--min-coverage", "2", cwd=tmp_path).refuses("--min-coverage", "from 0 to 1")
 
 
 def test_a_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path, short_log: bytes) -> None:

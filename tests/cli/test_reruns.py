@@ -50,7 +50,7 @@ def test_the_outcome_is_a_log_that_every_command_reads(log_file: Path) -> None:
     assert "again.mcap" in trilat("rerun", log_file, *options, cwd=cwd).succeeds()
     assert open_log(cwd / "again.mcap").driver == "rerun"
     text = trilat("verify", "again.mcap", "--virtual", cwd=cwd).succeeds()
-    assert "500/500 records identical" in text
+    assert "1500/1500 records identical" in text
     assert "m1 and m2 stand as recorded" in text
     trilat("rerun", log_file, *options, cwd=cwd).refuses("again.mcap", "--force")
     trilat("rerun", log_file, *options, "--force", cwd=cwd).succeeds()

@@ -45,7 +45,7 @@ def test_behind_a_gap_it_goes_on_from_its_memory(session: dict[str, str] | None)
     """As much can be judged as of a law of ours."""
     verdict = verify(without_records({"s": range(50, 61)}, own(), session))
     assert verdict.gaps == [("s", 50, 60)]
-    assert verdict.passed
+    assert verdict.agreed
     ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
     assert verdict.identical > 3 * TICKS - 50
@@ -152,7 +152,7 @@ def test_a_law_that_fails_ends_the_run_with_a_finished_log_that_says_why(how: st
     assert [event.text for event in log.events if event.kind == "failed"] == [text]
     assert {event.member: event.ticks for event in log.events if event.kind == "end"}["s"] == at
     verdict = verify(log)
-    assert verdict.passed
+    assert verdict.agreed
     assert verdict.identical == 3 * at + 2
     assert compare_with_virtual(log).fed.first is None
 
@@ -175,7 +175,7 @@ def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | Non
     log = opened(edited(external_log(), session=session))
     assert log["s"].q[50].tolist() == [0.5, -0.3]
     verdict = verify(log)
-    assert verdict.passed
+    assert verdict.agreed
     assert verdict.identical == 2 * TICKS
     twins = compare_with_virtual(log)
     assert twins.fed.identical == 2 * TICKS
@@ -185,7 +185,7 @@ def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | Non
 def test_an_arm_outside_is_executed_behind_a_gap_too() -> None:
     """As much can be judged as of an arm of ours."""
     verdict = verify(without_records({"s": range(40, 45)}, external_log()))
-    assert verdict.passed
+    assert verdict.agreed
     ours = verify(without_records({"s": range(40, 45)}, recorded("two_sites", SHORT)))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 

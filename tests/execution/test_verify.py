@@ -187,7 +187,7 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
 )
 def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[int]) -> None:
     verdict = verify(without_records({site: lost}))
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
     assert verdict.records == 3 * TICKS - len(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
@@ -199,7 +199,7 @@ def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[
 @pytest.mark.parametrize("first", [TICKS - 1, TICKS - 10])
 def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
     verdict = verify(without_records({site: range(first, TICKS)}))
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, TICKS - 1)]
 
 
@@ -212,7 +212,7 @@ def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
 def test_gaps_are_never_a_false_alarm(site: str, holes: list[tuple[int, int]], whole_run: bool) -> None:
     lost = {t for start, length in holes for t in range(start, start + length) if t < TICKS - 1}
     verdict = verify(without_records({site: lost}, session={} if whole_run else OTHER_PLATFORM))
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == ranges(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
 
@@ -234,7 +234,7 @@ def test_gaps_where_samples_come_late_or_never_are_no_false_alarm(
     """On links that keep their order, as those of a session do."""
     data = delivered(first_in_first_out(delays), never)
     verdict = verify(without_records(lost, data, {} if whole_run else OTHER_PLATFORM))
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert {gap[0] for gap in verdict.gaps} == set(lost)
 
 
@@ -243,7 +243,7 @@ def test_a_gap_among_reordered_samples_is_no_false_alarm() -> None:
     delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
     data = delivered(delays)
     verdict = verify(opened(edited(data, record=without("m2", {50}))))
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
 
 
 def test_a_change_behind_a_gap_is_still_found() -> None:
@@ -267,7 +267,7 @@ def test_on_another_platform_each_tick_follows_from_the_two_before_it(name: str)
     data = recorded(name, {"duration_s": 0.5})
     verdict = verify(opened(edited(data, session=OTHER_PLATFORM)))
     assert not verdict.whole_run
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records
 
 
@@ -295,6 +295,6 @@ def test_a_torn_log_is_verified_as_far_as_it_is_whole(share: float) -> None:
     log = opened(data[: int(share * len(data))])
     assert not log.complete
     verdict = verify(log)
-    assert verdict.passed, str(verdict.first)
+    assert verdict.agreed, str(verdict.first)
     assert 0 < verdict.identical + verdict.unjudged == verdict.records < 3 * TICKS
     assert verdict.unjudged <= 3

@@ -67,6 +67,7 @@ def a_file(
     writer = Writer(stream)
     writer.start()
     (head,) = (entry.metadata for entry in reader.iter_metadata() if entry.name == "trilat.session")
+    head.pop("digest_chain", None)
     writer.add_metadata("trilat.session", {**head, **(session or {})})
     if part:
         writer.add_metadata("trilat.part", {"index": str(part), "previous": ""})

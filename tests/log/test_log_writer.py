@@ -94,13 +94,14 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
         return
     assert sorted(tmp_path.iterdir()) == [part_path(path, n) for n in range(1, len(parts) + 1)]
     found: list[Message] = []
-    previous = ""
+    previous = digest = ""
     for number, part in sorted(parts.items()):
         own, metadata = read(part)
         found += own
         assert metadata["trilat.session"]["session"] == "t"
-        assert metadata["trilat.part"] == {"index": str(number), "previous": previous}
-        previous = part.name
+        follows = {"previous_records": digest} if digest else {}
+        assert metadata["trilat.part"] == {"index": str(number), "previous": previous, **follows}
+        previous, digest = part.name, metadata["trilat.chain"]["records"]
         last = number == len(parts)
         assert metadata["trilat.accounts"] == ({"in all": str(len(messages))} if last else {"so far": "yes"})
         if size is not None:

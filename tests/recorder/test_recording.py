@@ -206,7 +206,7 @@ def test_a_crash_leaves_all_that_was_flushed() -> None:
     assert not log.complete
     assert log.accounts == {}
     assert [state.tick for state in log["m"].states][:30] == list(range(30))
-    assert verify(log).passed
+    assert verify(log).agreed
 
 
 def test_what_still_waits_at_the_end_is_written() -> None:
@@ -257,7 +257,7 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
     log = open_log(tmp_path / "run.mcap")
     assert log.complete
     assert 30 <= len(log["m"]) < TICKS
-    assert verify(log).passed
+    assert verify(log).agreed
 
 
 def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) -> None:

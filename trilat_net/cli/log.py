@@ -114,6 +114,10 @@ def _recovery_json(result: "Recovery") -> dict[str, object]:
         "lost_bytes": result.lost_bytes,
         "lost": result.lost,
         "missing": result.missing,
+        "coverage": {
+            site: {"records": there, "ticks": ticks} for site, (there, ticks) in result.coverage.items()
+        },
+        "digest_chain": str(result.chain) or None,
     }
 
 
@@ -123,6 +127,8 @@ def _print_recovery(result: "Recovery") -> None:
     rows = []
     if result.sites:
         rows.append(("records", ", ".join(f"{site} {count}" for site, count in result.sites.items())))
+        rows.append(("of the run", "; ".join(result.coverage_texts())))
+        rows.append(("source", f"digest chain {result.chain}"))
     rows.append(("messages", f"{result.messages} in {result.duration_s:.3f} s"))
     for name, lines in (("lost", result.lost), ("missing", result.missing)):
         rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]

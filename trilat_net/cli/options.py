@@ -110,6 +110,26 @@ LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
 NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")]
+
+
+def check_coverage(value: float) -> float:
+    """Refuses a share that is none."""
+    if not 0.0 <= value <= 1.0:
+        raise UsageError(f"--min-coverage is a share from 0 to 1, not {value:g}")
+    return value
+
+
+MinCoverageOption = Annotated[
+    float,
+    typer.Option(
+        "--min-coverage",
+        metavar="SHARE",
+        help="Least share of every site's ticks that must be judged to pass.",
+        callback=check_coverage,
+    ),
+]
+MIN_COVERAGE = 0.999
+"""As in `log.integrity`, which takes long to import."""
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 

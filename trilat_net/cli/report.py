@@ -26,5 +26,5 @@ def report_command(
     with terminal.progress_bar("drawing") as progress:
         conclusion = conclude(log, results, progress)
     terminal.print_conclusion(conclusion)
-    if not conclusion.agreed:
+    if not conclusion.passed:
         raise typer.Exit(1)

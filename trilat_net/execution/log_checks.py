@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from ..errors import ScenarioError
+from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from .verify import VerifyResult, find_executed_sites, find_user_laws, verify
@@ -24,8 +25,6 @@ class CheckLine(NamedTuple):
 
 MAX_GAPS_NAMED = 60
 """Gaps that a line names."""
-RECORDS_LABEL = "records"
-"""Label of the line with the number of records."""
 
 
 class LogCheckReport(NamedTuple):
@@ -36,7 +35,7 @@ class LogCheckReport(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """True if every execution agreed with the log, complete or not."""
+        """True if the log is as it was made, enough of it was judged, and every execution agreed with it."""
         return all(line.passed for line in self.lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -49,6 +48,10 @@ class LogCheckReport(NamedTuple):
             "identical": result.identical,
             "differing": result.differing,
             "unjudged": result.unjudged,
+            "coverage": result.coverage.share,
+            "min_coverage": result.min_coverage,
+            "judged": {site: [result.judged.get(site, 0), n] for site, n in result.expected.items()},
+            "integrity": result.integrity.state.name.lower(),
             "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
             "first_difference": None
             if first is None
@@ -57,29 +60,28 @@ class LogCheckReport(NamedTuple):
         }
 
 
-def run_log_checks(log: Log, *, virtual: bool, progress: Progress | None = None) -> LogCheckReport:
+def run_log_checks(
+    log: Log, *, virtual: bool, progress: Progress | None = None, min_coverage: float = MIN_COVERAGE
+) -> LogCheckReport:
     """Executes a log again, and compares it with virtual time if `virtual` is set.
 
-    An incomplete log is reported and does not fail: its execution shows nothing wrong.
+    A log of which too little can be judged fails, though its execution shows nothing wrong.
 
     Raises:
         LogError: a record cannot be read.
         ScenarioError: the file of a user law does not exist.
     """
-    result = verify(log, progress)
-    lines = list(_checks(log, result, virtual=virtual, progress=progress))
-    return LogCheckReport(
-        result, [line._replace(passed=True) if line.label == RECORDS_LABEL else line for line in lines]
-    )
+    result = verify(log, progress, min_coverage=min_coverage)
+    return LogCheckReport(result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 
-def check_log_files(sources: Sequence[str]) -> list[CheckLine]:
+def check_log_files(sources: Sequence[str], min_coverage: float = MIN_COVERAGE) -> list[CheckLine]:
     """Returns a line per check of a log in files; a user law whose file does not exist fails one."""
     log = open_log(*sources)
     try:
-        return list(_checks(log, verify(log), virtual=True))
+        return run_log_checks(log, virtual=True, min_coverage=min_coverage).lines
     except ScenarioError as error:
-        return [_records_line(log), CheckLine("executed again", f"cannot be: {error}", False)]
+        return [CheckLine("executed again", f"cannot be: {error}", False)]
 
 
 def _checks(
@@ -87,7 +89,8 @@ def _checks(
 ) -> Iterator[CheckLine]:
     others = [name for name in log.sites if name not in find_executed_sites(log)]  # of an open-loop rerun
     recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
-    yield _records_line(log)
+    yield _records_line(log, result)
+    yield CheckLine("integrity", result.integrity.text, result.integrity.passed)
     yield from (CheckLine("user law", str(law), True) for law in find_user_laws(log.scenario))
     yield _verify_line(result, recorded)
     if log.session.get("scenario_sha256") != log.scenario_sha256:
@@ -96,31 +99,33 @@ def _checks(
         yield CheckLine("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
     elif virtual:
         twins = compare_with_virtual(log, progress)
-        yield _virtual_line("virtual time fed with the log's arrivals", twins.fed, None)
+        gap = min((first for _, first, _ in result.gaps), default=None)  # what arrived there is unknown
+        yield _virtual_line("virtual time fed with the log's arrivals", twins.fed, gap)
         why = "a link was measured, not modelled" if log.scenario.measured else ""
         why = "an arm was external" if log.scenario.external else why
         if why and log.driver != "virtual":
             yield CheckLine("plain virtual time", f"is another run: {why}", True)
             return
         late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
-        yield _virtual_line(
-            f"plain virtual time ({late})", twins.plain, twins.late[0].due_tick if twins.late else None
-        )
+        lost = f"; {len(twins.lost)} lost on the way, the first: {twins.lost[0]}" if twins.lost else ""
+        yield _virtual_line(f"plain virtual time ({late}{lost})", twins.plain, twins.excused_from)
 
 
-def _records_line(log: Log) -> CheckLine:
+def _records_line(log: Log, result: VerifyResult) -> CheckLine:
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
     have = sum(len(log[name]) for name in log.sites)
-    want = sum(made.get(name, 0) for name in log.sites)
     silent = [name for name in log.sites if name not in made]
-    text = f"{have}/{want} in the file" if not silent else f"{have} in the file"
+    text = (
+        f"{have}/{sum(result.expected.values())} in the file; {result.coverage.describe(result.min_coverage)}"
+    )
     if silent:
         text += f"; {', '.join(silent)} did not report the number of its ticks"
     if log.damaged:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    return CheckLine(RECORDS_LABEL, text, not silent and have == want and log.complete)
+    passed = result.coverage.share >= result.min_coverage and not log.damaged
+    return CheckLine("records", text, passed)
 
 
 def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
@@ -129,14 +134,16 @@ def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
     if result.gaps:
         text += f"; no records of {_gaps_text(result.gaps)}"
     if recorded:
-        text += f"; {recorded} as recorded, against other samples than the file has"
+        text += f"; {recorded} as recorded"
+        if result.coverage.share < result.min_coverage:
+            text += ", not judged: the log that the rerun was made of is not beside it"
     if result.unjudged:
         text += f"; {result.unjudged} behind gaps could not be judged"
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
     if not result.records:
         return CheckLine("executed again", "no records to execute", False)
-    return CheckLine("executed again", text, result.passed)
+    return CheckLine("executed again", text, result.agreed)
 
 
 def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
@@ -152,11 +159,11 @@ def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
     return "; ".join(texts) + more
 
 
-def _virtual_line(label: str, comparison: RecordComparison, late_from: int | None) -> CheckLine:
-    """Excuses a difference only from the tick at which the first late sample was due."""
+def _virtual_line(label: str, comparison: RecordComparison, excused_from: int | None) -> CheckLine:
+    """Excuses a difference only from the tick at which the first late or lost sample was due."""
     first = comparison.first
     text = f"{comparison.identical}/{comparison.records} records identical"
     if first is None:
         return CheckLine(label, text, True)
-    excused = late_from is not None and first.tick >= late_from
+    excused = excused_from is not None and first.tick >= excused_from
     return CheckLine(label, f"{text}; the first that differs: {first}", excused)

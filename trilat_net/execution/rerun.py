@@ -39,11 +39,9 @@ from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
 from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry, describe_accounts
-from .verify import EXECUTED_SITES_KEY, find_executed_sites, find_user_laws
+from .verify import EXECUTED_SITES_KEY, RERUN_DRIVER, find_executed_sites, find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
-
-RERUN_DRIVER = "rerun"
 
 
 class LogAndRerun(NamedTuple):

@@ -7,16 +7,29 @@ resumes after it from two consecutive records, and records that cannot be judged
 reported as differences.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
+from pathlib import Path
 from typing import NamedTuple
+
+import msgspec
 
 from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.site_step import MAX_CHANGES, Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
-from ..log.log_reader import Log
+from ..log.integrity import (
+    MIN_COVERAGE,
+    NOT_JUDGED,
+    Coverage,
+    Integrity,
+    count_expected_ticks,
+    judge_integrity,
+)
+from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..net.messages import State
@@ -42,6 +55,9 @@ class VerifyResult:
         unjudged: records behind gaps that could not be judged.
         first: the first difference, by tick and then by site.
         gaps: missing ticks: (site, first, last).
+        judged, expected: ticks by site: those that were executed and compared, and those of the run.
+        min_coverage: the least share of them that passes.
+        integrity: whether the log is as it was made.
     """
 
     whole_run: bool
@@ -51,11 +67,35 @@ class VerifyResult:
     differing: int = 0
     first: RecordDifference | None = None
     gaps: list[tuple[str, int, int]] = field(default_factory=list)
+    judged: dict[str, int] = field(default_factory=dict)
+    expected: dict[str, int] = field(default_factory=dict)
+    min_coverage: float = MIN_COVERAGE
+    integrity: Integrity = NOT_JUDGED
+
+    @property
+    def agreed(self) -> bool:
+        """True if no record differs, however few were judged."""
+        return self.first is None
+
+    @property
+    def coverage(self) -> Coverage:
+        """How much of the run was judged."""
+        return Coverage(self.judged, self.expected)
 
     @property
     def passed(self) -> bool:
-        """True if no record differs."""
-        return self.first is None
+        """True if no record differs, enough of the run was judged, and the log is as it was made."""
+        return self.agreed and self.coverage.share >= self.min_coverage and self.integrity.passed
+
+    def add(self, other: "VerifyResult") -> None:
+        """Adds the result of other sites, which were executed from another log."""
+        for name in ("records", "identical", "unjudged", "differing", "gaps"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.whole_run &= other.whole_run
+        self.judged |= other.judged
+        self.first = self.first or other.first
+        if not other.integrity.passed:
+            self.integrity = other.integrity
 
     def add_difference(self, difference: RecordDifference) -> None:
         """Counts a record that differs."""
@@ -130,6 +170,15 @@ class SiteVerifier:
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
+        result, name = self._result, self._log.name
+        before = result.records - result.unjudged
+        last = self._run(report)
+        result.judged[name] = result.records - result.unjudged - before
+        if last < self._own_end:
+            result.gaps.append((name, last + 1, self._own_end))
+
+    def _run(self, report: Callable[[int], None] | None) -> int:
+        """Executes every record; returns the last tick that has one, or -1."""
         result, states, name = self._result, self._log.states, self._log.name
         expected = 0
         for n, state in enumerate(states):
@@ -151,17 +200,26 @@ class SiteVerifier:
                     self._certain = True
                 if self._certain and not self._law_failed:
                     self._verify_record(n, state)
+                elif other := self._find_other_sender(state):
+                    result.add_difference(other)
                 else:
                     result.unjudged += 1
             except LawFailed as failed:
                 self._law_failed = True
                 result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
-        if expected <= self._own_end:
-            result.gaps.append((name, expected, self._own_end))
+        return expected - 1
+
+    def _find_other_sender(self, state: State) -> RecordDifference | None:
+        """Returns the difference of a record that another start, or another site, made; else None."""
+        name = self._log.name
+        if state.boot != (boot := self._log.states[0].boot):
+            return RecordDifference(name, state.tick, "boot", state.boot, boot)
+        return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
 
     def _verify_record(self, n: int, state: State) -> None:
         """Executes the tick of record n and compares the result with the record."""
         result, states, peers = self._result, self._log.states, self._log.peers
+        difference = self._find_other_sender(state)
         if not result.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
             self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
         arrivals, missing = self._inputs.arrivals(state.rx)
@@ -175,13 +233,7 @@ class SiteVerifier:
         output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
-        difference = invalid_change or invalid
-        for name, found, expected in (
-            ("boot", state.boot, states[0].boot),
-            ("site", state.site, self._log.name),
-        ):
-            if difference is None and found != expected:
-                difference = RecordDifference(self._log.name, state.tick, name, found, expected)
+        difference = invalid_change or invalid or difference
         if difference is None and not equal_record(state, output, peers):
             difference = find_first_difference(state, output, peers, self._equal)
             if difference is not None and self._inputs.in_doubt(state, output):
@@ -218,26 +270,78 @@ class SiteVerifier:
 
 EXECUTED_SITES_KEY = "rerun_executed"
 """Entry of the session's metadata in a log that a rerun wrote: the sites that it executed."""
+RERUN_DRIVER = "rerun"
+"""Driver of such a log."""
 
 
-def verify(log: Log, progress: Progress | None = None) -> VerifyResult:
+def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = MIN_COVERAGE) -> VerifyResult:
     """Executes every site of a log again; `progress` gets the records done and their total.
+
+    Args:
+        log: the log.
+        progress: called now and then.
+        min_coverage: the least share of every site's ticks that must be judged to pass.
 
     Raises:
         LogError: a record cannot be read.
         ScenarioError: the file of a user law does not exist.
     """
-    result = VerifyResult(whole_run=log.session.get("fingerprint") == compute_fingerprint())
+    result = _begin(log, min_coverage)
     with process.pause_gc():
-        by_tick = {name: log[name].by_tick for name in log.sites}
-        ends = find_last_ticks(log)
         sites = find_executed_sites(log)
         total = sum(len(log[name]) for name in sites)
-        report = None if progress is None else lambda done: progress(done, total)
-        for name in sites:
-            verifier = SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, ends, result)
-            verifier.run(report)
+        _execute_sites(log, sites, result, None if progress is None else lambda done: progress(done, total))
+        others = [name for name in log.sites if name not in sites]
+        if others and (source := open_rerun_source(log)) is not None:
+            for name in others:
+                _compare_with_source(log[name], source[name], result)
+            theirs = _begin(source, min_coverage)
+            _execute_sites(source, [name for name in find_executed_sites(source) if name in others], theirs)
+            result.add(theirs)
     return result
+
+
+def _begin(log: Log, min_coverage: float) -> VerifyResult:
+    return VerifyResult(
+        whole_run=log.session.get("fingerprint") == compute_fingerprint(),
+        expected=count_expected_ticks(log),
+        min_coverage=min_coverage,
+        integrity=judge_integrity(log),
+    )
+
+
+def _execute_sites(
+    log: Log, sites: Sequence[str], result: VerifyResult, report: Callable[[int], None] | None = None
+) -> None:
+    by_tick = {name: log[name].by_tick for name in log.sites}
+    ends = find_last_ticks(log)
+    for name in sites:
+        SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, ends, result).run(report)
+
+
+def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
+    """Compares the records that an open-loop rerun took over with those of its log."""
+    if recorded.payloads == source.payloads:
+        return
+    for ours, theirs in zip_longest(recorded.states, source.states):
+        if ours is None or theirs is None or ours != msgspec.structs.replace(theirs, v=ours.v):
+            tick = (ours or theirs).tick
+            result.add_difference(RecordDifference(recorded.name, tick, "record", "here", "in its log"))
+            return
+
+
+def open_rerun_source(log: Log) -> Log | None:
+    """Returns the log that a rerun was made of, if it stands beside it and is the same file; else None."""
+    names, digests = (log.session.get(key, "").split() for key in ("rerun_of", "rerun_of_sha256"))
+    files = [Path(log.sources[0]).with_name(Path(name).name) for name in names]
+    if not files or len(files) != len(digests) or not all(map(Path.is_file, files)):
+        return None
+    for path, digest in zip(files, digests, strict=True):
+        with path.open("rb") as stream:
+            if hashlib.file_digest(stream, "sha256").hexdigest() != digest:
+                return None
+    source = open_log(*files)
+    return source if source.sites == log.sites else None
 
 
 def find_executed_sites(log: Log) -> tuple[str, ...]:
@@ -246,7 +350,7 @@ def find_executed_sites(log: Log) -> tuple[str, ...]:
     All of them, except in an open-loop rerun: the records of its other sites were made against sites that the
     file does not hold.
     """
-    named = log.session.get(EXECUTED_SITES_KEY)
+    named = log.session.get(EXECUTED_SITES_KEY) if log.driver == RERUN_DRIVER else None
     return tuple(name for name in log.sites if named is None or name in named.split())
 
 

@@ -1,20 +1,23 @@
 """Compares a log with virtual time and finds the samples that arrived late.
 
 Invariant (L2): virtual time fed with a log's arrivals equals that log on every tick, always; plain virtual
-time equals it until the first sample arrives after its due tick.
+time equals it until the first sample arrives after its due tick, or is lost on the way.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
 from .. import process
 from ..core.site_step import Site
-from ..core.ticks import PlantState, TickRecord
-from ..errors import LawFailed
+from ..core.ticks import NS_PER_S, PlantState, TickRecord
+from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
 from .difference import (
@@ -24,8 +27,9 @@ from .difference import (
     equal_record,
     find_first_difference,
 )
+from .resumption import ArrivalEntry
 from .verify import find_last_ticks
-from .virtual_network import Network, RecordedNetwork
+from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 
 class RecordComparison(NamedTuple):
@@ -37,19 +41,20 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """A sample of a peer that arrived at a site after it was due; the last two are the site's ticks."""
+    """A sample of a peer that was not at a site when it was due; the last two are the site's ticks.
+
+    A sample that was lost on the way, not by its link's model, has no `arrived_tick`.
+    """
 
     site: str
     peer: str
     tick: int
     due_tick: int
-    arrived_tick: int
+    arrived_tick: int | None
 
     def __str__(self) -> str:
-        return (
-            f"sample {self.tick} of {self.peer} was due at tick {self.due_tick} of {self.site} "
-            f"and came at tick {self.arrived_tick}"
-        )
+        how = "never came" if self.arrived_tick is None else f"came at tick {self.arrived_tick}"
+        return f"sample {self.tick} of {self.peer} was due at tick {self.due_tick} of {self.site} and {how}"
 
 
 def compare_records(
@@ -83,22 +88,49 @@ def compare_records(
 
 def find_late_samples(log: Log) -> list[LateSample]:
     """Returns every sample that arrived after it was due, by the tick at which it was due."""
-    late = []
+    return [sample for sample in _find_absent_samples(log) if sample.arrived_tick is not None]
+
+
+def _find_absent_samples(log: Log) -> list[LateSample]:
+    """Returns every sample that was not there when it was due, by the tick at which it was due.
+
+    One that never came counts as lost if a record at that tick, or after it, still has an older one in use.
+    """
+    ends, absent = find_last_ticks(log), []
     for name in log.sites:
         site = Site(log.scenario.setup(name)._replace(own=None))  # only its links matter: no law runs
-        ordered = log.commands(name)
-        for state in log[name].states:
+        part, ordered = log[name], log.commands(name)
+        came: list[set[int]] = [set() for _ in part.peers]
+        for state in part.states:
+            for peer, tick, _ in state.rx:
+                if 0 <= peer < len(came):
+                    came[peer].add(tick)
+        asked = [0] * len(part.peers)
+        for state in part.states:
             for command in ordered.get(state.tick, ()):
                 site.order(command)
             for peer, tick, _ in state.rx:
                 due = site.release_tick(peer, tick)
                 if due is not None and due < state.tick and not site.measures(peer):
-                    late.append(LateSample(name, site.peers[peer], tick, due, state.tick))
-    return sorted(late, key=lambda sample: sample.due_tick)
+                    absent.append(LateSample(name, site.peers[peer], tick, due, state.tick))
+            for j, sender in enumerate(part.peers):
+                sent = min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, ends[sender]) + 1
+                for tick in range(asked[j], sent):
+                    due = None if tick in came[j] or site.measures(j) else site.release_tick(j, tick)
+                    if due is not None and _is_shown_absent(part, sender, tick, due):
+                        absent.append(LateSample(name, sender, tick, due, None))
+                asked[j] = max(asked[j], sent)
+    return sorted(absent, key=lambda sample: sample.due_tick)
+
+
+def _is_shown_absent(part: SiteLog, peer: str, tick: int, due_tick: int) -> bool:
+    """True if the first record from the due tick of a sample on has an older one in use."""
+    place = int(np.searchsorted(part.tick, due_tick))
+    return place < len(part) and int(part.used[peer][place]) < tick
 
 
 class VirtualComparison(NamedTuple):
-    """A log against virtual time: always equal if fed with its arrivals, else until the first late sample.
+    """A log against virtual time: equal if fed with its arrivals, else until the first late or lost sample.
 
     The plain one is empty if an arm is external: there is no such run.
     """
@@ -106,6 +138,12 @@ class VirtualComparison(NamedTuple):
     fed: RecordComparison
     plain: RecordComparison
     late: list[LateSample]
+    lost: list[LateSample]
+
+    @property
+    def excused_from(self) -> int | None:
+        """The tick from which plain virtual time may differ; None if every sample was there in time."""
+        return min((sample.due_tick for sample in (*self.late[:1], *self.lost[:1])), default=None)
 
 
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
@@ -129,13 +167,24 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
                     progress(before + n, total)
                 yield site.name, output
 
-        recorded = RecordedNetwork({name: {s.tick: s.rx for s in states[name]} for name in states}, peers)
+        recorded = RecordedNetwork({name: _complete_arrivals(log, name, ends) for name in states}, peers)
         fed = compare_records(log, execute(recorded, 0), arrivals=True)
         if arms:
             plain = RecordComparison(0, 0, None)
         else:
             plain = compare_records(log, execute(None, total // 2), arrivals=False)
-        return VirtualComparison(fed, plain, find_late_samples(log))
+        absent = _find_absent_samples(log)
+        late = [sample for sample in absent if sample.arrived_tick is not None]
+        return VirtualComparison(fed, plain, late, [one for one in absent if one.arrived_tick is None])
+
+
+def _complete_arrivals(log: Log, name: str, ends: Mapping[str, int]) -> Mapping[int, Sequence[ArrivalEntry]]:
+    """Returns the arrivals of a site by tick; in gaps those that are assumed, if not too much is missing."""
+    part = log[name]
+    rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
+    with suppress(LogError):
+        return complete_deliveries(part, rates_hz, [ends[peer] for peer in part.peers]).at
+    return {state.tick: state.rx for state in part.states}
 
 
 def _recorded_scenario(log: Log) -> Scenario:

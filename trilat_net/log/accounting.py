@@ -203,12 +203,20 @@ class SessionAccounts:
         rates_hz: tick rate of every site, in scenario order.
         continued: True for a later part of a log, which is counted from its first message on.
         events: True if events have numbers.
+        ticks: ticks of every site in the whole run, for `run_coverage`.
     """
 
     def __init__(
-        self, session: str, rates_hz: Mapping[str, int], *, continued: bool = False, events: bool = True
+        self,
+        session: str,
+        rates_hz: Mapping[str, int],
+        *,
+        continued: bool = False,
+        events: bool = True,
+        ticks: Mapping[str, int] | None = None,
     ) -> None:
         self._session, self._rates_hz, self._continued = session, rates_hz, continued
+        self._ticks = dict(ticks or {})
         self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
         self._bases: dict[str, int] = {}
@@ -244,6 +252,8 @@ class SessionAccounts:
             return
         if event.kind == "end" and event.member in self._rates_hz and 0 <= event.ticks < 1 << 32:
             self.expect(event.member, event.ticks)
+            if event.member in self._ticks:
+                self._ticks[event.member] = min(event.ticks, self._ticks[event.member])
 
     def expect(self, site: str, ticks: int) -> None:
         """Counts as missing what a site published in so many ticks and is not there."""
@@ -267,6 +277,11 @@ class SessionAccounts:
         """Returns the number of records per site."""
         accounts = {site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz}
         return {site: account.received for site, account in accounts.items() if account is not None}
+
+    def run_coverage(self) -> dict[str, tuple[int, int]]:
+        """Returns per site the records that are there, and the ticks that it made, else those of the run."""
+        there = self.records()
+        return {site: (there[site], ticks) for site, ticks in self._ticks.items() if site in there}
 
     def missing(self) -> Iterator[str]:
         """Yields a text per site that lacks records."""
@@ -294,4 +309,5 @@ def open_session_accounts(
         {name: site.rate_hz for name, site in scenario.sites.items()},
         continued=metadata.get(PART, {}).get("index", "1") != "1",
         events=version >= EVENTS_NUMBERED_SINCE,
+        ticks={name: scenario.ticks(name) for name in scenario.names},
     )

@@ -40,7 +40,8 @@ from .data_tables import (
     build_state_table,
     to_data_frame,
 )
-from .log_layout import ACCOUNTS, describe_unfinished
+from .digest_chain import ChainState
+from .log_layout import ACCOUNTS, PART, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
 from .site_log import MessageTimes, SiteLog, TimedMessages
@@ -139,6 +140,17 @@ class Log:
         lacks = any(name not in ticks or self.missing(name) for name in self.sites)
         return self._contents.ended and not lacks
 
+    @property
+    def part(self) -> int:
+        """Its number among the parts of a log; 0 of several parts, and of a log without parts."""
+        number = self._contents.metadata.get(PART, {}).get("index", "0")
+        return int(number) if len(self.sources) == 1 and number.isdecimal() and len(number) < 10 else 0
+
+    @property
+    def chain(self) -> tuple[ChainState, str]:
+        """Agreement with the digest chain of its files, the worst of several, and a sentence for it."""
+        return self._contents.chain
+
     @cached_property
     def accounts(self) -> dict[str, str]:
         """Per topic what arrived and what is missing, as written at the end; {} in a torn file.
@@ -174,6 +186,20 @@ class Log:
         most = {name: self.scenario.ticks(name) for name in self.sites}
         ends = [event for event in self.events if event.kind == "end" and event.member in most]
         return {event.member: min(max(event.ticks, 0), most[event.member]) for event in ends}
+
+    def expected_ticks(self, site: str) -> int:
+        """Returns how many ticks of a site belong to the run.
+
+        Those that it stated at its end; of a site that others lost for good, those up to its last known one;
+        else those of the scenario.
+        """
+        stated = self._stated_ticks().get(site)
+        there = int(self[site].tick[-1]) + 1 if len(self[site]) else 0
+        if stated is None:
+            told = [event for event in self.events if event.about == site and event.kind in ("lost", "back")]
+            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind == "lost"
+            stated = there if gone and there else self.scenario.ticks(site)
+        return max(stated, there)
 
     def missing(self, site: str) -> int:
         """Returns how many records of a site are missing: of those that it made, else up to its last one."""

@@ -18,6 +18,7 @@ from ..files import refuse_existing
 from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
+from .digest_chain import ALGORITHM, CHAIN_KEY, PREVIOUS_DIGEST_KEY
 from .log_file import LogFile
 from .log_layout import (
     ACCOUNTS,
@@ -58,6 +59,9 @@ class LogWriter:
         choice: the channels that it takes.
         views_hz: messages a second of the channels for viewers, see `VizChannels`; 0 for none.
 
+    Attributes:
+        records_digest: the digest of its messages, once it is finished; else "".
+
     Raises:
         LogRefused: the disk refused.
     """
@@ -76,6 +80,7 @@ class LogWriter:
         views_hz: float = 0.0,
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
+        self.records_digest = ""
         self._ended = ""  # why nothing more can be added
         self._views = None
         if views_hz:
@@ -93,6 +98,7 @@ class LogWriter:
             "seed": str(scenario.seed),
             "sites": " ".join(scenario.names),
             "epoch_unix_ns": str(epoch_unix_ns),
+            CHAIN_KEY: ALGORITHM,
         }
         about |= {**collect_provenance(), **choice.facts(), **(facts or {})}
         with self._refusing():
@@ -228,6 +234,7 @@ class LogWriter:
                     self._views.finish(self._last_log_ns)
             finally:
                 self._file.add_metadata(ACCOUNTS, taken)
+                self.records_digest = self._file.close_chain()["records"]
                 self._file.finish()
 
     @contextmanager
@@ -336,6 +343,7 @@ class LogParts:
         self.so_far: Callable[[], Mapping[str, str]] = dict
         self._storage, self._begin_log = storage, begin
         self._number, self._previous = storage.first()
+        self._previous_digest = ""
         if storage.force and storage.splits:  # what was left of a log would seem to belong to the new one
             for number in (0, *find_parts(storage.path)):
                 name = part_path(storage.path, number)
@@ -349,6 +357,8 @@ class LogParts:
         """Begins a part."""
         path = part_path(self._storage.path, self._number)
         part = {"index": str(self._number), "previous": self._previous} if self._number else {}
+        if self._previous_digest:
+            part[PREVIOUS_DIGEST_KEY] = self._previous_digest
         self._file = file = self._opened(path)
         try:
             self._writer = self._begin_log(file, part)
@@ -361,6 +371,7 @@ class LogParts:
     def _roll(self) -> None:
         """Ends a part and begins the next one."""
         self._writer.finish(self.so_far())
+        self._previous_digest = self._writer.records_digest
         self._before_bytes += self._writer.written_bytes
         self._file.end()
         self._number += 1

@@ -51,7 +51,7 @@ class CheckFinding(NamedTuple):
 
     Attributes:
         check: its name: "whole", "checksums", "records", "index"; of a trilat-net log also "sequence",
-            "accounts", "schema", "times", "rates", "scenario".
+            "accounts", "chain", "schema", "times", "rates", "scenario".
         passed: True if it passed.
         text: the result in one line.
         places: problems, at most `MAX_LISTED_PROBLEMS`.

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from ..errors import LogError
 from ..net import topics
+from .digest_chain import CHAIN, ChainState, DigestChain, judge_chain
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .mcap_records import (
     DEFINITIONS,
     MESSAGE_HEAD,
     OP_MESSAGE,
     RECORD_HEAD,
+    RECORD_HEAD_BYTES,
     Damage,
     RecordFrame,
     RecordScanner,
@@ -120,6 +122,7 @@ class McapReader:
         self.packed_bytes = self.unpacked_bytes = 0
         self.offset = 0
         self.complete = False
+        self._chain, self._messages = DigestChain(), 0
         self._scanner = RecordScanner(stream)
         self.size = self._scanner.size
         self._source = name
@@ -175,12 +178,16 @@ class McapReader:
             case Opcode.METADATA:
                 entry = parse_record(frame.opcode, content)
                 self.metadata[entry.name] = entry.metadata
+                if entry.name != CHAIN:
+                    self._chain.add_entry(frame.opcode, content)
             case Opcode.ATTACHMENT:
                 attachment = parse_record(frame.opcode, content)
                 if not has_right_crc(content):
                     raise UnreadableRecord(f"the attachment {attachment.name[:80]!r}: its CRC differs")
                 self.attachments[attachment.name] = attachment.data
+                self._chain.add_entry(frame.opcode, content)
             case Opcode.HEADER:
+                self._chain.add_entry(frame.opcode, content)
                 self.library = parse_record(frame.opcode, content).library
         return b""
 
@@ -188,10 +195,12 @@ class McapReader:
         find_topic, ours = self._topics.get, self._ours
         parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
         new = tuple.__new__  # what the class does with its arguments, in half the time
-        memory = 0
+        memory = chained = 0
+        view = memoryview(data)
         for opcode, begin, end in iterate_records(data):
             if opcode == OP_MESSAGE:
                 length = end - begin
+                self._messages += 1
                 if length < head_bytes:
                     raise UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
@@ -205,11 +214,25 @@ class McapReader:
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in DEFINITIONS:
+                self._chain.add_records(view[chained : begin - RECORD_HEAD_BYTES])
+                chained = end
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
+        self._chain.add_records(view[chained:])
         self._take_memory(memory, frame)
 
+    def judge_chain(self) -> tuple[ChainState, str]:
+        """Returns whether the file agrees with its digest chain, once it was read, and a sentence for it."""
+        return judge_chain(
+            self._chain,
+            self._messages,
+            self.metadata,
+            finished=self.complete,
+            damaged=bool(self.damaged),
+        )
+
     def _define(self, opcode: int, content: bytes) -> None:
+        self._chain.add_entry(opcode, content)
         record = parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
             self._schemas.setdefault(record.id, (record.name, record.encoding, record.data))
@@ -276,6 +299,7 @@ class LogContents:
         complete: True if all of it is there, finished and readable throughout; a later part alone is not.
         ended: True if the last one was finished.
         damaged: what cannot be read, a sentence each.
+        chain: agreement with the digest chain, of several files the worst, and a sentence for it.
     """
 
     sources: tuple[str, ...]
@@ -286,6 +310,7 @@ class LogContents:
     complete: bool
     ended: bool
     damaged: list[str]
+    chain: tuple[ChainState, str] = (ChainState.ABSENT, "")
 
     @property
     def source(self) -> str:
@@ -317,8 +342,9 @@ def read_contents(stream: BinaryIO, name: str, progress: Progress | None = None)
         raise LogError(f"{problem}; {why}" if why else problem)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
-    text = reader.attachments[SCENARIO]
-    return LogContents((name,), session, text, reader.metadata, channels, complete, reader.complete, damaged)
+    text, chain = reader.attachments[SCENARIO], reader.judge_chain()
+    ended = reader.complete
+    return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
 
 
 def _make_adder(topic: str, channels: dict[str, ChannelMessages]) -> Callable[[bytes, int, int], None]:

@@ -16,6 +16,7 @@ from typing import Protocol, runtime_checkable
 import zstandard
 from mcap.opcode import Opcode
 
+from .digest_chain import CHAIN, DigestChain
 from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 
 CHUNK_BYTES = 1 << 20
@@ -96,7 +97,10 @@ class McapWriter:
         self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
         self._records: Counter[Opcode] = Counter()  # in the summary, by kind
-        self._put(MAGIC + pack_record(Opcode.HEADER, pack_text(profile) + pack_text(library)))
+        self._chain = DigestChain()
+        header = pack_text(profile) + pack_text(library)
+        self._chain.add_entry(Opcode.HEADER, header)
+        self._put(MAGIC + pack_record(Opcode.HEADER, header))
 
     def _put(self, data: bytes) -> int:
         """Writes bytes and returns where they are."""
@@ -135,7 +139,9 @@ class McapWriter:
         """Writes a schema and returns its number."""
         number = self._records[Opcode.SCHEMA] + 1
         body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
-        self._put(self._add_to_summary(Opcode.SCHEMA, body + struct.pack("<I", len(data)) + data))
+        body += struct.pack("<I", len(data)) + data
+        self._chain.add_entry(Opcode.SCHEMA, body)
+        self._put(self._add_to_summary(Opcode.SCHEMA, body))
         return number
 
     def register_channel(
@@ -144,7 +150,9 @@ class McapWriter:
         """Writes a channel and returns its number; it precedes the open chunk. Schema 0 stands for none."""
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id) + pack_text(topic) + pack_text(message_encoding)
-        self._put(self._add_to_summary(Opcode.CHANNEL, body + pack_text_map(metadata or {})))
+        body += pack_text_map(metadata or {})
+        self._chain.add_entry(Opcode.CHANNEL, body)
+        self._put(self._add_to_summary(Opcode.CHANNEL, body))
         self._counts[number] = 0
         self._entries[number] = []
         return number
@@ -164,7 +172,10 @@ class McapWriter:
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Writes a metadata record, before the open chunk."""
-        record = pack_record(Opcode.METADATA, pack_text(name) + pack_text_map(data))
+        content = pack_text(name) + pack_text_map(data)
+        if name != CHAIN:
+            self._chain.add_entry(Opcode.METADATA, content)
+        record = pack_record(Opcode.METADATA, content)
         index = struct.pack("<QQ", self._put(record), len(record)) + pack_text(name)
         self._add_to_summary(Opcode.METADATA_INDEX, index)
 
@@ -175,7 +186,9 @@ class McapWriter:
         times = struct.pack("<QQ", log_time, create_time)
         names = pack_text(name) + pack_text(media_type)
         body = times + names + struct.pack("<Q", len(data)) + data
-        record = pack_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
+        body += struct.pack("<I", zlib.crc32(body))
+        self._chain.add_entry(Opcode.ATTACHMENT, body)
+        record = pack_record(Opcode.ATTACHMENT, body)
         place = struct.pack("<QQ", self._put(record), len(record))
         index = place + times + struct.pack("<Q", len(data)) + names
         self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
@@ -188,7 +201,16 @@ class McapWriter:
             self._reserve(self.owed)
         self._stream.flush()
 
+    def close_chain(self) -> dict[str, str]:
+        """Writes the digests of all that was added, and returns them; only `finish` may follow."""
+        if self._open:
+            self._close_chunk()
+        facts = self._chain.facts(self.messages)
+        self.add_metadata(CHAIN, facts)
+        return facts
+
     def _close_chunk(self) -> None:
+        self._chain.add_records(self._open)
         data = self._compressor.compress(self._open)
         used = {channel: entries for channel, entries in self._entries.items() if entries}
         start_ns = min(min(entries[::2]) for entries in used.values())

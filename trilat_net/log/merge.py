@@ -16,6 +16,7 @@ from ..errors import LogError, WireError
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats
 from ..net.wire import decode
+from .digest_chain import CHAIN, PREVIOUS_DIGEST_KEY, ChainState
 from .log_layout import ACCOUNTS, PART
 from .mcap_reader import ChannelMessages, LogContents
 from .record_columns import decode_ticks
@@ -40,6 +41,7 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
             raise LogError(f"{other.source}: is no part of {session}")
     ordered = sorted(parts, key=_first_time)
     first, last = ordered[0], ordered[-1]
+    _check_digests(parts)
     names = dict.fromkeys(topic for part in ordered for topic in part.channels)
     whole = all(part.ended and not part.damaged for part in parts)
     return LogContents(
@@ -51,7 +53,18 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
         whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
         last.ended,
         [damage for part in ordered for damage in part.damaged],
+        max((part.chain for part in parts), key=lambda chain: list(ChainState).index(chain[0])),
     )
+
+
+def _check_digests(parts: Sequence[LogContents]) -> None:
+    """Refuses a part that follows another file than the one that is given as the part before it."""
+    finished = {_part_index(part): part for part in parts if CHAIN in part.metadata}
+    for part in parts:
+        stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
+        before = finished.get(_part_index(part) - 1)
+        if stated and before is not None and before.metadata[CHAIN].get("records") != stated:
+            raise LogError(f"{part.source}: does not follow {before.source}: that file was another one")
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:

@@ -6,7 +6,7 @@ modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebui
 a number, the one covered by a valid checksum wins, else the first.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -20,9 +20,10 @@ from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
 from .accounting import open_session_accounts
+from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
-from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, collect_provenance, describe_unfinished
-from .mcap_reader import Progress
+from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, SESSION, collect_provenance, describe_unfinished
+from .mcap_reader import McapReader, Progress
 from .mcap_records import (
     COMPRESSION_NAME_OFFSET,
     DEFINITIONS,
@@ -43,8 +44,6 @@ from .mcap_records import (
 )
 from .mcap_writer import McapWriter
 
-RECOVERED_METADATA = "trilat.recovered"
-"""Metadata that states what a file was made from, and what was lost."""
 MAX_LISTED_LOSSES = 20
 """Losses that are listed there one by one."""
 MAX_SALVAGE_BYTES = 64 << 20
@@ -72,6 +71,8 @@ class Recovery:
         salvaged: messages out of a last chunk that was cut off.
         lost, lost_bytes: what was lost, a sentence each, and how many bytes could not be read.
         missing: per site which records are not in the file, be they lost here or never recorded.
+        coverage: per site the records in the file and the ticks of the run; empty if it is no trilat-net log.
+        chain: agreement of the source with its digest chain; "" if it is no trilat-net log.
     """
 
     path: Path
@@ -84,11 +85,20 @@ class Recovery:
     lost: list[str] = field(default_factory=list)
     lost_bytes: int = 0
     missing: list[str] = field(default_factory=list)
+    coverage: dict[str, tuple[int, int]] = field(default_factory=dict)
+    chain: ChainState | str = ""
 
     @property
     def lossless(self) -> bool:
         """True if all that was in the file is in the new one."""
         return not self.lost
+
+    def coverage_texts(self) -> list[str]:
+        """Returns how much of the run is in the new file, a text per site."""
+        return [
+            f"{site} {there} of {ticks} ticks ({100.0 * there / max(ticks, 1):.4g} %)"
+            for site, (there, ticks) in self.coverage.items()
+        ]
 
     def lose(self, what: str, size: int = 0) -> None:
         """Adds a loss of so many bytes."""
@@ -106,6 +116,8 @@ class Recovery:
             "lost_bytes": str(self.lost_bytes),
             "salvaged_messages": str(self.salvaged),
             "missing": "; ".join(self.missing) or "nothing",
+            "coverage": "; ".join(self.coverage_texts()) or "unknown",
+            "chain": str(self.chain),
         }
 
 
@@ -150,6 +162,7 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
+    result.chain = _judge_source(stream, survey)
     file = LogFile(result.output, force=force, working=working)
     try:
         _FileCopy(scanner, file, survey, result).run(progress)
@@ -160,6 +173,18 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
             raise file.refused(file.trouble) from None
         raise
     return result
+
+
+def _judge_source(stream: BinaryIO, survey: "_Survey") -> ChainState | str:
+    """Returns the agreement of a log of ours with its digest chain; "" for other files."""
+    stream.seek(0)
+    reader = McapReader(stream, "source", kept=False)
+    if SESSION not in survey.metadata:
+        return ""
+    with suppress(LogError):
+        deque(reader.messages(), maxlen=0)
+        return reader.judge_chain()[0]
+    return ChainState.OPEN
 
 
 class _Survey:
@@ -281,7 +306,8 @@ class _FileCopy:
             self._take_inner(opcode, content)
         elif opcode == Opcode.METADATA:
             entry = parse_record(opcode, content)
-            if entry.name != RECOVERED_METADATA and (entry.name != ACCOUNTS or self._accounts is None):
+            ours = self._accounts is not None
+            if entry.name != RECOVERED and not (ours and entry.name in (ACCOUNTS, CHAIN)):
                 self._out.add_metadata(entry.name, entry.metadata)
         elif opcode == Opcode.ATTACHMENT:
             one = parse_record(opcode, content)
@@ -382,10 +408,13 @@ class _FileCopy:
         if accounts is not None:
             result.missing = list(accounts.missing())
             result.sites = accounts.records()
+            result.coverage = accounts.run_coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
             counts = {name: text for name, text in before.items() if not name.startswith("/")}
             self._out.add_metadata(ACCOUNTS, {**accounts.texts(), **counts})
-        self._out.add_metadata(RECOVERED_METADATA, result.facts())
+        self._out.add_metadata(RECOVERED, result.facts())
+        if accounts is not None:
+            self._out.close_chain()
         self._out.finish()
 
 

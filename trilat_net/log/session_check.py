@@ -20,6 +20,7 @@ from ..net.messages import READABLE, VERSION, Event, LinkStats, RecorderStats, S
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from .accounting import Account, count_messages, number_message
+from .digest_chain import ChainState
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -77,7 +78,8 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    return LogCheckResult([*files.findings(), *(session.findings() if session.ours else ())], session.ours)
+    found = session.findings() if session.ours else session.find_lost_session()
+    return LogCheckResult([*files.findings(), *found], session.ours)
 
 
 class MessageIdentity(NamedTuple):
@@ -264,7 +266,7 @@ class SessionCheck:
         self._accounts: dict[str, str] = {}  # of the last file
         self._first_part = False  # the files begin with the session
         self._views = 0
-        self._file = ""
+        self._file = self._chain_text = ""
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks all messages of a file.
@@ -295,6 +297,9 @@ class SessionCheck:
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
+        state, self._chain_text = reader.judge_chain()
+        if state is ChainState.CHANGED:
+            self._problems["chain"].add(file, None, self._chain_text)
 
     def _begin(self, reader: McapReader) -> None:
         about = reader.metadata.get(SESSION, {})
@@ -357,6 +362,11 @@ class SessionCheck:
         epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
         return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, self._problems)
 
+    def find_lost_session(self) -> Iterator[CheckFinding]:
+        """Yields the problem of files with a digest chain and no session: that was taken out."""
+        if self._problems["chain"].wrong:
+            yield self._problems["chain"].finding("chain", "")
+
     def findings(self) -> Iterator[CheckFinding]:
         """Yields the results, once all files were read."""
         ticks = {check.member: check.ticks for check in self.channels.values() if check.ticks is not None}
@@ -366,6 +376,7 @@ class SessionCheck:
                 check.expect(min(ticks[check.member], most))
         yield self._check_sequence()
         yield self._check_accounts()
+        yield self._problems["chain"].finding("chain", self._chain_text)
         kinds = f"every message is one of version {self._session_number('schema_version')}"
         views = f", and {self._views} views" if self._views else ""
         yield self._problems["schema"].finding("schema", kinds + views)

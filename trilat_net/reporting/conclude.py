@@ -12,7 +12,7 @@ import numpy as np
 
 from ..analysis.certificate.stability_certificate import certify
 from ..errors import LawFailed, RunFailed, ScenarioError
-from ..execution.log_checks import RECORDS_LABEL, CheckLine, check_log_files
+from ..execution.log_checks import CheckLine, check_log_files
 from ..execution.verify import find_last_ticks
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.log_reader import Log
@@ -37,11 +37,6 @@ class Conclusion(NamedTuple):
     def passed(self) -> bool:
         """True if every check passed."""
         return all(line.passed for line in self.lines)
-
-    @property
-    def agreed(self) -> bool:
-        """True if every execution agreed with the log, complete or not."""
-        return all(line.passed for line in self.lines if line.label != RECORDS_LABEL)
 
 
 def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:

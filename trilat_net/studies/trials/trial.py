@@ -182,6 +182,7 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
         return TrialResult(trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept)
     ended = "; ".join(problems) or "ended in order"
     session = ExpectationResult("session", not problems, ended, "ends in order")
-    identical, records = f"{verdict.identical} identical", f"{verdict.records} records"
+    judged = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
+    identical, records = f"{verdict.identical} identical{judged}", f"{verdict.records} records"
     again = ExpectationResult("executed again", verdict.passed, identical, records)
     return result._replace(outcomes=[*result.outcomes, session, again], log=kept)

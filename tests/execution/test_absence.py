@@ -1,0 +1,298 @@
+"""What a log does not hold, and what was changed in it, passes nothing."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from tests.execution.deliveries import SITES, TICKS, delivered
+from tests.execution.logs import without_records
+from tests.log_editing import edited, opened, recorded, without
+from tests.log_surgery import Pieces, Stored, repacked, taken_apart
+from trilat_net.cli import options
+from trilat_net.errors import LogError, ScenarioError
+from trilat_net.execution.log_checks import run_log_checks
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.verify import verify
+from trilat_net.log.digest_chain import ChainState
+from trilat_net.log.integrity import MIN_COVERAGE, Coverage, judge_integrity
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.messages import Event
+
+LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}
+"""Samples that come late in another run of the same experiment: its motion differs from then on."""
+
+
+@cache
+def run(*, other: bool = False) -> bytes:
+    return delivered(LATE if other else {})
+
+
+def pieces(*, chained: bool, other: bool = False) -> Pieces:
+    taken = taken_apart(run(other=other))
+    return taken if chained else taken.without_chain()
+
+
+def is_refused(data: bytes, *, chained: bool) -> bool:
+    """True if a log does not pass as whole and identical; one with a chain by that alone."""
+    try:
+        log = opened(data)
+        if chained:
+            return not judge_integrity(log).passed
+        return not run_log_checks(log, virtual=False).passed
+    except (LogError, ScenarioError):
+        return True
+
+
+def test_what_is_put_together_unchanged_is_the_same_file() -> None:
+    assert taken_apart(run()).bytes() == run()
+    log = opened(run())
+    assert judge_integrity(log).state is ChainState.INTACT
+    assert run_log_checks(log, virtual=True).passed
+    old = opened(pieces(chained=False).bytes())
+    assert judge_integrity(old).state is ChainState.ABSENT
+    assert run_log_checks(old, virtual=True).passed
+
+
+sites = st.one_of(st.sampled_from([(site,) for site in SITES]), st.just(SITES))
+stretches = st.tuples(st.integers(1, TICKS - 2), st.integers(1, 30)).map(
+    lambda x: range(x[0], min(sum(x), TICKS - 1))
+)
+
+
+def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
+    """Where in a file the records of some sites and ticks are."""
+    topics = taken.topics()
+    wanted = {f"/trilat/free/{site}/state" for site in of}
+    return [n for n, m in enumerate(taken.messages) if topics[m.channel] in wanted and m.sequence in ticks]
+
+
+def remove(draw: Callable, taken: Pieces) -> None:
+    gone = set(places(taken, draw(sites), draw(stretches)))
+    taken.messages = [m for n, m in enumerate(taken.messages) if n not in gone]
+
+
+def splice(draw: Callable, taken: Pieces) -> None:
+    """Another run from some tick on, over a gap or none."""
+    k, gap = draw(st.integers(TICKS // 2, TICKS - 5)), draw(st.integers(0, 3))
+    other = taken_apart(run(other=True)).messages
+    topics = taken.topics()
+
+    def is_record(m: Stored) -> bool:
+        return topics[m.channel].endswith("/state")
+
+    kept = [m for m in taken.messages if not is_record(m) or m.sequence < k]
+    taken.messages = kept + [m for m in other if is_record(m) and m.sequence >= k + gap]
+
+
+def replay(draw: Callable, taken: Pieces) -> None:
+    """A stretch once more: as it is, or under the numbers that follow, in place of what was there."""
+    of, ticks = draw(sites), draw(stretches)
+    again = [taken.messages[n] for n in places(taken, of, ticks)]
+    if draw(st.booleans()):
+        taken.messages += again
+        return
+    assume(ticks.stop + len(ticks) < TICKS)
+    later = set(places(taken, of, range(ticks.stop, ticks.stop + len(ticks))))
+    taken.messages = [m for n, m in enumerate(taken.messages) if n not in later]
+    for message in again:
+        tick = message.sequence + len(ticks)
+        taken.messages.append(repacked(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000))
+
+
+def renumber(draw: Callable, taken: Pieces) -> None:
+    by = draw(st.integers(-40, 40).filter(bool))
+    for n in places(taken, draw(sites), draw(stretches)):
+        tick = taken.messages[n].sequence + by
+        taken.messages[n] = repacked(taken.messages[n], tick=tick)
+
+
+def change_metadata(draw: Callable, taken: Pieces) -> None:
+    """An entry of any metadata, of a channel's too, changed, added or taken away; or all of it."""
+    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "metadata")]))
+    key = draw(st.sampled_from([*entry.metadata, "new"]))
+    match draw(st.sampled_from(["change", "drop", "rename"])):
+        case "drop" if key != "new":
+            del entry.metadata[key]
+        case "rename" if hasattr(entry, "name") and entry.name != "trilat.session":
+            entry.name += "x"
+        case _:
+            entry.metadata[key] = entry.metadata.get(key, "") + draw(st.sampled_from(["0", " ", "s"]))
+
+
+def change_description(draw: Callable, taken: Pieces) -> None:
+    """A byte of the scenario or of a schema."""
+    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "data")]))
+    place = draw(st.integers(0, len(entry.data) - 1))
+    entry.data = entry.data[:place] + bytes([entry.data[place] ^ 1]) + entry.data[place + 1 :]
+
+
+def change_message(draw: Callable, taken: Pieces) -> None:
+    """A time, or the telemetry of a record, which no execution computes; or any message taken out."""
+    n = draw(st.integers(0, len(taken.messages) - 1))
+    message = taken.messages[n]
+    match draw(st.sampled_from(["log_ns", "publish_ns", "telemetry", "out"])):
+        case "telemetry" if "late_us" in msgpack.unpackb(message.payload):
+            taken.messages[n] = repacked(message, late_us=77)
+        case "out":
+            del taken.messages[n]
+        case "publish_ns":
+            taken.messages[n] = message._replace(publish_ns=message.publish_ns + 1)
+        case _:
+            taken.messages[n] = message._replace(log_ns=message.log_ns + 1)
+
+
+OF_RECORDS = [remove, splice, replay, renumber]
+ANY = [*OF_RECORDS, change_metadata, change_description, change_message]
+
+
+def refuses_all(changes: list[Callable], *, chained: bool, examples: int) -> None:
+    @settings(max_examples=examples)
+    @given(st.data(), st.sampled_from(changes))
+    def check(data: st.DataObject, change: Callable) -> None:
+        taken = pieces(chained=chained)
+        change(data.draw, taken)
+        assert is_refused(taken.bytes(), chained=chained), change.__name__
+
+    check()
+
+
+def test_no_change_of_a_log_passes_by_its_chain() -> None:
+    refuses_all(ANY, chained=True, examples=150)
+
+
+def test_no_change_of_the_records_of_an_older_log_passes() -> None:
+    refuses_all(OF_RECORDS, chained=False, examples=40)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("chained", "changes"), [(True, ANY), (False, OF_RECORDS)])
+def test_of_500_changed_logs_none_passes(chained: bool, changes: list[Callable]) -> None:
+    refuses_all(changes, chained=chained, examples=500)
+
+
+def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
+    """The same experiment, the same starts of its sites: what follows the gap was still another run."""
+    taken = pieces(chained=False)
+    other = taken_apart(run(other=True)).messages
+    topics = taken.topics()
+    taken.messages = [m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60]
+    taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
+    found = judge_integrity(opened(taken.bytes()))
+    assert found.state is ChainState.CHANGED
+    assert "taken out or put in" in found.text
+
+
+def test_sparse_logs_fail_and_say_how_much_was_judged() -> None:
+    log = without_records({"m1": range(2, 100)})
+    verdict = verify(log)
+    assert verdict.agreed
+    assert not verdict.passed
+    assert verdict.coverage.judged["m1"] < 25
+    assert verdict.coverage.share < 0.2
+    text = run_log_checks(log, virtual=False).lines[0].text
+    assert "m1" in text
+    assert "less than 99.9 %" in text
+
+
+def test_a_torn_log_passes_no_more_than_is_asked_for() -> None:
+    data = edited(recorded("paper"), chunk_bytes=2048)
+    log = opened(data[: len(data) // 2])
+    assert not verify(log).passed
+    share = verify(log).coverage.share
+    assert 0.1 < share < 0.9
+    assert verify(log, min_coverage=share).passed
+    assert not verify(log, min_coverage=share + 1e-6).passed
+    whole = recorded("paper")
+    assert judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is ChainState.OPEN
+
+
+def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:
+    """The two records behind a gap are not executed; whose they are is compared all the same."""
+
+    def record(r: dict) -> dict | None:
+        changed = {**r, "boot": 1} if (r["site"], r["tick"]) == ("s", 45) else r
+        return without("s", {43, 44})(changed)
+
+    first = verify(opened(edited(recorded("paper"), record=record))).first
+    assert first is not None
+    assert first[:3] == ("s", 45, "boot")
+
+
+def test_a_log_that_only_claims_to_be_a_rerun_is_executed_as_a_whole() -> None:
+    def zeroed(r: dict) -> dict:
+        return r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}
+
+    claims = {"rerun_executed": "s", "rerun_mode": "open loop"}
+    data = edited(recorded("paper"), record=zeroed, session=claims)
+    assert not verify(opened(data)).agreed
+    worse = verify(opened(edited(data, session={**claims, "driver": "rerun"})))
+    assert worse.agreed  # its m1 and m2 met samples that are not in it
+    assert worse.coverage.share == 0.0
+    assert not worse.passed
+
+
+def test_an_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(recorded("free"))
+    made = tmp_path / "again.mcap"
+    rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(made)
+    verdict = verify(open_log(made))
+    assert verdict.passed
+    assert verdict.identical == 3 * TICKS
+    forged = edited(made.read_bytes(), record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r)
+    made.write_bytes(forged)
+    assert verify(open_log(made)).first[:3] == ("m1", 0, "record")
+    (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")  # no more the file that the rerun names
+    alone = run_log_checks(open_log(made), virtual=True)
+    assert not alone.passed
+    assert "not beside it" in "".join(line.text for line in alone.lines)
+
+
+def test_samples_lost_on_the_way_excuse_plain_virtual_time_and_nothing_before_them() -> None:
+    lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
+    log = opened(delivered({}, lost))
+    report = run_log_checks(log, virtual=True)
+    assert report.passed, report.lines
+    assert "20 lost on the way, the first: sample 40 of s was due at tick 60 of m2 and never came" in (
+        report.lines[-1].label
+    )
+    assert "the first that differs" in report.lines[-1].text
+
+    def record(r: dict) -> dict:
+        return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
+
+    changed = run_log_checks(opened(edited(delivered({}, lost), record=record)), virtual=True)
+    assert not changed.lines[-1].passed
+
+
+def test_a_gap_does_not_fail_virtual_time_fed_with_what_can_have_arrived() -> None:
+    lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).lines
+    fed = next(line for line in lines if "fed" in line.label)
+    assert fed.passed, fed
+
+
+def test_coverage_is_that_of_the_site_with_the_least() -> None:
+    found = Coverage({"a": 1000, "b": 995}, {"a": 1000, "b": 1000, "c": 0})
+    assert found.share == 0.995
+    assert str(found) == "b 995 of 1000 ticks (99.5 %)"
+    assert Coverage({}, {}).share == 0.0
+    assert Coverage({"a": 0}, {"a": 0}).share == 0.0
+    assert "99.999 %" in str(Coverage({"a": 10**7 - 1}, {"a": 10**7}))
+    assert options.MIN_COVERAGE == MIN_COVERAGE
+
+
+def test_a_site_that_others_lost_ends_where_it_was_last_seen() -> None:
+    whole = opened(recorded("paper"))
+    assert {whole.expected_ticks(site) for site in SITES} == {TICKS}
+    data = edited(recorded("paper"), chunk_bytes=2048)
+    torn = opened(data[: len(data) // 2])
+    assert {torn.expected_ticks(site) for site in SITES} == {TICKS}  # nobody tells more
+    last = int(torn["s"].tick[-1])
+    torn.events.append(Event(member="m1", boot=1, t_ns=1, n=9, kind="lost", text="", about="s"))
+    assert [torn.expected_ticks(site) for site in SITES] == [TICKS, TICKS, last + 1]
+    torn.events.append(Event(member="m1", boot=1, t_ns=2, n=10, kind="back", text="", about="s"))
+    assert torn.expected_ticks("s") == TICKS
