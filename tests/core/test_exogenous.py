@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import signal
 
 from tests.core.physical_arms import Array, angles, speeds
 from trilat_net.core.exogenous import (
@@ -15,6 +16,7 @@ from trilat_net.core.exogenous import (
     torque_on_arm,
     torque_source_rows,
 )
+from trilat_net.scenario.operators import Multisine
 
 LENGTHS = np.array([1.0, 0.9])
 STEP = 1e-6
@@ -164,6 +166,33 @@ def test_recorded_torque_is_linear_between_its_points(rows: list[tuple[float, ..
     assert found == pytest.approx(expected, abs=1e-9)
 
 
+@given(t_s=st.floats(2.0, 20.0), ends=st.tuples(st.floats(0.1, 20.0), st.floats(0.1, 20.0)))
+def test_a_chirp_sweeps_its_frequencies_evenly_and_begins_again(
+    t_s: float, ends: tuple[float, float]
+) -> None:
+    """By SciPy's chirp."""
+    source = TorqueSource(TorqueKind.CHIRP, 2.0, 30.0, 2.0, 6.0, (3.0, -1.0), ends)
+    sine = signal.chirp((t_s - 2.0) % 4.0, ends[0], 4.0, ends[1], phi=-90)
+    found = torque(t_s, np.zeros(2), np.zeros(2), source)
+    assert found == pytest.approx([3.0 * sine, -sine], abs=1e-6)
+
+
+def test_a_multisine_has_its_lines_and_nothing_else() -> None:
+    """Of its spectrum over a period, and its peak is far below the sum of its amplitudes."""
+    hz = (0.5, 0.75, 1.0, 2.5, 4.0, 7.0, 7.25, 9.0)
+    source = Multisine(amplitude_nm=(2.0, 0.0), frequencies_hz=hz, start_s=1.0).actor
+    t_s = 1.0 + np.arange(400) / 100.0
+    found = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
+    amplitude = 2.0 * np.abs(np.fft.rfft(found)) / len(found)
+    expected = np.where(np.isin(np.arange(201) / 4.0, hz), 2.0, 0.0)
+    assert amplitude == pytest.approx(expected, abs=1e-9)
+    assert np.abs(found).max() < 0.75 * 2.0 * len(hz)
+    given_phases = Multisine(amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)).actor
+    assert torque(0.1, np.zeros(2), np.zeros(2), given_phases)[0] == pytest.approx(
+        math.sin(0.4 * math.pi + 0.5)
+    )
+
+
 def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
     rest = np.zeros(2)
     held = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
@@ -174,8 +203,9 @@ def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
 
 @pytest.mark.parametrize("acts", list(TorqueKind))
 def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None:
-    table = np.array([[0.0, 1.0, 1.0], [9.0, 1.0, 1.0]])
-    actor = TorqueSource(acts, 2.0, 3.0, a=(1.0, 0.0), b=(-1.0, 0.0), K=(9.0, 9.0), B=(1.0, 1.0), table=table)
+    table = np.array([[0.0, 1.2, 1.0], [9.0, 1.0, 1.0]])
+    vectors = {"a": (1.0, 0.0), "b": (-1.0, 0.0), "K": (9.0, 9.0), "B": (1.0, 1.0)}
+    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table)
     q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
         assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]

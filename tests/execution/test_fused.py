@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.core.compiled import printed
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.metric_catalogue import QUANTITIES
 from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
@@ -17,6 +19,8 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, list_shipped, load_scenario
 
 Array = NDArray[np.float64]
+TOTALS = ("rms_error_rad", "force_peak_n", "walls_j")
+VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 2.0}
 
 LINKS: tuple[dict[str, Any], ...] = (
     {"link.delay_ms": 0.0},
@@ -110,6 +114,35 @@ def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
     np.testing.assert_array_equal(parts.records, whole.records)
     np.testing.assert_array_equal(np.array(parts.maxima), np.array(whole.maxima))
     assert parts.settled_s == whole.settled_s
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("contact", {"duration_s": 6.0, "rate_hz": 500}),
+        ("contact", {"duration_s": 6.0, "rate_hz": 500, "sites.s.environment.0.sampled": True}),
+        ("windup", {"duration_s": 6.0, "sites.m1.rate_hz": 250, "sites.m2.environment": [VISCOUS]}),
+        ("free", {"duration_s": 3.0, "limits.qd_limit_rad_s": 1.5}),
+    ],
+)
+def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None:
+    """RMS e, peak force and work of the walls as `trilat metrics` has them; the effort by its formula."""
+    scenario = load_scenario(load_scenario(name), changes)
+    fused = FusedRun(scenario)
+    fused.advance(0.5 * scenario.duration_s)
+    fused.advance(scenario.duration_s)
+    log = virtual.simulate_scenario(scenario)
+    whole = {one.key: compute_log_metrics(log).whole(one).value for one in QUANTITIES if one.key in TOTALS}
+    found = fused.totals._asdict()
+    for key in TOTALS:
+        assert found[key] == (whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)), key
+    squares = []
+    for site, spec in scenario.sites.items():
+        q, tau, theta = log[site].q, log[site].tau, spec.arm.theta
+        outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
+        gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
+        squares.append(np.mean((tau - gravity) ** 2))
+    assert found["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
 
 
 def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:

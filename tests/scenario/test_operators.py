@@ -15,7 +15,14 @@ TIP = {"kind": "tip_spring", "stiffness_n_m": 100.0}
 RECORDED = {"kind": "recorded", "points": [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]]}
 VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 1.0}
 WALL = {"kind": "wall", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m": 2000.0}
-GROUPS = {"hands": [PULSE, SPRING, TIP, RECORDED], "environment": [VISCOUS, WALL]}
+CHIRP = {"kind": "chirp", "peak_nm": 1.0, "from_hz": 0.5, "to_hz": 5.0, "sweep_s": 4.0}
+MULTISINE = {
+    "kind": "multisine",
+    "amplitude_nm": 1.0,
+    "frequencies_hz": [0.5, 1.25],
+    "phases_rad": [0.0, 1.0],
+}
+GROUPS = {"hands": [PULSE, SPRING, TIP, RECORDED, CHIRP, MULTISINE], "environment": [VISCOUS, WALL]}
 
 
 def refused(group: str, entry: Any) -> str:
@@ -76,6 +83,12 @@ def test_a_value_of_the_wrong_kind_is_told_what_its_key_wants(group: str, entry:
         ("hands", {**SPRING, "stiffness_n_m": 1.0}, ".*; did you mean 'stiffness_nm_rad'"),
         ("hands", {**PULSE, "end_s": 0.5}, ".end_s: must be later than start_s = 1, is 0.5"),
         ("hands", {**SPRING, "move_start_s": 4.0}, ".move_end_s: must not be before move_start_s = 4, is 0"),
+        ("hands", {**CHIRP, "to_hz": 0.0}, ".to_hz: must be a frequency above 0 and up to 1000 Hz, is 0.0"),
+        (
+            "hands",
+            {**MULTISINE, "phases_rad": [1.0]},
+            ".phases_rad: must be 2 angles, as many as frequencies",
+        ),
         ("hands", {**PULSE, "peak_nm": [1.0]}, ".peak_nm: must be one torque for both joints or two, ON"),
         ("hands", {**SPRING, "stiffness_nm_rad": -5.0}, ".*at least 0, N m/rad, is -5.0"),
         ("hands", {**SPRING, "sampled": 1}, ".sampled: must be true or false, is 1"),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import TorqueKind, TorqueSource
+from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..scenario import SiteSpec
@@ -63,7 +63,7 @@ def compute_source_torque(
     """Returns the torque of a spring, damper or wall ON the arm, shape (K, 2), N m.
 
     Raises:
-        ValueError: it is another source: pulses and recorded torques are no function of the state.
+        ValueError: it is another source: a scripted torque is no function of the state.
     """
     if source.acts is TorqueKind.WALL:
         force = wall_force(source, t_s, end_effector)[:, None] * np.array(source.b)
@@ -130,9 +130,9 @@ def split_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
     """Returns the intention of an operator, which does not depend on the arm's motion, shape (K, 2), N m.
 
-    A pulse or a recorded torque itself; of a spring K times the displacement of its target and B times its
-    speed, of one in the plane by the Jacobian J of one pose, shape (2, 2). It moves if and only if the
-    operator does.
+    A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the displacement of its
+    target and B times the target's speed, of one in the plane by the Jacobian J of one pose, shape (2, 2). It
+    moves if and only if the operator does.
     """
     if source.acts is TorqueKind.PULSE:
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
@@ -141,6 +141,14 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         at_s, rows = source.table[:, 0], source.table[:, 1:]
         columns = [np.interp(t_s, at_s, column, left=0.0, right=0.0) for column in rows.T]
         intent = np.stack(columns, axis=1)
+    elif source.acts is TorqueKind.CHIRP:
+        span_s, (first_hz, last_hz) = source.move_end_s - source.move_start_s, source.b
+        x = np.mod(t_s - source.start_s, span_s)
+        turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
+        intent = np.sin(2.0 * np.pi * turns)[:, None] * np.array(source.a)
+    elif source.acts is TorqueKind.MULTISINE and source.table is not None:
+        turns = np.outer(t_s - source.start_s, source.table[:, 0]) + source.table[:, 1]
+        intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
     else:
         origin = np.zeros((len(t_s), JOINTS))
         pull = compute_spring_effort(source, t_s, origin, origin)
@@ -159,7 +167,7 @@ def attribute_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
     for source in (one.actor for one in spec.hands):
         script = compute_operator_script(source, t_s, split.end_effector.J[0])
         scripts = scripts + script
-        if source.acts in (TorqueKind.PULSE, TorqueKind.RECORDED):
+        if source.acts in SCRIPTED_KINDS:
             expected = expected + script
         elif not source.sampled:
             torque = compute_source_torque(source, t_s, records.q, records.qd, split.end_effector)

@@ -180,6 +180,10 @@ def compare_command(
     ] = None,
     budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,
     seed: Annotated[int, _option("--seed", metavar="S", help="Seed of the search.")] = 1,
+    seeds: Annotated[
+        int,
+        _option("--seeds", metavar="N", help="Seeds of the scenario that each candidate is the mean of."),
+    ] = 1,
     objective: Annotated[
         str, _option("--objective", metavar="error|settling", help="The objective besides effort.")
     ] = "error",
@@ -220,6 +224,7 @@ def compare_command(
         seed=seed,
         objective=objective,
         gravity_percent=gravity,
+        seeds=seeds,
     )
     _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 
 _NO_NUMBER = "–"
+_MAX_LINES = 16
+"""Most frequencies of one response that are printed; --json has all."""
 
 
 def metrics_command(file: options.LogArgument, as_json: options.JsonOption = False) -> None:
@@ -100,14 +102,16 @@ def _print_impedance(found: "LogMetrics") -> None:
         return
     rows = []
     for one in found.responses:
-        ratio = one.ratio
         what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, joint {one.joint}"
-        if ratio.gain is None:
-            rows.append([what, one.unit, "", "", "", "", ratio.why])
-            continue
-        numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
-        error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-        rows.append([what, one.unit, *(_number(value or 0.0) for value in numbers), f"+- {error}"])
+        step = -(-len(one.spectrum) // _MAX_LINES) or 1
+        for n, ratio in enumerate(one.spectrum[::step] if len(one.spectrum) > 1 else [one.ratio]):
+            head = ["" if n else what, one.unit]
+            if ratio.gain is None:
+                rows.append([*head, "", "", "", "", ratio.why])
+                continue
+            numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
+            error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
+            rows.append([*head, *(_number(value or 0.0) for value in numbers), f"+- {error}"])
     _print(["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2)
 
 

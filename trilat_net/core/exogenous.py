@@ -25,7 +25,8 @@ class TorqueKind(IntEnum):
     PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a damper towards a
     target that moves along a minimum-jerk path, in joint angles or in the plane. RECORDED is torque by a
     table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-plane, and never
-    pulls.
+    pulls. CHIRP is a sine whose frequency rises or falls in straight lines, again and again. MULTISINE is a
+    sum of sines of one amplitude.
     """
 
     PULSE = 0
@@ -34,6 +35,12 @@ class TorqueKind(IntEnum):
     RECORDED = 3
     VISCOUS = 4
     WALL = 5
+    CHIRP = 6
+    MULTISINE = 7
+
+
+SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
+"""The kinds whose torque is a function of time alone."""
 
 
 class TorqueSource(NamedTuple):
@@ -43,14 +50,17 @@ class TorqueSource(NamedTuple):
         acts: its kind.
         start_s: when it begins to act, s since the epoch.
         end_s: when it ends, s.
-        move_start_s: when its target begins to move, s.
-        move_end_s: when its target arrives, s.
-        a: PULSE: peak, N m. HAND, TASK_HAND: target before, rad or m. WALL: a point of it, m.
-        b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall.
+        move_start_s: when its target begins to move, s; CHIRP: beginning of its first sweep.
+        move_end_s: when its target arrives, s; CHIRP: end of its first sweep.
+        a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND: target before,
+            rad or m. WALL: a point of it, m.
+        b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall. CHIRP: frequencies
+            at the beginning and the end of a sweep, Hz.
         K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (the first one).
         B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first one).
         sampled: true: evaluated once a tick and held.
-        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (n, 1 + JOINTS).
+        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (n, 1 + JOINTS). MULTISINE:
+            rows of frequency, Hz, phase at the start in turns, and a column that is not used.
     """
 
     acts: TorqueKind
@@ -82,6 +92,7 @@ TorqueTable = Array
 
 _PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
 _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
+_CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
 
 
 def torque_source_rows(actors: tuple[TorqueSource, ...]) -> tuple[TorqueSourceRows, TorqueTable]:
@@ -151,6 +162,30 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 
 
 @leaf
+def _sine_of_turns(turns: float) -> float:
+    s, _ = sincos(2.0 * math.pi * (turns - math.floor(turns)))
+    return s
+
+
+@leaf
+def _chirp_torque(actor: Row, t_s: float) -> Pair:
+    """Returns peak * sin(2 pi x (f0 + (f1 - f0) x / (2 span))), x the time within the present sweep."""
+    span_s = actor.move_end_s - actor.move_start_s
+    x = t_s - actor.start_s
+    x -= span_s * math.floor(x / span_s)
+    s = _sine_of_turns(x * (actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x))
+    return actor.a[0] * s, actor.a[1] * s
+
+
+@leaf
+def _multisine_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
+    total = 0.0
+    for n in range(actor.table_first, actor.table_first + actor.table_count):
+        total += _sine_of_turns(table[n, 0] * (t_s - actor.start_s) + table[n, 1])
+    return actor.a[0] * total, actor.a[1] * total
+
+
+@leaf
 def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
     """Returns the force of a wall on the end effector, N: along its normal, and never a pull."""
     depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
@@ -190,6 +225,10 @@ def source_torque(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row
         return -actor.B[0] * qd[0], -actor.B[1] * qd[1]
     if actor.acts == _RECORDED:
         return _recorded_torque(actor, t_s, table)
+    if actor.acts == _CHIRP:
+        return _chirp_torque(actor, t_s)
+    if actor.acts == _MULTISINE:
+        return _multisine_torque(actor, t_s, table)
     return _end_effector_torque(actor, t_s, q, qd, lengths)
 
 
@@ -212,3 +251,29 @@ def torque_on_arm(
             total_0 += torque[0]
             total_1 += torque[1]
     return total_0, total_1
+
+
+@leaf
+def environment_torque(
+    t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows, table: TorqueTable
+) -> tuple[Pair, Pair, float]:
+    """Returns the torque of environments on the arm, present and held, N m, and the largest wall force, N."""
+    now_0 = now_1 = held_0 = held_1 = peak_n = 0.0
+    for n in range(actors.shape[0]):
+        actor: Row = actors[n]
+        if (actor.acts != _VISCOUS and actor.acts != _WALL) or actor.sampled > 1:
+            continue
+        torque = source_torque(t_s, q, qd, lengths, actor, table)
+        if actor.sampled == 1:
+            held_0 += torque[0]
+            held_1 += torque[1]
+        else:
+            now_0 += torque[0]
+            now_1 += torque[1]
+        if actor.acts == _WALL and (torque[0] != 0.0 or torque[1] != 0.0):
+            _, at = forward_kinematics(lengths, q)
+            x, y = end_effector_jacobian(lengths, q)
+            speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
+            force = _wall_force(actor, at, speed)
+            peak_n = max(peak_n, math.sqrt(force[0] * force[0] + force[1] * force[1]))
+    return (now_0, now_1), (held_0, held_1), peak_n

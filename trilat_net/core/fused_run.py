@@ -6,13 +6,14 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 
 import numpy as np
 
+from .exogenous import TorqueSourceRows, TorqueTable, environment_torque
 from .jit import leaf
 from .kernel import act_stages, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
-from .site_arrays import RECORD_Q_DES, RECORD_TAU_X, ROW_FLOATS, SiteArrays
+from .site_arrays import RECORD_Q_DES, RECORD_TAU, RECORD_TAU_X, ROW_FLOATS, SiteArrays
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .two_link_arm import JOINTS
-from .vectors import Array, IntArray, Row, RowArray
+from .vectors import Array, IntArray, Row, RowArray, pair
 
 NEVER_NS = 2**63 - 1
 """The time of the next tick of a site that has made all its ticks."""
@@ -24,6 +25,20 @@ BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of 
 (-1: never)."""
 SENT_DTYPE = np.dtype((np.record, [("t_ns", "i8"), ("row", "f8", (ROW_FLOATS,))]))
 """The record of a tick, as long as a peer may still want it."""
+
+_PAIR = (JOINTS,)
+SUMS_DTYPE = np.dtype(
+    (
+        np.record,
+        [
+            ("environment", "i8"),
+            *((name, "f8") for name in ("effort", "force_peak_n", "environment_j")),
+            *((name, "f8", _PAIR) for name in ("errors", "q", "now", "held")),
+        ],
+    )
+)
+"""A site's sums over its records: 1 if it has environments; sums of |tau - G|^2 and of e^2; the largest
+force of a wall; the work of its environments. And of the record before: q, their present and held torque."""
 
 _DIVERGED = int(Mode.DIVERGED)
 
@@ -46,11 +61,13 @@ def _receive(
 
 
 @leaf
-def _update_peaks(row: Array, t_ns: int, apart_rad: float, progress: Row, peaks: Array) -> None:
+def _update_peaks(row: Array, t_ns: int, apart_rad: float, progress: Row, peaks: Array, sums: Row) -> None:
     """Updates the largest |e| and |qd| of the present bucket by a record; a full bucket is left."""
     error = speed = 0.0
     for i in range(JOINTS):
-        error = max(error, abs(row[i] - row[RECORD_Q_DES + i]))
+        e = row[i] - row[RECORD_Q_DES + i]
+        sums.errors[i] += e * e
+        error = max(error, abs(e))
         speed = max(speed, abs(row[JOINTS + i]))
     n = progress.bucket
     peaks[n, 0] = max(peaks[n, 0], error)
@@ -64,6 +81,31 @@ def _update_peaks(row: Array, t_ns: int, apart_rad: float, progress: Row, peaks:
 
 
 @leaf
+def _update_sums(
+    k: int, t_ns: int, s: Row, actors: TorqueSourceRows, table: TorqueTable, row: Array, sums: Row
+) -> None:
+    """Adds a record to the effort, and the period before it to the work of the environments.
+
+    G is in the regressor of this tick, whose last columns are g cos q_1 and g cos(q_1 + q_2).
+    """
+    outer = s.Y[1, 4] * s.theta[4]
+    off_0 = row[RECORD_TAU] - (s.Y[0, 3] * s.theta[3] + outer)
+    off_1 = row[RECORD_TAU + 1] - outer
+    sums.effort += off_0 * off_0 + off_1 * off_1
+    if sums.environment == 0:
+        return
+    q, qd = (row[0], row[1]), (row[2], row[3])
+    now, held, force_n = environment_torque(t_ns * 1e-9, q, qd, pair(s.lengths), actors, table)
+    sums.force_peak_n = max(sums.force_peak_n, force_n)
+    if k > 0:
+        for i in range(JOINTS):
+            mean = 0.5 * (sums.now[i] + now[i]) + sums.held[i]
+            sums.environment_j += mean * (q[i] - sums.q[i])
+    for i in range(JOINTS):
+        sums.q[i], sums.now[i], sums.held[i] = q[i], now[i], held[i]
+
+
+@leaf
 def run_until(
     last_ns: int,
     apart_rad: float,
@@ -71,6 +113,7 @@ def run_until(
     taken: IntArray,
     sent: RowArray,
     peaks: Array,
+    sums: RowArray,
     arrays: SiteArrays,
 ) -> None:
     """Steps every site up to a time, or to the instant at which one diverges.
@@ -82,6 +125,7 @@ def run_until(
         taken: the next sample of each peer to accept, shape (N, P).
         sent: each site's last records, shape (N, a power of two), SENT_DTYPE.
         peaks: largest |e| and |qd| of each bucket, -1 where there is no record, shape (N, buckets, 2).
+        sums: of each site, shape (N,), SUMS_DTYPE.
         arrays: of all sites, see `stack_site_arrays`.
     """
     count = progress.shape[0]
@@ -115,7 +159,9 @@ def run_until(
             record: Row = sent[i, k & (sent.shape[1] - 1)]
             record.t_ns = t_ns
             act_stages(k, t_ns, site, arrays.actors[i], arrays.table, record.row)
-            _update_peaks(record.row, t_ns, apart_rad, own, peaks[i])
+            total: Row = sums[i]
+            _update_peaks(record.row, t_ns, apart_rad, own, peaks[i], total)
+            _update_sums(k, t_ns, site[0], arrays.actors[i], arrays.table, record.row, total)
             if site[0].mode == _DIVERGED:
                 own.diverged_ns = t_ns
                 last_ns = t_ns

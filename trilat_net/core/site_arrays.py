@@ -51,8 +51,8 @@ ARRIVAL_DTYPE = np.dtype(
 
 ROW_FLOATS = 6 * JOINTS + PARAMETERS
 """The floats of a record, one after the other: q, qd, q_des, qd_des, tau, tau_x, theta_hat."""
-RECORD_Q_DES, RECORD_TAU_X = 2 * JOINTS, 5 * JOINTS
-"""Where two of them begin."""
+RECORD_Q_DES, RECORD_TAU, RECORD_TAU_X = 2 * JOINTS, 4 * JOINTS, 5 * JOINTS
+"""Where three of them begin."""
 
 
 class SiteArrays(NamedTuple):

@@ -1,22 +1,25 @@
 """The virtual-time driver without a log: all sites in one compiled loop, about 1000 times real time.
 
-It keeps the peaks of every 50 ms in place of records.
+It keeps the peaks of every 50 ms, and sums over the run, in place of records.
 
 Invariant: the result equals `execution.virtual` with its default network, bit for bit; scenarios that the
 compiled loop cannot run are refused.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import PROGRESS_DTYPE, SENT_DTYPE, run_until
+from ..core.fused_run import PROGRESS_DTYPE, SENT_DTYPE, SUMS_DTYPE, run_until
 from ..core.site_arrays import stack_site_arrays
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, tick_ns
+from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array, Row, RowArray
 from ..errors import ScenarioError
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
+from ..scenario.operators import Wall
 
 
 def check_fusable(scenario: Scenario) -> None:
@@ -54,6 +57,22 @@ def _largest_ratio(scenario: Scenario) -> int:
     return math.ceil(max(rates_hz) / min(rates_hz))
 
 
+class RunTotals(NamedTuple):
+    """Numbers of a whole run.
+
+    Attributes:
+        rms_error_rad: RMS of e of the worst joint of all sites.
+        effort_nm: RMS over sites and joints of tau - G(q), the torque beyond what gravity asks.
+        force_peak_n: the largest force of a wall; None without a wall.
+        walls_j: the work of the environments on the arms; None without one.
+    """
+
+    rms_error_rad: float
+    effort_nm: float
+    force_peak_n: float | None
+    walls_j: float | None
+
+
 class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
@@ -74,6 +93,8 @@ class FusedRun:
         kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
         self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
         self._peaks = np.full((count, 0, 2), -1.0)
+        self._sums: RowArray = np.zeros(count, SUMS_DTYPE)
+        self._sums["environment"] = [len(spec.environment) > 0 for spec in scenario.sites.values()]
         self.ran_s = 0.0
 
     def advance(self, until_s: float) -> None:
@@ -90,9 +111,8 @@ class FusedRun:
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
-        run_until(
-            last_ns, self._apart_rad, self._progress, self._taken, self._sent, self._peaks, self._tables
-        )
+        rows = (self._progress, self._taken, self._sent, self._peaks, self._sums)
+        run_until(last_ns, self._apart_rad, *rows, self._tables)
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     @property
@@ -120,6 +140,19 @@ class FusedRun:
         return tuple(
             self._peaks[n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1]
             for n, progress in enumerate(self._progress)
+        )
+
+    @property
+    def totals(self) -> "RunTotals":
+        """Errors, effort and contact over the whole run."""
+        ticks = self._progress["tick"].astype(np.float64)
+        specs = self._scenario.sites.values()
+        touched = any(isinstance(one, Wall) for spec in specs for one in spec.environment)
+        return RunTotals(
+            rms_error_rad=float(np.sqrt(self._sums["errors"] / ticks[:, None]).max()),
+            effort_nm=float(np.sqrt(np.mean(self._sums["effort"] / (JOINTS * ticks)))),
+            force_peak_n=float(self._sums["force_peak_n"].max()) if touched else None,
+            walls_j=float(self._sums["environment_j"].sum()) if self._sums["environment"].any() else None,
         )
 
     @property

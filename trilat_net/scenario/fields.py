@@ -60,10 +60,12 @@ def _vector_lengths(kind: StructType) -> Mapping[str, int]:
 
 
 def expand_vectors(table: TomlTable, kind: StructType) -> TomlTable:
-    """Returns a table with every single number written out as the vector that its type has."""
+    """Returns a table with every single number or distribution written out as the vector of its type."""
     lengths = _vector_lengths(kind)
     return {
-        key: [value] * lengths[key] if key in lengths and is_number(value) else value
+        key: [value] * lengths[key]
+        if key in lengths and (is_number(value) or is_distribution(value))
+        else value
         for key, value in table.items()
     }
 
@@ -71,6 +73,11 @@ def expand_vectors(table: TomlTable, kind: StructType) -> TomlTable:
 def is_number(value: Any) -> TypeGuard[float]:
     """True for a number as an author writes it; true and false are none."""
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def is_distribution(value: Any) -> bool:
+    """True for a table that stands for a number: { normal = [...] } or { uniform = [...] }."""
+    return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..errors import ScenarioError
+from .distributions import Draws
 from .fields import (
     MAX_QUANTITY,
     Frozen,
@@ -34,6 +35,7 @@ from .fields import (
     is_number,
 )
 
+Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
 
 
@@ -148,6 +150,59 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
+class Chirp(ActorBase, frozen=True, tag="chirp"):
+    """A torque of an operator whose frequency runs from one to another, evenly, again and again.
+
+    Attributes:
+        peak_nm: its peak on each joint, N m.
+        from_hz: frequency at the beginning of a sweep, Hz.
+        to_hz: frequency at its end, Hz.
+        sweep_s: duration of a sweep, s.
+        start_s: when it begins.
+        end_s: when it ends.
+    """
+
+    peak_nm: Joints
+    from_hz: Frequency
+    to_hz: Frequency
+    sweep_s: Positive
+    start_s: NotNegative = 0.0
+    end_s: Positive = MAX_QUANTITY
+
+    def _source(self) -> TorqueSource:
+        sweep = (self.start_s, self.start_s + self.sweep_s)
+        return TorqueSource(
+            TorqueKind.CHIRP, self.start_s, self.end_s, *sweep, self.peak_nm, (self.from_hz, self.to_hz)
+        )
+
+
+class Multisine(ActorBase, frozen=True, tag="multisine"):
+    """A torque of an operator that is a sum of sines of one amplitude.
+
+    Attributes:
+        amplitude_nm: amplitude of each sine on each joint, N m.
+        frequencies_hz: their frequencies, Hz.
+        phases_rad: their phases at the start, rad; left out: -pi k (k - 1) / n for the k-th of n, which keeps
+            the peak of their sum low (Schroeder, "Synthesis of low-peak-factor signals and binary sequences
+            with low autocorrelation", IEEE Trans. Information Theory 16 (1970)).
+        start_s: when it begins.
+        end_s: when it ends.
+    """
+
+    amplitude_nm: Joints
+    frequencies_hz: Annotated[tuple[Frequency, ...], Meta(min_length=1, max_length=64)]
+    phases_rad: Annotated[tuple[Real, ...], Meta(max_length=64)] = ()
+    start_s: NotNegative = 0.0
+    end_s: Positive = MAX_QUANTITY
+
+    def _source(self) -> TorqueSource:
+        count = len(self.frequencies_hz)
+        turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
+        turns = turns or [-k * (k - 1) / (2.0 * count) for k in range(1, count + 1)]
+        table = np.column_stack((self.frequencies_hz, turns, np.zeros(count)))
+        return TorqueSource(TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table)
+
+
 class ViscousEnvironment(ActorBase, frozen=True, tag="viscous"):
     """An environment that resists motion of the joints.
 
@@ -198,7 +253,7 @@ class Wall(ActorBase, frozen=True, tag="wall"):
         return TorqueSource(TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled)
 
 
-Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque
+Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque | Chirp | Multisine
 Environment = ViscousEnvironment | Wall
 OPERATORS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Operator)}
 ENVIRONMENTS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Environment)}
@@ -217,6 +272,11 @@ _WORDS = {
     "peak_nm": "one torque for both joints or two, ON the arm, N m",
     "stiffness_nm_rad": f"{_GAIN}, N m/rad",
     "damping_nm_s_rad": f"{_GAIN}, N m s/rad",
+    "amplitude_nm": "one torque for both joints or two, ON the arm, N m",
+    **dict.fromkeys(("from_hz", "to_hz"), "a frequency above 0 and up to 1000 Hz"),
+    "sweep_s": "a duration above 0 s",
+    "frequencies_hz": "a list of 1 to 64 frequencies above 0 and up to 1000 Hz",
+    "phases_rad": "a list of angles, rad, one for each frequency",
     "normal": "two numbers, x and y: to which side the wall is free",
     "points": f"a list of rows {_ROW}",
     "sampled": "true or false",
@@ -231,29 +291,32 @@ _SHOWN = 60
 
 
 def resolve_operators(
-    written: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str
+    written: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str, draws: Draws
 ) -> list[TomlTable]:
     """Returns a site's operators or environments, complete, of the kinds that it may hold.
 
-    `site` is the site's own tables, complete but for this; errors call the list `path`.
+    `site` is the site's own tables, complete but for this; errors call the list `path`; `draws` gives the
+    numbers of distributions.
     """
     if not isinstance(written, list):
         raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
-    return [_resolve_actor(entry, kinds, site, f"{path}[{n}]") for n, entry in enumerate(written)]
+    return [_resolve_actor(entry, kinds, site, f"{path}[{n}]", draws) for n, entry in enumerate(written)]
 
 
-def _resolve_actor(entry: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str) -> TomlTable:
+def _resolve_actor(
+    entry: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str, draws: Draws
+) -> TomlTable:
     if not isinstance(entry, dict):
         raise ScenarioError("must be a table", path=path)
     kind = _check_kind(entry, kinds, path)
     check_keys(entry, ("kind", *field_names(kinds[kind])), path)
-    table = expand_vectors(entry, kinds[kind])
+    table = draws.draw_numbers(expand_vectors(entry, kinds[kind]), path)
     if kind == "spring":
-        table.setdefault("from_rad", site["q0_rad"])
-        table.setdefault("to_rad", table["from_rad"])
+        draws.follow_start(table, "from_rad", site["q0_rad"], path)
+        draws.follow_start(table, "to_rad", table["from_rad"], path)
     if kind == "tip_spring":
-        table.setdefault("from_m", _end_effector(site))
-        table.setdefault("to_m", table["from_m"])
+        draws.follow_start(table, "from_m", _end_effector(site), path)
+        draws.follow_start(table, "to_m", table["from_m"], path)
     _check_values(table, kinds[kind], entry, path)
     return table
 

@@ -19,6 +19,7 @@ from ..core.two_link_arm import JOINTS
 from ..errors import ScenarioError
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
+from .distributions import Draws
 from .expect import Expect, check_window_keys
 from .fields import (
     TomlTable,
@@ -35,10 +36,11 @@ from .operators import ENVIRONMENTS, OPERATORS, resolve_operators
 from .scenario_types import SITE_GROUPS, Change, SiteSpec
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
-_TABLES = (*SITE_GROUPS, "control", "link", "sites", "dominance", "links", "timeline", "expect")
+_TABLES = (*SITE_GROUPS, "control", "link", "sites", "dominance", "links", "timeline", "expect", "drawn")
 _SITE = field_names(SiteSpec)
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
+_DEFAULT_SEED = 1
 MAX_SITES = 32
 """Most sites of an experiment; every pair of them has two links."""
 
@@ -78,7 +80,8 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     check_keys(tables.get("expect", {}), field_names(Expect), "expect")
     check_window_keys(tables.get("expect", {}).get("windows"))
     _resolve_control(tables.get("control", {}), {}, "control")
-    sites = _resolve_sites(tables)
+    draws = Draws(tables.get("seed", _DEFAULT_SEED), tables.get("drawn", {}))
+    sites = _resolve_sites(tables, draws)
     written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
     for name in sites:
         if name not in written:
@@ -88,7 +91,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
     return {
         "duration_s": 20.0,
-        "seed": 1,
+        "seed": _DEFAULT_SEED,
         "scheme": "second_order",
         **resolved,
         "sites": sites,
@@ -96,6 +99,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "links": links,
         "timeline": resolve_timeline(tables.get("timeline", []), links, list(sites)),
         "expect": tables.get("expect", {}),
+        "drawn": msgspec.to_builtins(draws.drawn),
     }
 
 
@@ -134,7 +138,7 @@ def _unix_lines(value: Any) -> Any:
     return value.replace("\r\n", "\n").replace("\r", "\n") if isinstance(value, str) else value
 
 
-def _resolve_sites(tables: TomlTable) -> TomlTable:
+def _resolve_sites(tables: TomlTable, draws: Draws) -> TomlTable:
     sites: TomlTable = {}
     if not isinstance(tables["sites"], dict):
         raise ScenarioError("must be tables [sites.NAME]", path="sites")
@@ -157,14 +161,24 @@ def _resolve_sites(tables: TomlTable) -> TomlTable:
         site.setdefault("rate_hz", tables.get("rate_hz", 1000))
         site.setdefault("q0_rad", [0.0] * JOINTS)
         site.setdefault("qd0_rad_s", [0.0] * JOINTS)
+        _draw_site(site, path, draws)
         for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-            site[group] = resolve_operators(site.get(group, []), kinds, site, f"{path}.{group}")
+            site[group] = resolve_operators(site.get(group, []), kinds, site, f"{path}.{group}", draws)
         sites[name] = {key: site[key] for key in field_names(SiteSpec) if key in site}
     if len(sites) > MAX_SITES:
         raise ScenarioError(f"has {len(sites)} sites, at most {MAX_SITES} are taken", path="sites")
     if len(sites) < 2:
         raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")
     return sites
+
+
+def _draw_site(site: TomlTable, path: str, draws: Draws) -> None:
+    """Replaces the distributions of a site, its operators and environments aside, by numbers."""
+    site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)
+    for group in (*SITE_GROUPS, "control"):
+        site[group] = draws.draw_numbers(site[group], f"{path}.{group}")
+    if isinstance(settings := site["control"].get("settings"), dict):
+        site["control"]["settings"] = draws.draw_numbers(settings, f"{path}.control.settings")
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:

@@ -68,6 +68,15 @@ def load_scenario(
     return parse_scenario(text, str(source), overrides, folder)
 
 
+def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
+    """Returns the same experiment with another seed, which draws its random numbers again.
+
+    Raises:
+        ScenarioError: the seed is not valid, or draws a number that its key does not take.
+    """
+    return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
+
+
 def read_source(source: str | Path) -> tuple[str, Path]:
     """Returns the TOML text of a shipped name or a path, and the folder of the files that it names.
 

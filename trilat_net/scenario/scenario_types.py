@@ -23,6 +23,7 @@ from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks, theta_from_links
 from ..core.vectors import Array
 from .delay_models import Link, LinkBase
+from .distributions import Distribution
 from .expect import Expect
 from .fields import Frozen, Joints, NotNegative, Positive, RateHz
 from .laws import ControlLaw, ImportedLaw
@@ -166,6 +167,7 @@ def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int
 _ABSENT: dict[str, tuple[Any, ...]] = {
     "timeline": ((), []),
     "expect": ({},),
+    "drawn": ({},),
     "on_stale": ({},),
     "environment": ((), []),
     "plant": ("simulated",),
@@ -195,6 +197,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         links: "j->i" for every pair of sites.
         timeline: changes during the run.
         expect: expectations, see `trilat test`.
+        drawn: the distributions that numbers of the sites were drawn from, by dotted key.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
@@ -206,6 +209,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     links: dict[str, Link]
     timeline: tuple[Change, ...] = ()
     expect: Expect = Expect()
+    drawn: dict[str, Distribution] = msgspec.field(default_factory=dict)
     title: str = ""
     about: str = ""
     assumed: tuple[str, ...] = ()
@@ -262,6 +266,11 @@ class Scenario(Frozen, frozen=True, dict=True):
     @property
     def random(self) -> bool:
         """True if anything is drawn: then another seed is another run."""
+        return bool(self.drawn) or self.links_random
+
+    @property
+    def links_random(self) -> bool:
+        """True if some link draws its delays or losses while the run goes on."""
         return any(link.random for link in self._all_links())
 
     @property
@@ -325,4 +334,5 @@ class Scenario(Frozen, frozen=True, dict=True):
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without operators."""
         sites = {name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()}
-        return msgspec.structs.replace(self, sites=sites)
+        drawn = {key: one for key, one in self.drawn.items() if ".hands." not in key}
+        return msgspec.structs.replace(self, sites=sites, drawn=drawn)

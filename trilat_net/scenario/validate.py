@@ -16,10 +16,19 @@ import msgspec
 from ..core.two_link_arm import is_positive_definite
 from ..errors import ScenarioError
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
+from .distributions import dotted_key
 from .expect import find_expect_problem
 from .fields import TomlTable
 from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
-from .operators import EndEffectorSpring, Environment, JointSpring, Operator, RecordedTorque, Wall
+from .operators import (
+    EndEffectorSpring,
+    Environment,
+    JointSpring,
+    Multisine,
+    Operator,
+    RecordedTorque,
+    Wall,
+)
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 FORCE_REFLECTION_SITES = 2
@@ -83,7 +92,9 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at ")
         dotted = _name_key(resolved, path.strip("`$."))
-        raise ScenarioError(_reword(problem, dotted), path=dotted) from None
+        drawn = resolved.get("drawn", {}).get(dotted_key(dotted))
+        why = f"; {drawn['value']:g} was drawn with seed {resolved['seed']}" if drawn else ""
+        raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
     for name, site in scenario.sites.items():
         if not is_positive_definite(site.arm.theta):
             raise ScenarioError(
@@ -113,6 +124,8 @@ def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
                 key, problem = "points", "must be in the order of their times"
         elif actor.end_s <= actor.start_s:
             key, problem = "end_s", f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}"
+        elif isinstance(actor, Multisine) and len(actor.phases_rad) not in (0, len(actor.frequencies_hz)):
+            key, problem = "phases_rad", f"must be {len(actor.frequencies_hz)} angles, as many as frequencies"
         elif isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
             key, problem = "normal", "must point somewhere, is zero"
         elif isinstance(actor, JointSpring | EndEffectorSpring) and actor.move_end_s < actor.move_start_s:

@@ -18,6 +18,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
+from ..scenario.operators import Chirp, Multisine
 from .linear_loop import LinearLoop, find_loop_states, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import ESTIMATE, Q, describe_switching_points, has_estimate
@@ -88,7 +89,10 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
 
 
 def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the experiment prolonged: forces present at its end stay, nothing new begins."""
+    """Returns the experiment prolonged: forces present at its end stay, but for those that swing.
+
+    Nothing new begins.
+    """
     end_s = scenario.duration_s
 
     def prolong(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
@@ -97,7 +101,7 @@ def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
             if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
             else actor
             for actor in actors
-            if getattr(actor, "start_s", 0.0) <= end_s
+            if getattr(actor, "start_s", 0.0) <= end_s and not isinstance(actor, Chirp | Multisine)
         )
 
     sites = {

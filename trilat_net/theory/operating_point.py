@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.delay import DelayKind
-from ..core.exogenous import TorqueKind, TorqueSource
+from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.philox import link_key
 from ..core.site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup, StaleAction
 from ..core.site_step import Site
@@ -238,11 +238,17 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
         for actor in present
     ):
         notes.append(f"an operator at {name} still moves at the end: taken to be at the end of that motion")
-    scripted = [actor for actor in present if actor.acts in (TorqueKind.PULSE, TorqueKind.RECORDED)]
+    if any(actor.acts in _PERIODIC for actor in present):
+        notes.append(f"an operator at {name} still swings at the end: left out, its torque has no mean")
+    scripted = [actor for actor in present if actor.acts in SCRIPTED_KINDS and actor.acts not in _PERIODIC]
     constant = [actor._replace(a=_scripted_torque(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):
         notes.append(f"a scripted torque acts on {name} at the end: taken to stay as it is then")
-    return setup._replace(actors=(*(actor for actor in present if actor not in scripted), *constant))
+    others = (actor for actor in present if actor.acts not in SCRIPTED_KINDS)
+    return setup._replace(actors=(*others, *constant))
+
+
+_PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)
 
 
 def _scripted_torque(actor: TorqueSource, t_s: float) -> tuple[float, ...]:

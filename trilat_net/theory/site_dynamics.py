@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import TorqueKind, TorqueSource
+from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
@@ -122,7 +122,7 @@ def _sum_actors(site: SiteSetup, q: Numbers, qd: Numbers, *, sampled: bool) -> N
 
 def _actor_torque(site: SiteSetup, actor: TorqueSource, q: Numbers, qd: Numbers) -> Numbers:
     """Returns the torque of one actor: an operator's motion has ended, a scripted torque is constant, `a`."""
-    if actor.acts in (TorqueKind.PULSE, TorqueKind.RECORDED):
+    if actor.acts in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
     stiffness, damping = _as_columns(actor.K, q), _as_columns(actor.B, q)
     if actor.acts is TorqueKind.VISCOUS:

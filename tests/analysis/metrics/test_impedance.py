@@ -123,3 +123,35 @@ def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
     for one in found:
         if one.kind == "impedance":
             assert one.ratio.gain is None
+
+
+def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
+    """Of joint 1 of a pair M s^2 + d s + K, coupled by K exp(-s T), gains as in `shaken`."""
+    s = 2j * math.pi * frequency_hz
+    M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
+    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
+    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return complex(1.0 / (s * q[0]))
+
+
+CHIRP = {"kind": "chirp", "peak_nm": [1.0, 0.0], "from_hz": 0.5, "to_hz": 4.5, "sweep_s": 4.0}
+MULTISINE = {"kind": "multisine", "amplitude_nm": [0.3, 0.0], "frequencies_hz": [0.5, 1.25, 2.0, 3.0, 4.0]}
+
+
+@pytest.mark.parametrize(("hand", "lines"), [(CHIRP, 15), (MULTISINE, 5)])
+def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
+    """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
+    log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
+    found = next(one for one in compute_log_metrics(log).responses if (one.at, one.joint) == ("m", 1))
+    c2 = math.cos(float(log["m"].q[:, 1].mean()))
+    assert len(found.spectrum) == lines
+    for line in found.spectrum:
+        Z = closed_form_impedance(line.frequency_hz, c2)
+        assert line.gain == pytest.approx(abs(Z), rel=0.02 + 2.0 * line.error)
+        assert line.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.02 + 3.0 * line.error)
+        assert line.coherence > (0.998 if hand is MULTISINE else 0.92)
+    assert found.ratio in found.spectrum
+    assert [line.frequency_hz for line in found.spectrum] == sorted(
+        line.frequency_hz for line in found.spectrum
+    )

@@ -9,6 +9,7 @@ import pytest
 
 from trilat_net.analysis.run_end import EndBehaviour, classify_log_end
 from trilat_net.execution import virtual
+from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import (
@@ -78,7 +79,9 @@ def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
     assert found.extended > 0
     assert found.ran_s == 4.0 * 2**found.extended
     whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
-    assert msgspec.structs.replace(found, extended=0) == whole
+    totals = FusedRun(scenario)  # those of the scenario's own duration
+    totals.advance(4.0)
+    assert msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict()) == found
 
 
 def test_a_slow_trend_of_a_run_with_chance_in_it_decides_nothing() -> None:

@@ -1,8 +1,9 @@
 """Rendered impedance and reflected wall force over frequency, by a run's frequency response.
 
-Invariant: a response without sufficient excitation is undecided, with a reason. It is given at the one
-spectral line with the strongest drive, if at least `MIN_SEGMENTS` independent segments excite it and both
-signals have a coherence of at least `MIN_COHERENCE` with the drive: then its random error is below 17 %.
+Invariant: a response without sufficient excitation is undecided, with a reason. It is given at the spectral
+line with the strongest drive, and at all that are driven nearly as much, if at least `MIN_SEGMENTS`
+independent segments excite the line and both signals have a coherence of at least `MIN_COHERENCE` with the
+drive: then its random error is below 17 %.
 
 In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its own that
 depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources (Welch; Bendat and Piersol;
@@ -35,6 +36,8 @@ _OVERLAP_FACTOR = 1.06
 """So many segments under a Hann window count as one if they overlap by half."""
 MIN_DRIVE_TORQUE_NM = 0.05
 """Least amplitude of a torque that drives, N m."""
+_NEARLY = 0.55
+"""Share of the strongest drive from which on a line counts as driven: a Hann window leaks 0.5 to the next."""
 STILL_SCRIPT_NM_S = 1e-6
 """A script that changes by less stands still, N m/s."""
 NO_SCRIPT_TEXT = "what the hand was to do is not in the scenario: nobody knows who drives"
@@ -64,9 +67,17 @@ class FrequencyResponse(NamedTuple):
 def estimate_response(
     drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
 ) -> FrequencyResponse:
-    """Returns the ratio of two signals at the line with the strongest drive, if that is `least` or larger.
+    """Returns the ratio of two signals at the line with the strongest drive, see `estimate_responses`."""
+    return estimate_responses(drive, put_in, came_out, usable, rate_hz, least)[0]
 
-    The drive depends on no other signal. Usable are rows that are recorded while no other drive is active.
+
+def estimate_responses(
+    drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
+) -> list[FrequencyResponse]:
+    """Returns the ratio of two signals at the driven lines, that with the strongest drive first.
+
+    Driven is a line with a drive of `least` or more; without one, the only entry says so. The drive depends
+    on no other signal. Usable are rows that are recorded while no other drive is active.
     Own code in place of `scipy.signal.csd`, which cannot leave out segments with unusable rows.
     """
     length = round(SEGMENT_S * rate_hz)
@@ -76,16 +87,20 @@ def estimate_response(
         first = np.arange(0, len(usable) - length + 1, length // 2)
         starts = first[unusable[first + length] == unusable[first]].tolist()
     if not starts:
-        return FrequencyResponse(why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives")
+        return [FrequencyResponse(why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives")]
     D = _spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
-        return FrequencyResponse(why="its numbers are too large")
-    line = int(power.argmax())
-    if math.sqrt(2.0 * power[line]) < least:
-        return FrequencyResponse(why="nothing drives it")
-    X, Y = (_spectra(one, starts, length)[:, line] for one in (put_in, came_out))
-    return _estimate_at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X, Y)
+        return [FrequencyResponse(why="its numbers are too large")]
+    strongest = int(power.argmax())
+    if math.sqrt(2.0 * power[strongest]) < least:
+        return [FrequencyResponse(why="nothing drives it")]
+    driven = np.flatnonzero(power >= max(0.5 * least**2, _NEARLY**2 * power[strongest]))
+    X, Y = (_spectra(one, starts, length) for one in (put_in, came_out))
+    return [
+        _estimate_at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X[:, line], Y[:, line])
+        for line in (strongest, *driven[driven != strongest].tolist())
+    ]
 
 
 def _estimate_at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -> FrequencyResponse:
@@ -133,6 +148,8 @@ class ImpedanceEstimate(NamedTuple):
             all behind it, N m s/rad. "reflection": torque that an operator feels over the one of the
             environment ON another arm.
         at, of: the site of the operator, and of a reflection that of the environment, else "".
+        ratio: at the line with the strongest drive.
+        spectrum: at every driven line, by rising frequency.
     """
 
     kind: str
@@ -140,6 +157,7 @@ class ImpedanceEstimate(NamedTuple):
     of: str
     joint: int
     ratio: FrequencyResponse
+    spectrum: tuple[FrequencyResponse, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -162,7 +180,7 @@ def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Itera
     script, usable = by_source.script, _find_still_rows(runs, site, alone=not wall)
     rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)
     for joint in range(JOINTS):
-        response = FrequencyResponse(why=NO_SCRIPT_TEXT)
+        found = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
         if script is not None and usable is not None:
             usable, operator = usable & records.known, by_source.operator[:, joint]
             if wall:
@@ -170,8 +188,10 @@ def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Itera
                 signals = torque, torque, -operator, usable & recorded
             else:
                 signals = script[:, joint], records.qd[:, joint], operator, usable
-            response = estimate_response(*signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
-        yield ImpedanceEstimate("reflection" if wall else "impedance", site, wall, joint + 1, response)
+            found = estimate_responses(*signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
+        spectrum = sorted((one for one in found if one.frequency_hz), key=lambda one: one.frequency_hz or 0.0)
+        kind = "reflection" if wall else "impedance"
+        yield ImpedanceEstimate(kind, site, wall, joint + 1, found[0], tuple(spectrum))
 
 
 def _find_still_rows(runs: Mapping[str, SiteRun], at: str, *, alone: bool) -> Bools | None:

@@ -21,7 +21,7 @@ from ..link_summary import LinkSummary, summarise_links
 from ..torque_sources import attribute_torque
 from . import motion_metrics as motion
 from . import static_windows
-from .impedance import ImpedanceEstimate, estimate_impedances
+from .impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
 from .metric_catalogue import (
     ENERGY,
     LOOP,
@@ -223,11 +223,16 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         "felt": [
             {
                 **one._asdict(),
-                "ratio": {**one.ratio._asdict(), "why": one.ratio.why or None, "unit": one.unit},
+                "ratio": _response_to_json(one.ratio, one.unit),
+                "spectrum": [_response_to_json(line, one.unit) for line in one.spectrum],
             }
             for one in metrics.responses
         ],
     }
+
+
+def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:
+    return {**response._asdict(), "why": response.why or None, "unit": unit}
 
 
 def _value_and_why(key: str, one: Metric) -> dict[str, Any]:

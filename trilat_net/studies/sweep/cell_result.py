@@ -14,7 +14,7 @@ import msgspec
 from ...analysis.run_end import EndBehaviour, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...errors import ScenarioError
-from ...execution.fused import FusedRun, check_fusable
+from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
 
 
@@ -59,6 +59,8 @@ class CellResult(msgspec.Struct, frozen=True):
         peak_error_rad: the largest abs(e) of the run, rad.
         settled_s: since when abs(e) is below 0.01 rad; None where it is not at the end.
         diverged_s: when the first site left its limits, or None.
+        rms_error_rad: this and the others down to `walls_j` are those of `RunTotals`, over the duration of
+            the scenario, extensions left out.
     """
 
     verdict: CellClass
@@ -72,6 +74,10 @@ class CellResult(msgspec.Struct, frozen=True):
     peak_error_rad: float
     settled_s: float | None
     diverged_s: float | None
+    rms_error_rad: float | None = None
+    effort_nm: float | None = None
+    force_peak_n: float | None = None
+    walls_j: float | None = None
 
 
 FLAT_LOG_CHANGE = 0.02
@@ -109,13 +115,13 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     ends_s = scenario.duration_s
     run.advance(ends_s)
-    extended = 0
-    while not is_conclusive(outcome := _cell_result(run, extended)) and ends_s < longest_s:
+    totals, extended = run.totals, 0
+    while not is_conclusive(outcome := _cell_result(run, totals, extended)) and ends_s < longest_s:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
     trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
-    wanders = scenario.random and trend and not _pronounced(outcome)
+    wanders = scenario.links_random and trend and not _pronounced(outcome)
     return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED) if wanders else outcome
 
 
@@ -146,7 +152,7 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
     return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
 
 
-def _cell_result(run: FusedRun, extended: int) -> CellResult:
+def _cell_result(run: FusedRun, totals: RunTotals, extended: int) -> CellResult:
     maxima = run.maxima
     end = classify_run_end(maxima, run.ran_s, run.diverged_s)
     rates = (end.error.rate_per_s, end.speed.rate_per_s)
@@ -163,4 +169,5 @@ def _cell_result(run: FusedRun, extended: int) -> CellResult:
         peak_error_rad=max(float(values[:, 0].max()) for values in maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,
+        **totals._asdict(),
     )

@@ -17,26 +17,12 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...errors import UsageError
+from ...execution.fused import RunTotals
 from ...files import import_extra
+from ..intervals import MeanInterval, mean_interval, wilson_interval
 from .cell_result import CellClass, CellResult
 from .sweep_cell import CellRun, apply_diff, build_sim_command
 from .sweep_plan import SweepPlan, plan_from_json
-
-
-def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
-    """Returns the 95 % score interval of a share, which has a width even if all runs agree.
-
-    Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
-    Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta, "Interval estimation for a
-    binomial proportion", Statistical Science 16 (2001).
-    """
-    from scipy.stats import binomtest  # takes half a second, which most commands can do without
-
-    if runs == 0:
-        return 0.0, 1.0
-    low, high = binomtest(successes, runs).proportion_ci(method="wilson")
-    return float(low), float(high)
-
 
 RESULTS_FILE = "results.parquet"
 _PLAN_KEY = "trilat_net.sweep"
@@ -79,7 +65,8 @@ class SweepResults(NamedTuple):
 
     def outcome(self, row: ResultRow) -> CellResult:
         """Returns the result of a run."""
-        return msgspec.convert({field: row[field] for field in CellResult.__struct_fields__}, CellResult)
+        known = (field for field in CellResult.__struct_fields__ if field in row)  # older files lack some
+        return msgspec.convert({field: row[field] for field in known}, CellResult)
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
@@ -170,15 +157,25 @@ def read_results(path: Path) -> SweepResults:
 
 
 GRID_POINTS_FILE = "places.parquet"
+RUN_TOTALS = RunTotals._fields
+"""The numbers of a run that are averaged over its seeds."""
 
 
 class GridPoint(NamedTuple):
-    """One cell with all its seeds: how many runs came to each class, in the order of `CellClass`."""
+    """One cell with all its seeds.
+
+    Attributes:
+        cell, law, values: its place.
+        counts: how many runs came to each class, in the order of `CellClass`.
+        means: of each of `RUN_TOTALS` its mean over the runs that stayed within their limits; None of fewer
+            than two runs.
+    """
 
     cell: int
     law: str
     values: tuple[float | str, ...]
     counts: tuple[int, ...]
+    means: tuple[MeanInterval | None, ...] = (None,) * len(RUN_TOTALS)
 
     @property
     def decided(self) -> int:
@@ -203,13 +200,17 @@ class GridPoint(NamedTuple):
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     """Returns every grid point of a sweep, in the order of the cells."""
-    counted: dict[tuple[int, str], Counter[str]] = {}
+    rows_of: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
-        counted.setdefault((row["cell"], row["law"]), Counter())[row["verdict"]] += 1
-    return [
-        GridPoint(cell, law, results.plan.cell(cell).values, tuple(counts[one.value] for one in CellClass))
-        for (cell, law), counts in counted.items()
-    ]
+        rows_of.setdefault((row["cell"], row["law"]), []).append(row)
+    points = []
+    for (cell, law), rows in rows_of.items():
+        counts = Counter(row["verdict"] for row in rows)
+        kept = [row for row in rows if row["diverged_s"] is None]
+        means = tuple(mean_interval([row.get(key) for row in kept]) for key in RUN_TOTALS)
+        values = results.plan.cell(cell).values
+        points.append(GridPoint(cell, law, values, tuple(counts[one.value] for one in CellClass), means))
+    return points
 
 
 def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
@@ -230,4 +231,8 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
     columns["stable_share"] = shares, float
     columns["stable_share_low"] = [low for low, _ in intervals], float
     columns["stable_share_high"] = [high for _, high in intervals], float
+    for n, key in enumerate(RUN_TOTALS):
+        means = [one.means[n] for one in found]
+        columns[f"{key}_mean"] = [mean and mean.mean for mean in means], float
+        columns[f"{key}_half"] = [mean and mean.half for mean in means], float
     return _encode_parquet(columns)

@@ -9,7 +9,7 @@ is written out and named instead.
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -185,6 +185,12 @@ def _run_cells(plan: SweepPlan, journal: SweepJournal, pool: WorkerPool, progres
     make(((number, seed) for number in again for seed in others), plan.cells + len(again) * len(others))
 
 
+_TOTALS = {
+    "rms_error_rad": ("RMS e", "rad"),
+    "effort_nm": ("effort", "N m"),
+    "force_peak_n": ("peak force", "N"),
+    "walls_j": ("work of the walls", "J"),
+}
 _MAX_DOUBTFUL_SHOWN = 8
 """Most doubtful grid points printed; all stand in the file."""
 
@@ -218,8 +224,21 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
         first_s = results.plan.base.duration_s
         went_on = f"and went on, the longest to {longest_s:g} s"
         yield f"{len(extended)} were not plain after {first_s:g} s {went_on}"
+    yield from _describe_totals(rows)
     if len(results.plan.seeds) > 1:
         yield from _of_seeds(results)
+
+
+def _describe_totals(rows: Sequence[ResultRow]) -> Iterator[str]:
+    """Yields the ranges of the numbers of all runs that stayed within their limits."""
+    kept = [row for row in rows if row["diverged_s"] is None]
+    words = []
+    for key, (name, unit) in _TOTALS.items():
+        values = [row[key] for row in kept if row.get(key) is not None]
+        if values:
+            words.append(f"{name} {min(values):.3g} to {max(values):.3g} {unit}")
+    if words:
+        yield f"within their limits {len(kept)}: {', '.join(words)}"
 
 
 def _of_seeds(results: SweepResults) -> Iterator[str]:

@@ -20,6 +20,7 @@ class ExpectationResult(msgspec.Struct, frozen=True):
         key: the key of [expect] that asked, or a word for what every run must do.
         margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare, negative is
             beyond it. None where there is no such number.
+        value: the measured number, in the unit of the limit; None where it is none.
     """
 
     key: str
@@ -27,6 +28,7 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     measured: str
     limit: str
     margin: float | None = None
+    value: float | None = None
 
 
 def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
@@ -100,7 +102,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float, unit: st
         return ExpectationResult(key, False, "never", wanted)
     spare = measured - limit if least else limit - measured
     text = f"{measured:.4g} {unit}".rstrip()
-    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None)
+    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured)
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
@@ -131,4 +133,5 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
             text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
             spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
             margin = spare / half if half else None
-            yield ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin)
+            value = found.most if found.least == found.most else None
+            yield ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)

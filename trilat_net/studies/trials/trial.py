@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import tomli_w
 
 from ...errors import LawFailed, LogError, ScenarioError
@@ -18,6 +17,8 @@ from ...execution.verify import verify
 from ...log.log_reader import open_log
 from ...net.clock import SystemClock
 from ...scenario import Scenario, load_scenario
+from ...scenario.fields import is_distribution
+from ...scenario.scenario_reader import reseed_scenario
 from ..commands import format_command, set_options
 from .expectations import ExpectationResult, evaluate_expectations
 from .measure_run import RunMetrics, measure_log, measure_virtual_run
@@ -131,7 +132,7 @@ def trials(
     if not scenario.random and not live:
         del chosen[1:]
     texts = tuple(_assignments(set) if isinstance(set, Mapping) else set)
-    return [Trial(msgspec.structs.replace(scenario, seed=seed), called, texts, live) for seed in chosen]
+    return [Trial(reseed_scenario(scenario, seed), called, texts, live) for seed in chosen]
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
@@ -156,7 +157,7 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 def _assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Yields overrides as the command line takes them."""
     for key, value in overrides.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and not is_distribution(value):
             yield from _assignments(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}={_one_line(value)}"
@@ -166,6 +167,8 @@ def _one_line(value: Any) -> str:
     """Returns a value as TOML on one line."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_one_line, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key} = {_one_line(entry)}' for key, entry in value.items())}}}"
     return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
 
 

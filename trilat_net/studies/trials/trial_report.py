@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from ...reporting.text_table import TextTable
+from ..intervals import MeanInterval, mean_interval
 from .expectations import ExpectationResult
 from .trial import TrialResult
 
@@ -22,13 +23,14 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of one scenario: its worst outcome, and in how many of its runs it held."""
+    """One expectation of one scenario: its worst outcome, in how many of its runs it held, and the mean."""
 
     scenario: str
     key: str
     worst: ExpectationResult
     held: int
     runs: int
+    mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
         """Returns the row's texts, under `TRIAL_COLUMNS`."""
@@ -82,7 +84,11 @@ class TrialReport(NamedTuple):
 
     def table(self) -> list[str]:
         """Returns the table as aligned lines; the first holds the heads."""
-        return TextTable(TRIAL_COLUMNS, [row.cells() for row in self.rows()], align="lllllrr").lines()
+        rows = self.rows()
+        if not any(row.mean for row in rows):
+            return TextTable(TRIAL_COLUMNS, [row.cells() for row in rows], align="lllllrr").lines()
+        cells = [(*row.cells(), str(row.mean) if row.mean else "") for row in rows]
+        return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def text(self) -> str:
         """Returns all of it as plain text."""
@@ -104,7 +110,14 @@ def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
         return outcome.held, outcome.margin or 0.0  # the failed first, then by margin
 
     rows = [
-        ExpectationRow(name, key, min(outcomes, key=order), sum(o.held for o in outcomes), len(outcomes))
+        ExpectationRow(
+            name,
+            key,
+            min(outcomes, key=order),
+            sum(outcome.held for outcome in outcomes),
+            len(outcomes),
+            mean_interval([outcome.value for outcome in outcomes]),
+        )
         for key, outcomes in by_key.items()
     ]
     if broken := [result.error for result in results if result.error]:

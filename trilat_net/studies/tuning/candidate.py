@@ -22,6 +22,7 @@ from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
 from ..commands import format_command, set_options
+from ..intervals import mean_interval
 from ..record_batches import RecordBatch, run_in_batches
 from .final_posture import (
     CandidateClass,
@@ -45,6 +46,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
         settled_s: since when the largest |e| is below 0.01 rad; None where it is not at the end.
         saturated: share of all joint torques that were at the clamp.
         diverged_s: when the first site left its limits, or None.
+        seeds: how many runs it is the mean of; its outcome is the worst of theirs.
+        error_half_rad, effort_half_nm: half the width of the 95 % interval of that mean; None of one run.
     """
 
     outcome: CandidateClass
@@ -55,6 +58,27 @@ class CandidateScore(msgspec.Struct, frozen=True):
     settled_s: float | None
     saturated: float
     diverged_s: float | None = None
+    seeds: int = 1
+    error_half_rad: float | None = None
+    effort_half_nm: float | None = None
+
+
+def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
+    """Returns the score of a candidate from those of its seeds; a number that one of them lacks is None."""
+    if len(scores) == 1:
+        return scores[0]
+    rank = list(CandidateClass)
+    worst = min(scores, key=lambda score: rank.index(score.outcome))
+    named = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
+    means = {name: mean_interval([getattr(score, name) for score in scores]) for name in named}
+    error, effort = means["error_rad"], means["effort_nm"]
+    return msgspec.structs.replace(
+        worst,
+        **{name: mean and mean.mean for name, mean in means.items()},
+        seeds=len(scores),
+        error_half_rad=error and error.half,
+        effort_half_nm=effort and effort.half,
+    )
 
 
 def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
@@ -158,10 +182,14 @@ def _ending(t_s: Array, apart: Array, off: Array, e: Array) -> CandidateEnd:
 
 
 class CandidateTask(NamedTuple):
-    """One candidate to be run: the canonical texts of its scenario and of its twin, and what it is called."""
+    """One candidate to be run.
 
-    text: str
-    twin_text: str | None
+    Attributes:
+        runs: of each seed the canonical texts of its scenario and of its twin.
+        name: what it is called.
+    """
+
+    runs: tuple[tuple[str, str | None], ...]
     name: str
 
     def __str__(self) -> str:
@@ -170,7 +198,7 @@ class CandidateTask(NamedTuple):
 
 def measure_candidate_task(task: CandidateTask) -> CandidateScore:
     """Runs one task, in whatever process."""
-    return measure_candidate(task.text, task.twin_text)
+    return average_scores([measure_candidate(*run) for run in task.runs])
 
 
 class TuningScenario(NamedTuple):
@@ -204,7 +232,7 @@ class TuningScenario(NamedTuple):
         """What has to be run to measure it."""
         alone = build_twin(self.scenario)
         name = ", ".join(self.overrides) or self.source
-        return CandidateTask(self.scenario.text, None if alone is None else alone.text, name)
+        return CandidateTask(((self.scenario.text, None if alone is None else alone.text),), name)
 
     @property
     def command(self) -> str:

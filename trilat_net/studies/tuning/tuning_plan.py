@@ -14,12 +14,19 @@ from ...execution import virtual
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from .candidate import CandidateScore, TuningScenario, load_tuning_scenario, measure_candidate_task
+from .candidate import (
+    CandidateScore,
+    CandidateTask,
+    TuningScenario,
+    load_tuning_scenario,
+    measure_candidate_task,
+)
 from .final_posture import CandidateClass, build_twin, check_comparable
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
 from .search_space import (
     PAPER_GAINS,
     SEARCH_SPACES,
+    GainValues,
     ModelInformation,
     SearchSpace,
     build_model_information,
@@ -29,6 +36,7 @@ from .search_space import (
 DEFAULT_BUDGET = 64
 """Candidates per law: four laws on `free` take some minutes on two cores."""
 MAX_BUDGET = 100_000
+MAX_TUNING_SEEDS = 1000
 MAX_TICKS = 10_000_000
 """Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites has 180 000."""
 
@@ -62,7 +70,10 @@ class SearchResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison that can be run: `budget` candidates per law, `seed` of the search."""
+    """A comparison that can be run: `budget` candidates per law, `seed` of the search.
+
+    `others` is the experiment with further seeds: of each candidate the mean over all seeds counts.
+    """
 
     base: TuningScenario
     spaces: list[SearchSpace]
@@ -70,23 +81,30 @@ class TuningPlan(NamedTuple):
     seed: int
     objective: Objective
     knowledge: ModelInformation
+    others: tuple[TuningScenario, ...] = ()
 
     @property
     def runs(self) -> int:
         """How many runs it takes, those with printed gains and twins counted."""
-        return (len(self.spaces) * self.budget + len(self.printed())) * (1 + self.twin)
+        candidates = len(self.spaces) * self.budget + len(self.printed(self.base))
+        return candidates * (1 + self.twin) * (1 + len(self.others))
 
     @property
     def twin(self) -> bool:
         """True if the pose is measured on a twin: then every candidate is two runs."""
         return build_twin(self.base.scenario) is not None
 
-    def printed(self) -> dict[str, TuningScenario]:
+    def printed(self, base: TuningScenario) -> dict[str, TuningScenario]:
         """Returns the gains that the paper prints, by name, with the common information and without."""
-        told = SEARCH_SPACES["adaptive"].controls(self.base.scenario, self.knowledge, PAPER_GAINS)
+        told = SEARCH_SPACES["adaptive"].controls(base.scenario, self.knowledge, PAPER_GAINS)
         untold = {name: {**table, "theta_hat0": 0.0} for name, table in told.items()}
         controls = {"as printed": told, "as printed, told nothing": untold}
-        return {name: self.base.with_controls(tables) for name, tables in controls.items()}
+        return {name: base.with_controls(tables) for name, tables in controls.items()}
+
+    def task(self, space: SearchSpace, gains: GainValues) -> CandidateTask:
+        """Returns a candidate to be run, with every seed."""
+        bases = (self.base, *self.others)
+        return _join_tasks([base.with_gains(space, self.knowledge, gains).task for base in bases])
 
     def estimate_s(self, jobs: int | None = None) -> float:
         """Returns about how long the search will take, s: by a short run of the experiment."""
@@ -113,7 +131,8 @@ class TuningPlan(NamedTuple):
             RunFailed: a candidate ended its workers, or the cluster is gone.
         """
         searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
-        printed = self.printed()
+        printed = self.printed(self.base)
+        of_others = [self.printed(base) for base in self.others]
         measured: list[CandidateScore] = []
         total, done = len(searches) * self.budget + len(printed), 0
 
@@ -126,12 +145,14 @@ class TuningPlan(NamedTuple):
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
                 tasks = [
-                    self.base.with_gains(search.space, self.knowledge, gains).task
+                    self.task(search.space, gains)
                     for search, batch in zip(searches, asked, strict=True)
                     for gains in batch
                 ]
                 if number == 0:
-                    tasks += [candidate.task for candidate in printed.values()]
+                    tasks += [
+                        _join_tasks([found[name].task for found in (printed, *of_others)]) for name in printed
+                    ]
                 scores = iter(pool.map(measure_candidate_task, tasks, show))
                 done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):
@@ -143,6 +164,11 @@ class TuningPlan(NamedTuple):
             found.append(SearchResult(search.space, search.tried, search.scores, front))
         paper = [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)]
         return TuningResult(self, found, paper)
+
+
+def _join_tasks(tasks: Sequence[CandidateTask]) -> CandidateTask:
+    """Returns one candidate from its tasks of several seeds."""
+    return tasks[0]._replace(runs=tuple(run for task in tasks for run in task.runs))
 
 
 _EDGE = 1.02
@@ -194,6 +220,7 @@ def plan_tuning(
     seed: int = 1,
     objective: str = "error",
     gravity_percent: float = 100.0,
+    seeds: int = 1,
 ) -> TuningPlan:
     """Returns a comparison, checked and ready to run.
 
@@ -203,6 +230,7 @@ def plan_tuning(
         laws: which laws; none means all that take any number of sites.
         budget: candidates per law.
         seed: of the search; the seed of the scenario is the scenario's own.
+        seeds: of how many seeds of the scenario, from its own on, each candidate is the mean.
         objective: "error" or "settling".
         gravity_percent: gravity that all laws get, in per cent of the truth.
 
@@ -216,6 +244,8 @@ def plan_tuning(
         raise UsageError(f"--seed is from 0 to 2^63 - 1, not {seed}")
     if objective not in list(Objective):
         raise UsageError(f"--objective is {' or '.join(Objective)}, not {objective!r}")
+    if not 1 <= seeds <= MAX_TUNING_SEEDS:
+        raise UsageError(f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}")
     knowledge = build_model_information(gravity_percent)
     found = load_tuning_scenario(source, overrides)
     scenario = found.scenario
@@ -227,4 +257,6 @@ def plan_tuning(
         )
         raise ScenarioError(problem, path="duration_s", source=str(source))
     check_comparable(scenario)
-    return TuningPlan(found, spaces, budget, seed, Objective(objective), knowledge)
+    more = range(scenario.seed + 1, scenario.seed + seeds) if scenario.random else ()
+    others = tuple(load_tuning_scenario(source, (*overrides, f"seed={one}")) for one in more)
+    return TuningPlan(found, spaces, budget, seed, Objective(objective), knowledge, others)

@@ -22,6 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.text_table import TextTable
+from ..intervals import MeanInterval
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
 from .pareto_search import REFINEMENT_STEPS, Objective, ObjectivePoint
@@ -94,8 +95,14 @@ _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s"
 
 
 def _score_cells(score: CandidateScore) -> tuple[str, ...]:
-    numbers = (score.error_rad, score.spread_rad, score.pose_rad, score.effort_nm, score.settled_s)
-    return (*(_number(number) for number in numbers), f"{100.0 * score.saturated:.2g}")
+    error = _with_interval(score.error_rad, score.error_half_rad)
+    effort = _with_interval(score.effort_nm, score.effort_half_nm)
+    spread, pose, settled = map(_number, (score.spread_rad, score.pose_rad, score.settled_s))
+    return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.2g}"
+
+
+def _with_interval(mean: float | None, half: float | None) -> str:
+    return _number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
@@ -112,6 +119,8 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         plan.knowledge.text + ("; known gets inertia exactly as well" if informed else ""),
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS of tau - G(q)",
     ]
+    if plan.others:
+        lines.append(f"every candidate is the mean of {1 + len(plan.others)} seeds, with its 95 % interval")
     if plan.objective is Objective.SETTLING:
         lines.append("sought: the time from which the largest |e| stays below 0.01 rad, against effort")
     if plan.twin:
@@ -175,6 +184,7 @@ def tuning_to_json(tuned: TuningResult) -> TuningJson:
         "procedure": {
             "candidates_per_law": asked.budget,
             "seed": asked.seed,
+            "seeds": 1 + len(asked.others),
             "latin_hypercube": (asked.budget + 1) // 2,
             "refining_steps": list(REFINEMENT_STEPS),
             "runs": asked.runs,

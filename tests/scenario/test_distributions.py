@@ -1,0 +1,104 @@
+"""Distributions in place of numbers: drawn by seed, written resolved, drawn again by another seed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.scenario.distributions import Distribution
+from trilat_net.scenario.scenario_reader import reseed_scenario
+
+EXAMPLE: dict[str, Any] = {
+    "sites.m1.q0_rad": {"normal": [0.1, 0.02]},
+    "arm.m1_kg": {"uniform": [0.9, 1.1]},
+    "control.Kd": {"normal": [3.0, 0.1]},
+    "sites.m1.hands": [
+        {"kind": "spring", "stiffness_nm_rad": {"uniform": [20.0, 30.0]}, "end_s": 5.0},
+        {"kind": "tip_spring", "stiffness_n_m": [30.0, 30.0]},
+        {"kind": "pulse", "start_s": 1.0, "end_s": {"uniform": [3.0, 5.0]}, "peak_nm": [10.0, 0.0]},
+    ],
+}
+
+
+def drawn(seed: int) -> Scenario:
+    return load_scenario("free", {**EXAMPLE, "seed": seed})
+
+
+def test_each_number_is_drawn_by_itself() -> None:
+    """Joints, sites and seeds differ; the same seed gives the same."""
+    one, other = drawn(1), drawn(2)
+    assert one == drawn(1)
+    assert len(set(one.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
+    assert len({spec.arm.m1_kg for spec in (*one.sites.values(), *other.sites.values())}) == 6
+    assert one.random
+    assert not one.links_random
+    assert one.drawn["sites.m1.q0_rad.1"].value == one.sites["m1"].q0_rad[1]
+
+
+def test_another_number_that_is_drawn_changes_none() -> None:
+    more = load_scenario(drawn(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
+    assert more.sites["m1"] == drawn(1).sites["m1"]
+    assert more.sites["s"].q0_rad != drawn(1).sites["s"].q0_rad
+
+
+def test_numbers_are_distributed_as_asked() -> None:
+    """By the statistic of Kolmogorov and Smirnov, at 1e-4: a wrong mean or width of 10 % fails."""
+    from scipy import stats
+
+    keys = [f"sites.m1.q0_rad.{n}" for n in range(2000)]
+    normal = [Distribution(normal=(0.1, 0.02), value=0.0).draw(7, key) for key in keys]
+    uniform = [Distribution(uniform=(-1.0, 3.0), value=0.0).draw(7, key) for key in keys]
+    assert stats.kstest(normal, stats.norm(0.1, 0.02).cdf).pvalue > 1e-4
+    assert stats.kstest(uniform, stats.uniform(-1.0, 4.0).cdf).pvalue > 1e-4
+    assert abs(np.corrcoef(normal[1:], normal[:-1])[0, 1]) < 0.08
+
+
+def test_the_text_is_canonical_and_holds_what_was_drawn() -> None:
+    one = drawn(3)
+    again = parse_scenario(one.text)
+    assert again == one
+    assert again.sha256 == one.sha256
+    assert "[drawn" not in load_scenario("free").text
+
+
+def test_another_seed_draws_again_wherever_the_scenario_came_from() -> None:
+    """From a scenario, and from the text of a log: hands that hold the start pose too."""
+    for found in (reseed_scenario(drawn(1), 5), reseed_scenario(parse_scenario(drawn(2).text), 5)):
+        assert found == drawn(5)
+        assert found.sha256 == drawn(5).sha256
+    spring, tip, _ = found.sites["m1"].hands
+    assert spring.from_rad == spring.to_rad == found.sites["m1"].q0_rad
+    a, b = found.sites["m1"].q0_rad
+    assert tip.from_m == pytest.approx((np.cos(a) + np.cos(a + b), np.sin(a) + np.sin(a + b)))
+
+
+def test_a_number_that_was_replaced_stays() -> None:
+    fixed = load_scenario(drawn(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"})
+    other = reseed_scenario(fixed, 2)
+    assert other.sites["m1"].q0_rad == (0.3, 0.0)
+    assert other.sites["m1"].arm == drawn(2).sites["m1"].arm
+    assert not any(".control." in key for key in other.drawn)
+
+
+def test_an_experiment_without_operators_is_still_itself() -> None:
+    alone = drawn(1).without_hands()
+    assert parse_scenario(alone.text) == alone
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "problem"),
+    [
+        ("sites.m1.q0_rad", {"normal": [0.1]}, "sites.m1.q0_rad[0]: must be { normal = [mean, deviation] }"),
+        ("arm.m1_kg", {"normal": [1.0, -0.1]}, "sites.m1.arm.m1_kg: must be { normal"),
+        ("arm.m1_kg", {"uniform": [2.0, 1.0]}, "sites.m1.arm.m1_kg: must be { normal"),
+        ("arm.m1_kg", {"normal": [1.0, 0.1], "uniform": [0.0, 1.0]}, "sites.m1.arm.m1_kg: must be { normal"),
+        ("sites.m1.arm.m1_kg", {"uniform": [-2.0, -1.0]}, "was drawn with seed 1"),
+        ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn: "),
+    ],
+)
+def test_what_is_no_distribution_is_refused_at_its_key(key: str, value: Any, problem: str) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        load_scenario("free", {key: value})
+    assert problem in str(refused.value)

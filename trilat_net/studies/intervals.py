@@ -1,0 +1,45 @@
+"""Confidence intervals of 95 % over the runs of many seeds: of a share of them, and of a mean.
+
+Invariant: an interval is a function of its numbers, and has a width unless all runs are one.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+
+def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
+    """Returns the 95 % score interval of a share, which has a width even if all runs agree.
+
+    Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
+    Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta, "Interval estimation for a
+    binomial proportion", Statistical Science 16 (2001).
+    """
+    from scipy.stats import binomtest  # takes half a second, which most commands can do without
+
+    if runs == 0:
+        return 0.0, 1.0
+    low, high = binomtest(successes, runs).proportion_ci(method="wilson")
+    return float(low), float(high)
+
+
+class MeanInterval(NamedTuple):
+    """The mean of the numbers of several runs, and half the width of its 95 % interval by Student's t."""
+
+    mean: float
+    half: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.4g} +- {self.half:.2g}"
+
+
+def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
+    """Returns the mean of two numbers or more; None of fewer, or if one is missing."""
+    known = [value for value in values if value is not None]
+    if len(known) < 2 or len(known) < len(values):
+        return None
+    from scipy.special import stdtrit  # as above
+
+    spread = float(np.std(known, ddof=1) / np.sqrt(len(known)))
+    return MeanInterval(float(np.mean(known)), float(stdtrit(len(known) - 1, 0.975)) * spread)
