@@ -38,11 +38,6 @@ def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
     assert "1: a.mcap" in printed
 
 
-def test_arms_that_hang_are_named(logs: Path) -> None:
-    printed = trilat("compare", "a.mcap", "hang.mcap", cwd=logs).succeeds()
-    assert "hang: m1, m2, s hang at the end" in printed
-
-
 def test_logs_of_different_scenarios_are_compared_and_that_is_said(logs: Path) -> None:
     printed = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
     assert "logs of different scenarios: free, two_sites" in printed

@@ -9,9 +9,8 @@ from .running import trilat
 
 
 @pytest.fixture
-def folder(tmp_path: Path, short_log: bytes) -> Path:
-    (tmp_path / "run.mcap").write_bytes(short_log)
-    return tmp_path
+def folder(log_file: Path) -> Path:
+    return log_file.parent
 
 
 def test_figures_are_written_by_name(folder: Path) -> None:

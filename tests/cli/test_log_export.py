@@ -43,9 +43,8 @@ def test_an_export_goes_where_it_is_told_and_replaces_only_what_it_may(folder: P
     trilat(*command, cwd=folder).refuses("tables: exists", "--force")
     trilat(*command, "--force", cwd=folder).succeeds()
     assert pl.read_csv(folder / "tables" / "s_state.csv").height == 120
-    trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder).refuses(
-        "run.mcap: exists"
-    )
+    done = trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder)
+    done.refuses("run.mcap: exists")
     assert (folder / "run.mcap").read_bytes() == recorded("paper")
 
 
@@ -59,9 +58,8 @@ def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
-    trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder).refuses(
-        "--to", "xlsx", "ros2, parquet, csv"
-    )
+    done = trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder)
+    done.refuses("--to", "xlsx", "ros2, parquet, csv")
     assert [path.name for path in folder.iterdir()] == ["run.mcap"]
 
 
@@ -88,9 +86,8 @@ def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> Non
     every = messages(recorded("paper"))
     topic = next(m[0] for m in every if m[0].endswith("/s/state"))
     (folder / "bad.mcap").write_bytes(a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)]))
-    trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder).refuses(
-        "bad.mcap: a record of s cannot be"
-    )
+    done = trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder)
+    done.refuses("bad.mcap: a record of s cannot be")
     assert sorted(path.name for path in folder.iterdir()) == ["bad.mcap", "run.mcap"]
 
 

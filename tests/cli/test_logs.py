@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
 
 from tests.log_editing import edited
 from trilat_net.log.log_reader import open_log
@@ -74,14 +73,6 @@ def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: 
     assert done.code == 1, done
     assert "tau" in done.err
     assert "scenario" in done.err
-
-
-def test_a_log_of_another_program_is_bad_input(tmp_path: Path) -> None:
-    with (tmp_path / "other.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.finish()
-    trilat("verify", "other.mcap", cwd=tmp_path).refuses("no log of trilat-net")
 
 
 def test_a_torn_log_is_verified_as_far_as_it_is_whole_and_says_so(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from tests.studies.sweep.quick import SHORT
 from trilat_net.cli.sweep import parse_seed_count
-from trilat_net.errors import UsageError
 
 from .running import trilat
 
@@ -68,8 +67,6 @@ def test_seeds_are_a_number_or_a_list() -> None:
     assert parse_seed_count("10") == 10
     assert parse_seed_count("1..3,8") == [1, 2, 3, 8]
     assert parse_seed_count("7..7") == parse_seed_count("7,") == [7]
-    with pytest.raises(UsageError, match=r"1\.\.20"):
-        parse_seed_count("x")
 
 
 BAD = {

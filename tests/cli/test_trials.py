@@ -59,10 +59,9 @@ def test_one_scenario_that_fails_among_others_is_1(folder: Path) -> None:
 
 
 def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
+    command = ("test", "./quick.toml", "--seeds", "1..2", "--jobs", "1", "--junit", "o.xml")
     for more, failures in (((), "0"), (TOO_MUCH, "2")):
-        trilat(
-            "test", "./quick.toml", "--seeds", "1..2", "--jobs", "1", "--junit", "o.xml", *more, cwd=folder
-        )
+        trilat(*command, *more, cwd=folder)
         root = Xml.parse(folder / "o.xml").getroot()
         assert (root.get("tests"), root.get("failures")) == ("2", failures)
 

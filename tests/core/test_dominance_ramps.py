@@ -18,10 +18,12 @@ from trilat_net.core.ticks import Arrival, CoreChange, DominanceRamp, TickInput,
 S = 10**9
 PEERS = 3
 ULP = 2.0**-52
+Row = tuple[float, ...]
+Ramps = list[DominanceRamp]
 
 
 @st.composite
-def rows(draw: st.DrawFn) -> tuple[float, ...]:
+def rows(draw: st.DrawFn) -> Row:
     """Shares that sum to 1 as closely as doubles do."""
     parts = draw(st.lists(st.integers(0, 10**6), min_size=PEERS, max_size=PEERS))
     assume(sum(parts) > 0)
@@ -29,27 +31,25 @@ def rows(draw: st.DrawFn) -> tuple[float, ...]:
 
 
 @st.composite
-def ramp_lists(draw: st.DrawFn) -> list[DominanceRamp]:
+def ramp_lists(draw: st.DrawFn) -> Ramps:
     """Up to six ramps in the order of their starts; they may overlap, touch, take no time, or begin at 0."""
     starts = sorted(draw(st.lists(st.integers(0, 10 * S), max_size=6)))
     lasts = st.one_of(st.just(0), st.integers(1, 5 * S))
     return [DominanceRamp(start, start + draw(lasts), draw(rows())) for start in starts]
 
 
-def table(first: tuple[float, ...], ramps: list[DominanceRamp]) -> np.ndarray:
+def table(first: Row, ramps: Ramps) -> np.ndarray:
     return np.array([(0, 0, *first), *((r.start_ns, r.end_ns, *r.alpha) for r in ramps)], dtype=np.float64)
 
 
-def shares(
-    t_ns: int, first: tuple[float, ...], ramps: list[DominanceRamp]
-) -> tuple[list[float], list[float]]:
+def shares(t_ns: int, first: Row, ramps: Ramps) -> tuple[list[float], list[float]]:
     """(alpha, its derivative) per peer."""
     links = np.zeros(PEERS, LINK_DTYPE)
     apply_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
     return links["alpha"].tolist(), links["alpha_rate"].tolist()
 
 
-def exact(t_ns: int, first: tuple[float, ...], ramps: list[DominanceRamp]) -> list[Fraction]:
+def exact(t_ns: int, first: Row, ramps: Ramps) -> list[Fraction]:
     """The same in fractions: each ramp leads from where the ones before it are to its own end."""
     if not ramps or t_ns < ramps[0].start_ns:
         return [Fraction(a) for a in first]
@@ -66,17 +66,13 @@ times = st.integers(0, 16 * S)
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_shares_are_those_of_the_ramps(
-    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
-) -> None:
+def test_shares_are_those_of_the_ramps(first: Row, ramps: Ramps, t_ns: int) -> None:
     alpha, _ = shares(t_ns, first, ramps)
     assert alpha == pytest.approx([float(a) for a in exact(t_ns, first, ramps)], abs=1e-14)
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_a_row_sums_to_one_at_all_times(
-    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
-) -> None:
+def test_a_row_sums_to_one_at_all_times(first: Row, ramps: Ramps, t_ns: int) -> None:
     """Within two units in the last place, plus what its rows are off themselves."""
     alpha, rates = shares(t_ns, first, ramps)
     off = max(abs(math.fsum(row) - 1.0) for row in (first, *(ramp.alpha for ramp in ramps)))
@@ -89,9 +85,7 @@ def test_a_row_sums_to_one_at_all_times(
 
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
-def test_the_derivative_is_the_finite_difference(
-    first: tuple[float, ...], ramps: list[DominanceRamp], t_ns: int
-) -> None:
+def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns: int) -> None:
     step_ns = 1000
     edges = [edge for ramp in ramps for edge in (ramp.start_ns, ramp.end_ns)]
     assume(not any(t_ns < edge <= t_ns + step_ns for edge in edges))

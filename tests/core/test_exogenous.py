@@ -20,6 +20,7 @@ from trilat_net.scenario.operators import Multisine
 
 LENGTHS = np.array([1.0, 0.9])
 STEP = 1e-6
+Pair = tuple[float, float]
 number = st.floats(-3, 3)
 pairs = st.tuples(number, number)
 stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
@@ -77,7 +78,7 @@ def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
 
 
 @given(q=angles, K=stiff, target=pairs)
-def test_a_hand_that_stays_is_a_spring(q: Array, K: tuple[float, float], target: tuple[float, float]) -> None:
+def test_a_hand_that_stays_is_a_spring(q: Array, K: Pair, target: Pair) -> None:
     """Its torque is what its energy 1/2 K (q - target)^2 goes downhill by."""
     hand = TorqueSource(TorqueKind.HAND, K=K, a=target, b=target)
 
@@ -88,9 +89,7 @@ def test_a_hand_that_stays_is_a_spring(q: Array, K: tuple[float, float], target:
 
 
 @given(q=angles, K=stiff, target=pairs)
-def test_a_hand_at_the_tip_is_a_spring_in_the_plane(
-    q: Array, K: tuple[float, float], target: tuple[float, float]
-) -> None:
+def test_a_hand_at_the_tip_is_a_spring_in_the_plane(q: Array, K: Pair, target: Pair) -> None:
     hand = TorqueSource(TorqueKind.TASK_HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
@@ -100,9 +99,7 @@ def test_a_hand_at_the_tip_is_a_spring_in_the_plane(
 
 
 @given(q=angles, K=st.floats(0, 1000), place=pairs, direction=st.floats(-4, 4))
-def test_a_wall_is_a_spring_on_one_side(
-    q: Array, K: float, place: tuple[float, float], direction: float
-) -> None:
+def test_a_wall_is_a_spring_on_one_side(q: Array, K: float, place: Pair, direction: float) -> None:
     normal = (math.cos(direction), math.sin(direction))
     wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=place, b=normal)
 
@@ -125,7 +122,7 @@ def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: 
 
 
 @given(q=angles, qd=speeds, B=stiff)
-def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: tuple[float, float]) -> None:
+def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: Pair) -> None:
     assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(-np.array(B) * qd)
 
 

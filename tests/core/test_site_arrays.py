@@ -5,6 +5,7 @@ import pytest
 
 from tests.core.channels import channel, due
 from tests.core.kinds import KINDS, POINTS
+from tests.core.sites import setup
 from trilat_net.core.channel import LOST
 from trilat_net.core.delay import MAX_DELAY_US, max_delay_us
 from trilat_net.core.link import calendar_pages
@@ -25,24 +26,21 @@ def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
 
 def test_known_delays_take_few_pages_and_unbounded_ones_all() -> None:
     def pages(**changes: object) -> int:
-        scenario = load_scenario("free", {key.replace("__", "."): value for key, value in changes.items()})
-        return stack_site_arrays([scenario.setup(name) for name in scenario.names]).samples.shape[2]
+        setups = [setup(name, "free", **changes) for name in ("m1", "m2", "s")]
+        return stack_site_arrays(setups).samples.shape[2]
 
     assert pages(link__delay_ms=200.0) == 256
     assert pages(link__delay_ms=0.0) <= 16
-    assert (
-        10_000
-        < pages(link__model="gamma", link__delay_ms=20.0, link__deviation_ms=5.0)
-        <= calendar_pages(1000)
-    )
+    unbounded = pages(link__model="gamma", link__delay_ms=20.0, link__deviation_ms=5.0)
+    assert 10_000 < unbounded <= calendar_pages(1000)
 
 
 def test_stacked_tables_hold_each_site_s_own() -> None:
     scenario = load_scenario("windup")
     setups = [scenario.setup(name) for name in scenario.names]
     whole = stack_site_arrays(setups)
-    for n, setup in enumerate(setups):
-        own = build_site_arrays(setup)
+    for n, one in enumerate(setups):
+        own = build_site_arrays(one)
         assert whole.site[n].tobytes() == own.site.tobytes()
         assert whole.links[n].tobytes() == own.links.tobytes()
         assert whole.ramps[n].tobytes() == own.ramps.tobytes()

@@ -28,7 +28,6 @@ def simulated(name: str, overrides: Mapping[str, Any]) -> Log:
     """A virtual run, by the plain driver."""
     stream = io.BytesIO()
     virtual.write_virtual_log(load_scenario(name, overrides), stream)
-    stream.seek(0)
     return opened(stream.getvalue())
 
 

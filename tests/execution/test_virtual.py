@@ -15,6 +15,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import PromptNetwork
 from trilat_net.scenario import Scenario, load_scenario
 
+Rates = tuple[int, int, int]
 rates = st.sampled_from([1, 7, 100, 333, 450, 1000])
 
 
@@ -25,7 +26,7 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
 
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
-def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: tuple[int, ...]) -> None:
+def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     ran = [
         (o.t_ns, scenario.names.index(site.name), o.tick) for site, _, o in virtual.execute_virtual(scenario)
@@ -39,9 +40,7 @@ def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: tuple[int
 
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
-def test_every_sample_arrives_once_in_order_at_the_first_tick_after_its_stamp(
-    rate_hz: tuple[int, ...],
-) -> None:
+def test_every_sample_arrives_once_in_order_at_the_first_tick_after_its_stamp(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     stamps: dict[tuple[str, int], int] = {}
     ran = list(virtual.execute_virtual(scenario))

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.log_editing import recorded
 from tests.recorder.play.logs import session_payloads
-from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
-from trilat_net.scenario import load_scenario
 
 from .processes import Process, Session, Stage, executed_again
 
@@ -29,8 +28,7 @@ class Again:
 
     def recorder(self, log: Path) -> Process:
         return self._stage.start(
-            "second recorder",
-            *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint),
+            "second recorder", *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint)
         )
 
 
@@ -64,8 +62,7 @@ def test_a_log_that_is_played_and_recorded_again_is_the_same_bytes_in_the_same_o
 def virtual_log(folder: Path) -> Path:
     """A second of two sites."""
     path = folder / "virtual.mcap"
-    with path.open("wb") as stream:
-        virtual.write_virtual_log(load_scenario("two_sites", {"duration_s": 1.0}), stream)
+    path.write_bytes(recorded("two_sites", {"duration_s": 1.0}))
     return path
 
 

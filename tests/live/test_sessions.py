@@ -12,7 +12,6 @@ from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.scenario import load_scenario
 
 from .processes import BEGUN, PAPER, Session, Stage, connections, equal_to_virtual_time, executed_again, whole
 
@@ -166,16 +165,3 @@ def test_who_waits_in_vain_says_for_whom_and_leaves_no_file(stage: Stage) -> Non
     assert BEGUN not in site.text()
     assert "it met nobody" in recorder.text()
     assert not apart.log.exists()
-
-
-@pytest.mark.long
-def test_another_scenario_is_refused_with_both_hashes(stage: Stage) -> None:
-    session = Session(stage, "two_sites", ("m", "s"))
-    leader = session.site("m")
-    other = session.site("s", "--set", "control.Kd=5")
-    assert other.code() == 2
-    leader.signal(signal.SIGINT)
-    assert leader.code() == 130
-    (error,) = (line for line in other.text().splitlines() if line.startswith("error: "))
-    for overrides in ({}, {"control.Kd": 5}):
-        assert load_scenario("two_sites", overrides).sha256[:16] in error

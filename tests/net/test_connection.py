@@ -104,9 +104,8 @@ def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
 
 def test_a_router_listens_where_it_is_told_and_may_connect_to_others() -> None:
     assert resolve_router_connection(None, None, None, HERE) == Connection(HERE, (), "router", {})
-    assert resolve_router_connection([A], [B], file(mode="router"), HERE) == Connection(
-        [A], [B], "router", {}
-    )
+    told = resolve_router_connection([A], [B], file(mode="router"), HERE)
+    assert told == Connection([A], [B], "router", {})
     places = {"router": [C], "peer": [B]}
     assert resolve_router_connection(None, None, file(listen={"endpoints": places}), HERE).listen == [C]
     for mode in ("peer", "client"):

@@ -160,22 +160,15 @@ def test_what_is_logged_is_true() -> None:
     assert set(stats) <= set(LinkStats.__struct_fields__)
 
 
-@given(
-    st.tuples(st.integers(-10 * S, 10 * S), st.integers(-100_000, 100_000)),
-    st.tuples(st.integers(-10 * S, 10 * S), st.integers(-100_000, 100_000)),
-    st.tuples(st.floats(0, 5000), st.floats(1, 5000)),
-    st.tuples(st.floats(0, 5000), st.floats(1, 5000)),
-    st.integers(0, 600),
-    st.integers(0, 600),
-)
+Pair = tuple[float, float]
+skews = st.tuples(st.integers(-10 * S, 10 * S), st.integers(-100_000, 100_000))
+ways = st.tuples(st.floats(0, 5000), st.floats(1, 5000))
+
+
+@given(skews, skews, ways, ways, st.integers(0, 600), st.integers(0, 600))
 @settings(max_examples=8, deadline=None)
 def test_bounds_hold_whatever_the_clocks_the_ways_and_the_outage(
-    one: tuple[int, int],
-    two: tuple[int, int],
-    there: tuple[float, float],
-    back: tuple[float, float],
-    begin: int,
-    ticks: int,
+    one: Pair, two: Pair, there: Pair, back: Pair, begin: int, ticks: int
 ) -> None:
     session = Session((one, two), (queueing(*there), queueing(*back)))
     session.run(4.0, range(begin, begin + ticks))

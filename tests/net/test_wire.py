@@ -27,6 +27,8 @@ from trilat_net.net.messages import (
 from trilat_net.net.requests import ChangeReply, ChangeRequest, Pong
 from trilat_net.net.wire import MAX_BYTES, MAX_INFO_BYTES, decode, encode, encode_state
 
+from .parties import told
+
 KINDS = (State, PeerSample, LinkStats, Event, Info, Pong, ChangeRequest, ChangeReply)
 PEERS = ("m2", "s")
 LIMITS = [0.0, -0.0, 5e-324, -2.2e-308, math.pi, 1.7976931348623157e308, -1.7976931348623157e308]
@@ -261,25 +263,12 @@ def test_events_come_back(kind: str, text: str, boot: int, others: dict[str, int
 
 @given(counts=st.dictionaries(st.sampled_from(PEERS), st.integers(-1, 2**40)), boot=boots, tick=ticks)
 def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick: int) -> None:
-    stats = LinkStats(
-        v=VERSION,
-        site="m1",
-        boot=boot,
-        tick=tick,
-        t_ns=5,
-        mode="run",
-        **dict.fromkeys(("age_us", "accepted", "late", "duplicate", "refused", "dropped"), counts),
-        **dict.fromkeys(("offset_us", "bound_us", "delay_us"), counts),
-        late_max_us=1,
-        busy_max_us=2,
-        overruns=3,
-        grid_error_us=-4,
-        slew_ppb=5,
-    )
+    own = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
+    each = ("age_us", "accepted", "late", "duplicate", "refused", "dropped", "offset_us", "bound_us")
+    whole = {"late_max_us": 1, "busy_max_us": 2, "overruns": 3, "grid_error_us": -4, "slew_ppb": 5}
+    stats = LinkStats(**own, **dict.fromkeys((*each, "delay_us"), counts), **whole)
     assert decode(encode(stats), LinkStats) == stats
-    info = Info(
-        member="s", boot=boot, scenario_sha256="a", scenario="b", host="h", clock="c", fingerprint="f"
-    )
+    info = told("s", boot)
     assert decode(encode(info), Info) == info
 
 

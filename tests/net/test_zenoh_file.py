@@ -104,11 +104,8 @@ def test_what_a_session_does_not_need_is_taken_as_it_is() -> None:
     assert found(settings, "transport/unicast/open_timeout") == 700
     assert found(settings, "transport/unicast/accept_timeout") == 2_000
     assert found(settings, "transport/auth/usrpwd/password") == "p"
-    assert found(settings, "connect/retry") == {
-        "period_init_ms": 100,
-        "period_max_ms": 900,
-        "period_increase_factor": 1.5,
-    }
+    retry = {"period_init_ms": 100, "period_max_ms": 900, "period_increase_factor": 1.5}
+    assert found(settings, "connect/retry") == retry
     assert found(settings, "connect/endpoints") == ["tcp/b:1"]
     assert found(settings, "access_control/enabled") is False
 
@@ -150,10 +147,8 @@ def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_pa
     ("text", "problem"),
     [
         ("", "a Zenoh configuration is one object in braces; here are 0"),
-        ("// only a comment", "here are 0"),
         ("{}, {}", "here are 2"),
         ("[1]", r"a Zenoh configuration is one object in braces, not \[1\]"),
-        ("3", "not 3"),
         ("{\n  mode: 'peer',\n  a: [1\n}", "line 3, column 7: no JSON5: expected"),
         ("{mode:", "line 2, column 1: no JSON5: expected"),
         ("[" * 100_000, f"no JSON5: nested deeper than {MAX_DEPTH}"),

@@ -224,21 +224,11 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     network = LocalNetwork()
 
     def run(clock: RelayClock) -> None:
-        path = folder / "run.mcap"
-        recorder = Recorder(
-            network.join(),
-            clock,
-            SESSION,
-            BOOTS[topics.RECORDER],
-            LogStorage(path),
-            lambda: clock.monotonic_ns() > stop_ns,
-            str,
-        )
-        site = told("m")
-        recorder._joining.membership.met["x"] = msgspec.structs.replace(
-            site, member="x", boot=5, scenario="garbage"
-        )
-        recorder._joining.membership.met["m"] = site
+        own = (network.join(), clock, SESSION, BOOTS[topics.RECORDER], LogStorage(folder / "run.mcap"))
+        recorder = Recorder(*own, lambda: clock.monotonic_ns() > stop_ns, str)
+        met = recorder._joining.membership.met
+        met["x"] = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
+        met["m"] = told("m")
         recorder.record(EPOCH)
 
     def publish(clock: RelayClock) -> None:

@@ -62,13 +62,12 @@ def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
 
 
 def test_it_fits_a_message_however_much_is_missing() -> None:
-    names = [f"site-with-a-long-name-{n}" for n in range(12)]
-    scenario = load_scenario("two_sites")
-    desk = Desk(scenario)
+    desk = Desk(load_scenario("two_sites"))
     for key in desk.recording.accounts:
         for number in range(0, 10_000, 2):
             desk.recording.accounts[key].take(number + 2**39)
-    for name in names:
+    for n in range(12):
+        name = f"site-with-a-long-name-{n}"
         desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[key]
     desk.report.publish()
     (stats,) = heard(desk)

@@ -22,11 +22,8 @@ def test_a_run_of_constant_links_without_loss_is_not_worth_a_line():
 
 
 def test_a_link_says_what_was_stated_and_what_was_seen():
-    log = trilat_net.simulate(
-        "two_sites",
-        {"duration_s": 2, "link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50},
-    )
-    line = format_link_lines(log)[0]
+    link = {"link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50}
+    line = format_link_lines(trilat_net.simulate("two_sites", {"duration_s": 2, **link}))[0]
     assert line.startswith("link s->m: stated uniform 200 +- 28.9 ms; effective 16")
     assert " superseded " in line
     assert "lost" not in line

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import pytest
 
 from sites.peer_monitor import PeerMonitor
+from tests.net.parties import told
 from trilat_net.net import topics
 from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.membership import EventPublisher, liveliness_token, read_events
-from trilat_net.net.messages import Event, Info
+from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
 
 BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
@@ -21,8 +22,7 @@ class Desk:
         self.network = LocalNetwork()
         self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
         bus = self.network.join()
-        info = Info(member="m1", boot=1, scenario_sha256="", scenario="", host="", clock="", fingerprint="")
-        self._publisher = EventPublisher(bus, "t", info)
+        self._publisher = EventPublisher(bus, "t", told("m1", 1))
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
         self.company.admit(BOOTS)
 

@@ -40,7 +40,6 @@ def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(t
     looks: list[tuple[int, int]] = []
 
     def look(_: Bus, clock: RelayClock) -> None:
-        epoch_ns = 0
         while not path.exists():
             clock.sleep_until(clock.monotonic_ns() + 19 * MS)
             if not active_path(path).exists():

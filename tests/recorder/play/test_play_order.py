@@ -6,30 +6,27 @@ from hypothesis import strategies as st
 
 from recorder.play.batch import order_for_play
 
+Messages = list[tuple[int, int, int]]
 messages = st.lists(
     st.tuples(st.integers(-50, 50), st.integers(0, 3), st.integers(0, 12)), min_size=0, max_size=40
 )
 
 
-def ordered(given: list[tuple[int, int, int]]) -> tuple[list[int], list[int]]:
+def ordered(given: Messages) -> tuple[list[int], list[int]]:
     columns = np.array(given, dtype=np.int64).reshape(-1, 3)
     order, due_ns = order_for_play(columns[:, 0], columns[:, 1], columns[:, 2])
     return order.tolist(), due_ns.tolist()
 
 
 @given(messages)
-def test_every_message_comes_once_and_times_never_go_back(
-    given: list[tuple[int, int, int]],
-) -> None:
+def test_every_message_comes_once_and_times_never_go_back(given: Messages) -> None:
     order, due_ns = ordered(given)
     assert sorted(order) == list(range(len(given)))
     assert due_ns == sorted(due_ns)
 
 
 @given(messages)
-def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_file(
-    given: list[tuple[int, int, int]],
-) -> None:
+def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_file(given: Messages) -> None:
     order, _ = ordered(given)
     for channel in range(4):
         own = [(given[place][2], place) for place in order if given[place][1] == channel]
@@ -37,9 +34,7 @@ def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_fi
 
 
 @given(messages)
-def test_none_is_due_later_than_its_time_and_earlier_only_for_a_later_number(
-    given: list[tuple[int, int, int]],
-) -> None:
+def test_none_is_due_later_than_its_time_and_earlier_only_for_a_later_number(given: Messages) -> None:
     order, due_ns = ordered(given)
     for place, due in zip(order, due_ns, strict=True):
         t_ns, channel, number = given[place]
