@@ -225,6 +225,7 @@ def test_the_figures_that_are_quoted():
     assert newest_wins(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(162.2, abs=0.05)
     assert newest_wins(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(24.74, abs=0.05)
     assert in_order(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(238.8, abs=0.05)
+    assert in_order(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(376.3, abs=0.05)
 
 
 # -- losses

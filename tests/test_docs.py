@@ -1,0 +1,159 @@
+"""The documentation: numbers have a test or a command beside them; commands, tests and limits are real."""
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+from recorder import backfill
+from sites import change_server, external_arm, retransmit_buffer, shutdown
+from trilat_net.analysis import run_end, site_signals
+from trilat_net.analysis.metrics import impedance, static_windows
+from trilat_net.cli import app
+from trilat_net.core import delay, link
+from trilat_net.log import accounting, log_file
+from trilat_net.net import arm_port, requests, session, timing, zenoh_config
+from trilat_net.scenario import resolve
+from trilat_net.studies import executor
+from trilat_net.studies.sweep import cell_result, sweep_plan
+from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
+from trilat_net.theory import characteristic_roots, linear_edge, port_transparency
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+UNITS = r"%|rad|N m|N/m|N\b|J\b|s\b|ms\b|us\b|Hz|kHz|[MkG]i?B|dB|/s\b|ppm|min\b"
+NUMBER = re.compile(rf"(?<![\w.-])\d+(?:\.\d+)?(?:e-?\d+)? ?(?:{UNITS})")
+PROGRAMS = "trilat|make|python|docker"
+EVIDENCE = re.compile(
+    rf"tests/[\w/]+|\btest_\w+|^(?: {{4}}|\$ |)(?:\$ )?(?:{PROGRAMS}) |`(?:{PROGRAMS}|--set) ?[^`]*`",
+    re.MULTILINE,
+)
+
+STATED: list[tuple[str, str, float, float]] = [
+    ("definitions.md", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
+    ("design.md", "at most 200 ppm", 200.0, timing.SLEW_LIMIT / 1e3),
+    ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),
+    ("design.md", "an epoch 500 ms ahead", 500, session.EPOCH_AHEAD_NS / 1e6),
+    ("design.md", "150 ms before the epoch", 150, session.DECIDE_NS / 1e6),
+    ("design.md", "at most 5 s from the last question", 5, shutdown.LINGER_NS / 1e9),
+    ("design.md", "and 2 s more", 2, shutdown.LEAVE_TIMEOUT_NS / 1e9),
+    ("design.md", "It holds from 100 ms later", 100, change_server.AHEAD_MS),
+    ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
+    ("design.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("external-arm.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
+    ("external-arm.md", "older than 0.1 s", 0.1, arm_port.FRESH_NS / 1e9),
+    ("fair-comparison.md", "`--budget`, 64 per law", 64, tuning_plan.DEFAULT_BUDGET),
+    ("fair-comparison.md", "steps of 12, 8, 5, 3 %", 3, 100 * pareto_search.REFINEMENT_STEPS[-1]),
+    ("fair-comparison.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),
+    ("fair-comparison.md", "swings by more than 0.02 rad", 0.02, final_posture.SWING_RAD),
+    ("fair-comparison.md", "more than 0.2 rad from q", 0.2, final_posture.STRAYED_RAD),
+    ("fair-comparison.md", "more than 0.02 rad from q", 0.02, final_posture.TOGETHER_RAD),
+    ("linear.md", "faster than 1e-5 rad/s", 1e-5, run_end.EQUILIBRIUM_SPEED_RAD_S),
+    ("linear.md", "within 1e-6/s", 1e-6, characteristic_roots.STABILITY_EDGE_PER_S),
+    ("linear.md", "a scan of 24 values", 24, linear_edge.EDGE_SCAN_POINTS),
+    ("links.md", "No delay is longer than 10 s", 10, delay.MAX_DELAY_US / 1e6),
+    ("links.md", "round trips (8, 68, 136, 272, 544, 1088 ms)", 1088, resolve.GRID_ROUND_TRIPS_MS[-1]),
+    ("links.md", "losses (0, 10, 25, 50 %)", 50, resolve.GRID_LOSSES_PERCENT[-1]),
+    ("metrics.md", "faster than 2e-3 rad/s", 2e-3, run_end.STATIC_SPEED_RAD_S),
+    ("metrics.md", "by more than 1 % of the largest", 1, 100 * static_windows.MAX_TORQUE_VARIATION),
+    ("metrics.md", "from 0.05 N m", 0.05, static_windows.MIN_LOAD_NM),
+    ("metrics.md", "and 2 % of the largest", 2, 100 * static_windows.MIN_LOAD_SHARE),
+    ("metrics.md", "Hann windows of 4 s", 4, impedance.SEGMENT_S),
+    ("metrics.md", "0.5 to 20 Hz", 20, impedance.HIGHEST_HZ),
+    ("metrics.md", "coherence of 0.9", 0.9, impedance.MIN_COHERENCE),
+    ("ports.md", "over 0.1-10 Hz", 10, port_transparency.TRANSPARENCY_BAND_HZ[1]),
+    ("recording.md", "of the last 60 s", 60, retransmit_buffer.KEPT_S),
+    ("recording.md", "records up to 120 000", 120_000, retransmit_buffer.RECORDS_KEPT),
+    ("recording.md", "at most 64 messages", 64, requests.BACKFILL_MESSAGES),
+    ("recording.md", "or 40 kB", 40, requests.BACKFILL_BYTES / 1e3),
+    ("recording.md", "a gap after 50 ms", 50, backfill.GRACE_NS / 1e6),
+    ("recording.md", "after a silence of 1 s", 1, backfill.SILENT_NS / 1e9),
+    ("recording.md", "repeated after 0.3 s", 0.3, backfill.ANSWER_NS[0] / 1e9),
+    ("recording.md", "doubling to 3 s", 3, backfill.ANSWER_NS[1] / 1e9),
+    ("recording.md", "that 20 answers in a row", 20, backfill.MAX_VAIN_REQUESTS),
+    ("recording.md", "does not send for 10 s", 10, backfill.GIVE_UP_NS / 1e9),
+    ("recording.md", "of more than 50 000 in one channel", 50_000, accounting.MAX_GAPS),
+    ("recording.md", "synced once a second", 1, log_file.SYNC_PERIOD_NS / 1e9),
+    ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
+    ("sweep.md", "by more than 2 %", 2, 100 * cell_result.FLAT_LOG_CHANGE),
+    ("sweep.md", "in batches of about 2 s", 2, executor.CLUSTER_BATCH_S),
+    ("sweep.md", "0.4 s on this machine", 0.4, executor.BATCH_S),
+]
+"""Page, words, the number in them, and the program's own."""
+
+
+def flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+@pytest.mark.parametrize(("page", "words", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED])
+def test_a_limit_on_a_page_is_the_program_s(page: str, words: str, number: float, own: float) -> None:
+    assert words in flat((ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert number == pytest.approx(own, rel=1e-12)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_section_that_states_a_number_has_what_makes_it(page: Path) -> None:
+    """A command, a test, or a row above that holds a limit to the program's."""
+    limits = [words for name, words, *_ in STATED if name == page.name]
+    lacking = [
+        section.partition("\n")[0]
+        for section in re.split(r"(?m)^(?=#{1,3} )", page.read_text(encoding="utf-8"))
+        if NUMBER.search(section) and not EVIDENCE.search(section)
+        if not any(words in flat(section) for words in limits)
+    ]
+    assert not lacking
+
+
+@cache
+def names_of(path: Path) -> tuple[str, ...]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return tuple(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_test_that_a_page_names_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    files = {path.stem: path for path in (ROOT / "tests").rglob("*.py")}
+    functions = {name for path in files.values() for name in names_of(path)}
+    for named in re.findall(r"`(tests/[\w/.]+)`", text):
+        assert (ROOT / named).exists(), named
+    for name, rest in re.findall(r"`(?:tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text):
+        known = name in files or any(one.startswith(name) if rest else one == name for one in functions)
+        assert known, name
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """Yields the commands of a page that are written out, without what stands for something else."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = re.findall(r"^(?: {4})?(?:\$ )?(trilat [^\n]*)$", text, re.MULTILINE)
+    for line in lines:
+        words = shlex.split(line.partition("   ")[0].replace("…", "..."), comments=True)
+        if not any(re.search(r"\.\.\.|\b[A-Z]{3,}\b|^\[|[|<>&]", word) for word in words):
+            yield words
+
+
+WRITTEN = [(page.name, words) for page in PAGES for words in commands(page)]
+
+
+@pytest.mark.parametrize(
+    "words", [words for _, words in WRITTEN], ids=[f"{p}: {shlex.join(w)}" for p, w in WRITTEN]
+)
+def test_a_command_on_a_page_parses_as_it_is_written(words: list[str]) -> None:
+    command: Any = get_command(app)
+    rest = words[1:]
+    while hasattr(command, "commands"):
+        command = command.commands[rest.pop(0)]
+    with command.make_context(words[1], rest) as context:
+        assert context.args == []
+
+
+def test_most_pages_have_commands() -> None:
+    assert len(WRITTEN) > 60
