@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..analysis.metrics.log_metrics import MetricComparison
     from ..log.log_reader import Log
     from ..scenario.describe import ScenarioDifference
+    from ..studies.intervals import MeanInterval
     from ..studies.tuning import TuningPlan, TuningResult
 
 _MOST_REASONS = 6
@@ -30,6 +31,7 @@ def _print_comparison(
     logs: Sequence["Log"],
     different: Sequence["ScenarioDifference"],
     found: "MetricComparison",
+    means: "Sequence[MeanInterval | None]",
     remarks: Mapping[str, Sequence[str]],
 ) -> None:
     """Prints the differences of the experiments, the quantities of the logs, and remarks per log."""
@@ -43,7 +45,7 @@ def _print_comparison(
     else:
         terminal.out.print("one and the same experiment")
     terminal.out.print()
-    terminal.print_table(_tabulate_quantities(found))
+    terminal.print_table(_tabulate_quantities(found, means))
     terminal.out.print()
     for name, lines in remarks.items():
         for line in lines:
@@ -52,14 +54,31 @@ def _print_comparison(
     _print_reasons(found)
 
 
-def _tabulate_quantities(found: "MetricComparison") -> TextTable:
+def _tabulate_quantities(found: "MetricComparison", means: "Sequence[MeanInterval | None]") -> TextTable:
+    """Returns a row per quantity and a column per log; and one of the means where the logs are repeats."""
     rows: list[list[str]] = []
+    of_row = dict(zip(found.rows, means, strict=True)) if means else {}
     for group, members in groupby(found.rows, key=lambda row: row.quantity.group):
         rows.append([group])
         for row in members:
             values = ["-" if value is None else f"{value:.4g}" for value in row.values]
+            values += [str(of_row[row] or "-")] if means else []
             rows.append([f"  {row.quantity.name}", row.quantity.unit or "-", *values])
-    return TextTable(("", "unit", *found.columns), rows, align="llr")
+    heads = ("", "unit", *found.columns, *(["mean, 95 %"] if means else []))
+    return TextTable(heads, rows, align="llr")
+
+
+def average_repeats(logs: "Sequence[Log]", found: "MetricComparison") -> "list[MeanInterval | None]":
+    """Returns the mean of each quantity over logs that differ in their seeds alone; [] of other logs."""
+    from ..scenario.scenario_reader import reseed_scenario
+    from ..studies.intervals import mean_interval
+
+    first = logs[0].scenario
+    if len({log.scenario.seed for log in logs}) < len(logs):
+        return []
+    if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
+        return []
+    return [mean_interval(row.values) for row in found.rows]
 
 
 def _print_reasons(found: "MetricComparison") -> None:
@@ -241,8 +260,9 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     different = compare_scenarios([log.scenario for log in logs])
     remarks = {name: check_final_posture(log) for name, log in zip(names, logs, strict=True)}
     found = compare_metrics(logs, names)
+    means = average_repeats(logs, found)
     if not as_json:
-        _print_comparison(logs, different, found, remarks)
+        _print_comparison(logs, different, found, means, remarks)
         return
     entries = [
         {"name": name, "file": str(file), "scenario": log.scenario.name, "sha256": log.scenario.sha256}
@@ -250,6 +270,9 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     ]
     differences = [one._asdict() for one in different]
     facts = {"logs": entries, "differences": differences, "remarks": remarks, **comparison_to_json(found)}
+    if means:
+        pairs = zip(found.rows, means, strict=True)
+        facts["means"] = {row.quantity.key: mean._asdict() for row, mean in pairs if mean}
     terminal.print_json(facts)
 
 
