@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
 from trilat_net.core.dominance import find_balancing_weights
 from trilat_net.studies.sweep.stability_map import COMMON_MOTION_SHARE, evaluate_criterion
 from trilat_net.theory import analyse_linear_loop
+from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 
 LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]
 """The lab sheet's first exercise: 0.1 0.2 0.8 = 0.016 along the circle, 0.9 0.2 0.8 = 0.144 back."""
@@ -100,6 +102,31 @@ def test_it_is_the_edge_itself_at_the_worst_mass(count: int, seed: int) -> None:
         sum(count_growing([[a]], worst, K, share * line, ticks) for a in modes) for share in (0.98, 1.02)
     )
     assert below > 0 == above
+
+
+def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0)) -> Any:
+    """The rightmost root of two sites under PD+d, 200 ms apart."""
+    wires = (Wire(0, 1, K[0], Kd[0], 0.2), Wire(1, 0, K[1], Kd[1], 0.2))
+    spectrum = compute_delay_spectrum(Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1)
+    return spectrum.rightmost
+
+
+def test_pd_d_keeps_the_bound_while_error_damping_and_stiffness_have_one_ratio() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        K = 10.0 ** rng.uniform(0.0, 2.0, 2)
+        first = 10.0 ** rng.uniform(-1.0, 1.0)
+        d = (first, 1.02 * 0.2**2 * K[0] * K[1] / first)
+        root = pair_with_error_damping(
+            d, K * 10.0 ** rng.uniform(-2.0, 1.5), 10.0 ** rng.uniform(-1.5, 2.5, 2), K
+        )
+        assert root is None or root.s.real < 1e-9
+
+
+def test_pd_d_with_another_ratio_at_either_site_grows_above_the_bound() -> None:
+    assert 4.0 * 11.8 * 0.356 > (2.0 * 0.2 * 10.0) ** 2
+    root = pair_with_error_damping((11.8, 0.356), (307.0, 0.0), (0.58, 0.17))
+    assert root.s.real == pytest.approx(0.55, abs=0.01)
 
 
 def check_network(rng: np.random.Generator) -> bool | None:

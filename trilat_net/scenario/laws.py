@@ -305,7 +305,7 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
 class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", tag="pd_d"):
     """PD+d with known gravity: tau = G(q) - K e - Kd ed - d qd.
 
-    For constant delays the condition of P+d on K and d is sufficient (its source).
+    For constant delays, and Kd / K alike at all sites, the condition of P+d on K and d is sufficient.
 
     Attributes:
         K: stiffness per joint, N m/rad.
