@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -119,9 +119,25 @@ def test_workers_end_when_their_parent_is_killed() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="holds signals back")
-def test_a_ctrl_c_while_workers_start_arrives_afterwards() -> None:
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> None:
+    """Also if another thread of this process is the one that gets the signal."""
+
+    def interrupt_itself() -> None:
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+
     with Interrupt() as interrupt:
         with hold_sigint():
-            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+            if elsewhere:
+                thread = threading.Thread(target=unmasked, args=(interrupt_itself,))
+                thread.start()
+                thread.join()
+            else:
+                interrupt_itself()
             assert not interrupt.requested()
         assert interrupt.requested()
+
+
+def unmasked(act: Callable[[], None]) -> None:
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    act()

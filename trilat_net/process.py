@@ -122,15 +122,24 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Holds Ctrl-C back in the block: processes that start there never get it, this one does afterwards."""
-    if not hasattr(signal, "pthread_sigmask"):
+    """Holds Ctrl-C back in the block: processes that start there never get it, this one does afterwards.
+
+    The mask is for the processes. It does not hold what arrives in another thread of this one, whose handler
+    Python runs here all the same: so the handler is exchanged too.
+    """
+    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    arrived: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _frame: arrived.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if arrived:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _prepare_worker(parent: int) -> None:

@@ -82,7 +82,7 @@ def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> Non
 
 
 READERS = ["verify", "report", "rerun --closed-loop", "certify", "metrics", "replay", "figure"]
-READERS += ["log export --to csv -o x", "log view --save x.rrd"]
+READERS += ["log export --to csv", "log view --save x.rrd"]
 
 
 @pytest.mark.parametrize("command", READERS)

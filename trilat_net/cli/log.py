@@ -166,9 +166,9 @@ def log_export_command(
     if form not in _FORMATS:
         raise UsageError(f"--to is one of {', '.join(_FORMATS)}, not {form!r}")
     chosen = ExportFormat(form)
+    log = terminal.open_with_progress(*files)
     path = output if output is not None else default_export_path(chosen, files[0])
     exporter = Exporter(chosen, path, force=force)
-    log = terminal.open_with_progress(*files)
     with terminal.progress_bar(f"writing {path}") as progress:
         exporter.export(log, progress)
     records = sum(len(log[site]) for site in log.sites)
