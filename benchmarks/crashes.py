@@ -34,7 +34,7 @@ def _kills() -> list[str]:
                 stage.clear()
             lost_ms.append(done.lost_ms)
             kept += done.kept == done.flushed and done.recovery.lossless
-            passed += verify(done.log).passed
+            passed += verify(done.log).agreed
     return [
         f"recorder killed {KILLS} times, three sites at 1 kHz; records lost, ms (bar: <= 150):",
         "  " + " ".join(f"{value:.0f}" for value in sorted(lost_ms)),

@@ -79,7 +79,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_
     assert {"epoch", "start", "setup", "lost", "back", "end"} <= events
     torn = open_log(active_path(session.log))
     assert not torn.complete
-    assert verify(torn).passed
+    assert verify(torn).agreed
 
 
 @pytest.mark.long

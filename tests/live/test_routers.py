@@ -5,7 +5,7 @@ import signal
 import pytest
 
 from tests.net.certificates import Certificates
-from trilat_net.execution.verify import verify
+from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.log.log_reader import open_log
 
 from .processes import Process, Session, Stage
@@ -59,7 +59,8 @@ def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stag
     log = open_log(session.log)
     assert log.complete
     assert all("missing 0," in log.account(name) for name in SITES)
-    assert verify(log).passed
+    report = run_log_checks(log, virtual=True)
+    assert report.passed, report.lines  # samples were lost on the way, and the log shows it
     for name, peer in (SITES, SITES[::-1]):
         used = [state.used[peer] for state in log[name].states]
         assert used == sorted(used)
