@@ -256,12 +256,12 @@ def torque_on_arm(
 @leaf
 def environment_torque(
     t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows, table: TorqueTable
-) -> tuple[Pair, Pair, float]:
-    """Returns the torque of environments on the arm, present and held, N m, and the largest wall force, N."""
-    now_0 = now_1 = held_0 = held_1 = peak_n = 0.0
+) -> tuple[Pair, Pair]:
+    """Returns the torque of environments on the arm: what follows the present, and what is sampled."""
+    now_0 = now_1 = held_0 = held_1 = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
-        if (actor.acts != _VISCOUS and actor.acts != _WALL) or actor.sampled > 1:
+        if actor.acts != _VISCOUS and actor.acts != _WALL:
             continue
         torque = source_torque(t_s, q, qd, lengths, actor, table)
         if actor.sampled == 1:
@@ -270,10 +270,19 @@ def environment_torque(
         else:
             now_0 += torque[0]
             now_1 += torque[1]
-        if actor.acts == _WALL and (torque[0] != 0.0 or torque[1] != 0.0):
-            _, at = forward_kinematics(lengths, q)
-            x, y = end_effector_jacobian(lengths, q)
-            speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
+    return (now_0, now_1), (held_0, held_1)
+
+
+@leaf
+def largest_wall_force(t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows) -> float:
+    """Returns the largest force of a wall on the end effector, N."""
+    largest_n = 0.0
+    _, at = forward_kinematics(lengths, q)
+    x, y = end_effector_jacobian(lengths, q)
+    speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
+    for n in range(actors.shape[0]):
+        actor: Row = actors[n]
+        if actor.acts == _WALL and actor.start_s <= t_s < actor.end_s:
             force = _wall_force(actor, at, speed)
-            peak_n = max(peak_n, math.sqrt(force[0] * force[0] + force[1] * force[1]))
-    return (now_0, now_1), (held_0, held_1), peak_n
+            largest_n = max(largest_n, math.sqrt(force[0] * force[0] + force[1] * force[1]))
+    return largest_n

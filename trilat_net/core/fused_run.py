@@ -6,7 +6,7 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 
 import numpy as np
 
-from .exogenous import TorqueSourceRows, TorqueTable, environment_torque
+from .exogenous import TorqueSourceRows, TorqueTable, environment_torque, largest_wall_force
 from .jit import leaf
 from .kernel import act_stages, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
@@ -37,8 +37,9 @@ SUMS_DTYPE = np.dtype(
         ],
     )
 )
-"""A site's sums over its records: 1 if it has environments; sums of |tau - G|^2 and of e^2; the largest
-force of a wall; the work of its environments. And of the record before: q, their present and held torque."""
+"""A site's sums over its records: of |tau - G|^2 and of e^2; the largest force of a wall; the work of its
+environments (0: it has none, 1: beside operators, 2: alone). And of the record before: q, the present and
+the held torque of the environments."""
 
 _DIVERGED = int(Mode.DIVERGED)
 
@@ -94,9 +95,13 @@ def _update_sums(
     sums.effort += off_0 * off_0 + off_1 * off_1
     if sums.environment == 0:
         return
-    q, qd = (row[0], row[1]), (row[2], row[3])
-    now, held, force_n = environment_torque(t_ns * 1e-9, q, qd, pair(s.lengths), actors, table)
-    sums.force_peak_n = max(sums.force_peak_n, force_n)
+    t_s, q, qd, lengths = t_ns * 1e-9, (row[0], row[1]), (row[2], row[3]), pair(s.lengths)
+    held = pair(s.held)
+    now = (s.on_arm[0] - held[0], s.on_arm[1] - held[1])
+    if sums.environment == 1:  # beside operators
+        now, held = environment_torque(t_s, q, qd, lengths, actors, table)
+    if now[0] != 0.0 or now[1] != 0.0 or held[0] != 0.0 or held[1] != 0.0:
+        sums.force_peak_n = max(sums.force_peak_n, largest_wall_force(t_s, q, qd, lengths, actors))
     if k > 0:
         for i in range(JOINTS):
             mean = 0.5 * (sums.now[i] + now[i]) + sums.held[i]

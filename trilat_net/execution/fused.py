@@ -94,7 +94,9 @@ class FusedRun:
         self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
         self._peaks = np.full((count, 0, 2), -1.0)
         self._sums: RowArray = np.zeros(count, SUMS_DTYPE)
-        self._sums["environment"] = [len(spec.environment) > 0 for spec in scenario.sites.values()]
+        self._sums["environment"] = [
+            (1 if spec.hands else 2) if spec.environment else 0 for spec in scenario.sites.values()
+        ]
         self.ran_s = 0.0
 
     def advance(self, until_s: float) -> None:
