@@ -104,6 +104,21 @@ def test_it_is_the_edge_itself_at_the_worst_mass(count: int, seed: int) -> None:
     assert below > 0 == above
 
 
+@pytest.mark.parametrize("ticks", [1, 2, 3])
+def test_of_few_ticks_it_is_the_edge_of_the_loop_as_computed(ticks: int) -> None:
+    """Errata 13: 0.667 K h for one tick, and any masses above d h."""
+    criterion = evaluate_criterion(position_network(equal(3), d=0.0, delay_ms=float(ticks)))
+    assert criterion is not None
+    assert -criterion.excess == pytest.approx(10.0e-3 * max(0.6667, 0.5 * ticks), rel=1e-3)
+
+    def growing(d: float) -> int:
+        masses = np.geomspace(1.0001 * d * 1e-3, 3e-3 * ticks**2, 40)
+        modes = [(m, a) for m in masses for a in (-0.5, 1.0)]
+        return sum(count_growing([[a]], [np.eye(1) * m], 10.0, d, ticks, 1e-4) for m, a in modes)
+
+    assert growing(-0.98 * criterion.excess) > 0 == growing(-1.02 * criterion.excess)
+
+
 def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0)) -> Any:
     """The rightmost root of two sites under PD+d, 200 ms apart."""
     wires = (Wire(0, 1, K[0], Kd[0], 0.2), Wire(1, 0, K[1], Kd[1], 0.2))

@@ -14,6 +14,7 @@ from trilat_net.core.control import project_estimate
 from trilat_net.core.dominance import find_balancing_weights
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import lacks_detailed_balance
+from trilat_net.studies.sweep.stability_map import COMMON_MOTION_SHARE
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.frequency_search import build_frequency_grid
 from trilat_net.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights
@@ -59,6 +60,24 @@ def test_no_damping_makes_a_port_of_irreversible_shares_absolutely_stable(d: flo
     """Errata 14: three times and thirty times what reversible shares need."""
     assert least_margin(position_exchange(one_factor(0.5), d)) > -EIGENVALUE_ROUNDING
     assert least_margin(position_exchange(one_factor(0.25), d)) < -1e-4 / d
+
+
+@pytest.mark.parametrize("count", [3, 5, 7])
+def test_reversible_shares_are_passive_from_the_damping_on_that_makes_them_stable(count: int) -> None:
+    """Errata 14: D Z + Z^H D of masses that are free has the sign of d + K S sin(w T) / w; any masses."""
+    rng = np.random.default_rng(count)
+    weights = rng.uniform(0.0, 1.0, (count, count)) * (1.0 - np.eye(count))
+    alpha = (weights + weights.T) / (weights + weights.T).sum(axis=1, keepdims=True)
+    D = find_balancing_weights(alpha)
+    assert D is not None
+    K, T, w = 10.0, 0.2, np.linspace(1e-3, 60.0, 4000)
+    line = K * T * max(COMMON_MOTION_SHARE, -np.linalg.eigvals(alpha).real.min())
+    for d, passive in ((0.99 * line, False), (1.01 * line, True)):
+        s = 1j * w[:, None, None]
+        Z = np.diag(rng.uniform(0.1, 10.0, count)) * s + d * np.eye(count)
+        Z = D[:, None] * (Z + K * (np.eye(count) - alpha * np.exp(-s * T)) / s)
+        least = np.linalg.eigvalsh(Z + np.conj(np.swapaxes(Z, 1, 2))).min()
+        assert bool(least > -1e-9) is passive
 
 
 @pytest.mark.parametrize("d", [3.0, 30.0])
