@@ -10,7 +10,7 @@ from tests.log_editing import opened, recorded
 from trilat_net.errors import UsageError
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import find_executed_sites, verify
+from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 
@@ -59,7 +59,7 @@ def test_recorded_sites_stand_byte_for_byte(changes: dict[str, float]) -> None:
 def test_what_was_executed_is_verified_and_what_stands_is_not(replace: list[str]) -> None:
     after = rerun(opened(recorded("free")), replace, {"control.Kd": 5}).after
     verdict = verify(after)
-    assert find_executed_sites(after) == tuple(sorted(replace))
+    assert after.executed_sites == tuple(sorted(replace))
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records == TICKS * len(replace)
     lines = run_log_checks(after, virtual=True).lines

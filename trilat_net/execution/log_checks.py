@@ -11,7 +11,7 @@ from ..errors import ScenarioError
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
-from .verify import VerifyResult, find_executed_sites, find_user_laws, verify
+from .verify import VerifyResult, find_user_laws, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 
@@ -87,7 +87,7 @@ def check_log_files(sources: Sequence[str], min_coverage: float = MIN_COVERAGE) 
 def _checks(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None = None
 ) -> Iterator[CheckLine]:
-    others = [name for name in log.sites if name not in find_executed_sites(log)]  # of an open-loop rerun
+    others = [name for name in log.sites if name not in log.executed_sites]  # of an open-loop rerun
     recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
     yield _records_line(log, result)
     yield CheckLine("integrity", result.integrity.text, result.integrity.passed)

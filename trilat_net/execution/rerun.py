@@ -25,6 +25,7 @@ from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
 from ..errors import LogError
 from ..log.log_file import LogFile
+from ..log.log_layout import EXECUTED_SITES_KEY, RERUN_DRIVER
 from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
 from ..log.mcap_reader import Progress
@@ -39,7 +40,7 @@ from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
 from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry, describe_accounts
-from .verify import EXECUTED_SITES_KEY, RERUN_DRIVER, find_executed_sites, find_user_laws
+from .verify import find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
 
@@ -250,7 +251,7 @@ class Rerun:
     def broken(self) -> bool:
         """True if the rerun must equal the log, bit for bit, and does not."""
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
-        whole = set(self.request.replaced) <= set(find_executed_sites(self.before))
+        whole = set(self.request.replaced) <= set(self.before.executed_sites)
         return same_platform and whole and not self.request.changes and not self.identical
 
     @property
@@ -379,7 +380,7 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
         sites = " and ".join(request.recorded)
         are, do = ("are", "they do") if len(request.recorded) > 1 else ("is", "it does")
         yield f"{sites} {are} as recorded: nothing is changed there, and {do} not react"
-    if others := [name for name in request.replaced if name not in find_executed_sites(log)]:
+    if others := [name for name in request.replaced if name not in log.executed_sites]:
         yield f"this file is a rerun itself: its {', '.join(others)} met samples that are not in it"
     foreign = log.session.get("fingerprint") != compute_fingerprint()
     if foreign and not request.changes and not again.identical:

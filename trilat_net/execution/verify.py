@@ -268,12 +268,6 @@ class SiteVerifier:
         return state.rx, None
 
 
-EXECUTED_SITES_KEY = "rerun_executed"
-"""Entry of the session's metadata in a log that a rerun wrote: the sites that it executed."""
-RERUN_DRIVER = "rerun"
-"""Driver of such a log."""
-
-
 def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = MIN_COVERAGE) -> VerifyResult:
     """Executes every site of a log again; `progress` gets the records done and their total.
 
@@ -288,7 +282,7 @@ def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = 
     """
     result = _begin(log, min_coverage)
     with process.pause_gc():
-        sites = find_executed_sites(log)
+        sites = log.executed_sites
         total = sum(len(log[name]) for name in sites)
         _execute_sites(log, sites, result, None if progress is None else lambda done: progress(done, total))
         others = [name for name in log.sites if name not in sites]
@@ -296,7 +290,7 @@ def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = 
             for name in others:
                 _compare_with_source(log[name], source[name], result)
             theirs = _begin(source, min_coverage)
-            _execute_sites(source, [name for name in find_executed_sites(source) if name in others], theirs)
+            _execute_sites(source, [name for name in source.executed_sites if name in others], theirs)
             result.add(theirs)
     return result
 
@@ -342,16 +336,6 @@ def open_rerun_source(log: Log) -> Log | None:
                 return None
     source = open_log(*files)
     return source if source.sites == log.sites else None
-
-
-def find_executed_sites(log: Log) -> tuple[str, ...]:
-    """Returns the sites whose records can be executed from the file.
-
-    All of them, except in an open-loop rerun: the records of its other sites were made against sites that the
-    file does not hold.
-    """
-    named = log.session.get(EXECUTED_SITES_KEY) if log.driver == RERUN_DRIVER else None
-    return tuple(name for name in log.sites if named is None or name in named.split())
 
 
 def find_last_ticks(log: Log) -> dict[str, int]:

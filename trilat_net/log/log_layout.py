@@ -147,6 +147,10 @@ CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.EVENT: Event,
     topics.STATS: RecorderStats,
 }
+EXECUTED_SITES_KEY = "rerun_executed"
+"""Entry of the session's metadata in a log that a rerun wrote: the sites that it executed."""
+RERUN_DRIVER = "rerun"
+"""Driver of such a log."""
 SITE_CHANNELS = (topics.STATE, topics.LINK, topics.EVENT)
 """Channels of a site, each with a number per message that tells what is missing."""
 RECORDER_CHANNELS = (topics.EVENT, topics.STATS)

@@ -41,7 +41,7 @@ from .data_tables import (
     to_data_frame,
 )
 from .digest_chain import ChainState
-from .log_layout import ACCOUNTS, PART, describe_unfinished
+from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
 from .site_log import MessageTimes, SiteLog, TimedMessages
@@ -139,6 +139,16 @@ class Log:
         ticks = self._stated_ticks()
         lacks = any(name not in ticks or self.missing(name) for name in self.sites)
         return self._contents.ended and not lacks
+
+    @property
+    def executed_sites(self) -> tuple[str, ...]:
+        """The sites whose records can be executed from the file.
+
+        All of them, except in an open-loop rerun: the records of its other sites were made against sites that
+        the file does not hold.
+        """
+        named = self.session.get(EXECUTED_SITES_KEY) if self.driver == RERUN_DRIVER else None
+        return tuple(name for name in self.sites if named is None or name in named.split())
 
     @property
     def part(self) -> int:

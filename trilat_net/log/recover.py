@@ -6,8 +6,9 @@ modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebui
 a number, the one covered by a valid checksum wins, else the first.
 """
 
+import re
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -19,10 +20,11 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
+from ..net import topics
 from .accounting import open_session_accounts
 from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
-from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, SESSION, collect_provenance, describe_unfinished
+from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
 from .mcap_reader import McapReader, Progress
 from .mcap_records import (
     COMPRESSION_NAME_OFFSET,
@@ -410,12 +412,25 @@ class _FileCopy:
             result.sites = accounts.records()
             result.coverage = accounts.run_coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
+            alone = self._scanner.finished and result.lossless and PART not in self._survey.metadata
+            if alone and _contradicts(before, accounts.texts()):
+                result.chain = ChainState.CHANGED
             counts = {name: text for name, text in before.items() if not name.startswith("/")}
             self._out.add_metadata(ACCOUNTS, {**accounts.texts(), **counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
             self._out.close_chain()
         self._out.finish()
+
+
+def _contradicts(stated: Mapping[str, str], found: Mapping[str, str]) -> bool:
+    """True if the accounts of a file count other records than it has."""
+    pattern = re.compile(r"received \d+, missing \d+")
+    for topic, text in found.items():
+        there, told = pattern.search(text), pattern.search(stated.get(topic, ""))
+        if topic.endswith(f"/{topics.STATE}") and there and told and there[0] != told[0]:
+            return True
+    return False
 
 
 def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:

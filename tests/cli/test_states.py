@@ -1,0 +1,101 @@
+"""The table of docs/log-tools.md: the state of a log, a command, and what is said."""
+
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from tests.log.test_session_check import split
+from tests.log_editing import edited, recorded
+from tests.log_surgery import repacked, taken_apart
+
+from .running import trilat
+
+ROOT = Path(__file__).parents[2]
+RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
+ROWS = re.findall(
+    r"^\| \*\*(\w+)\*\*[^|]*\| (.+) \|$", (ROOT / "docs" / "log-tools.md").read_text(), re.MULTILINE
+)
+COMMANDS = ("log check", "verify", "report", "log recover")
+
+
+def whole() -> bytes:
+    return recorded("free", RUN)
+
+
+def torn() -> bytes:
+    return whole()[: len(whole()) * 2 // 3]
+
+
+def sparse() -> bytes:
+    """What an older recorder wrote that missed every tenth record of m1, and says so."""
+    taken = taken_apart(whole()).without_chain()
+    topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
+    taken.messages = [
+        m for m in taken.messages if topics[m.channel] != "/trilat/free/m1/state" or m.sequence % 10 != 5
+    ]
+    text = accounts["/trilat/free/m1/state"]
+    accounts["/trilat/free/m1/state"] = text.replace("received 3000, missing 0", "received 2700, missing 300")
+    return taken.bytes()
+
+
+def spliced() -> bytes:
+    """Two runs over a gap, under the starts of the first."""
+    first = taken_apart(whole()).without_chain()
+    other = taken_apart(recorded("free", {**RUN, "control.Kd": 3.5}))
+    topics = first.topics()
+    boots = {m.channel: m for m in first.messages if topics[m.channel].endswith("/state")}
+    first.messages = [m for m in first.messages if m.channel not in boots or m.sequence < 1500]
+    for message in other.messages:
+        if message.channel in boots and message.sequence >= 1502:
+            boot = msgpack.unpackb(boots[message.channel].payload)["boot"]
+            first.messages.append(repacked(message, boot=boot))
+    return first.bytes()
+
+
+def older() -> bytes:
+    return edited(whole())
+
+
+def forged() -> bytes:
+    """The torque of m1 and m2 is zeroed, and the metadata claim that only s was executed."""
+    claims = {"driver": "rerun", "rerun_executed": "s"}
+    zeroed = {"tau": [0.0, 0.0]}
+    return edited(whole(), record=lambda r: r if r["site"] == "s" else {**r, **zeroed}, session=claims)
+
+
+def changed() -> bytes:
+    taken = taken_apart(whole())
+    taken.metadata("trilat.session")["commit"] = "0" * 40
+    return taken.bytes()
+
+
+def newer() -> bytes:
+    return edited(whole(), record=lambda r: {**r, "v": 9}, session={"schema_version": "9"})
+
+
+MADE: dict[str, Callable[[], bytes]] = {
+    one.__name__: cache(one) for one in (whole, torn, sparse, spliced, older, forged, changed, newer)
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("state", [*MADE, "part"])
+def test_the_table_says_what_is_said(state: str, command: str, tmp_path: Path) -> None:
+    cells = dict(ROWS)[state].split(" | ")
+    code, _, text = cells[COMMANDS.index(command)].partition(": ")
+    file = tmp_path / "run.mcap"
+    if state == "part":
+        file = split(tmp_path, refilled=range(0))[1]
+    else:
+        file.write_bytes(MADE[state]())
+    done = trilat(*command.split(), file, cwd=tmp_path)
+    assert done.code == int(code), done
+    assert text.strip("`") in (done.out + done.err).replace("\n", " "), done
+
+
+def test_the_table_has_every_state() -> None:
+    assert {state for state, _ in ROWS} == {*MADE, "part"}
