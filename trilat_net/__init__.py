@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from .reporting.figures.registry import figure
     from .studies.trials.trial import trials
     from .studies.trials.trial_runner import check
+    from .theory.end_pose import certify_with_roots as certify
 
-__all__ = ["check", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
+__all__ = ["certify", "check", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
 
 _MODULES = {
+    "certify": "theory.end_pose:certify_with_roots",
     "check": "studies.trials.trial_runner",
     "figure": "reporting.figures.registry",
     "open_log": "log.log_reader",
@@ -42,5 +44,6 @@ deprecated.install()
 def __getattr__(name: str) -> Any:
     """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
     if name in __all__:
-        return getattr(import_module(f".{_MODULES.get(name, 'api')}", __name__), name)
+        module, _, attribute = _MODULES.get(name, "api").partition(":")
+        return getattr(import_module(f".{module}", __name__), attribute or name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

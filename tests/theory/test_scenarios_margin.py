@@ -26,7 +26,6 @@ def test_the_margin_is_the_smallest_eigenvalue_of_alpha_times_k_t(name: str, mar
 def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""
     shipped = load_scenario(name)
-    assert shipped.expect.stable
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
     assert measured(name, {"control.d": d, "duration_s": 40.0}).trend is EnvelopeTrend.GROWS
 

@@ -1,13 +1,14 @@
-"""Classification of the end of a run: converged, decaying, bounded, growing, diverged or undecided.
+"""The judgement of a run: stable, not stable, or open, and what it rests on.
 
-Invariant: a class states what the record shows and predicts nothing; without a clear trend it is
-undecided. Diverged passed a limit, growing has not yet; converged is at rest, decaying is not yet. Every
-other word for how a run ended (the class of a cell of a sweep, `stable` of [expect], the growth in a
-certificate) is a view of `RunEnd` or of its trends.
+Invariant: every command takes its word from here (docs/definitions.md, "Stable"). Each joint of each site is
+judged by itself, and the worst decides; a word states what the record shows and predicts nothing. What else
+is known of a whole log (V, the roots at its end pose) may make a stable run open, never the reverse.
 
-The second half of the run is divided into n equal windows, n = 16 and, if those do not decide, n = 8. A
-window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the logarithms of
-these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of freedom).
+The judged part is the second half of the run, or what follows the last act of an operator if that is less and
+long enough. It is called the half below. It is divided into n equal windows, n = 16 and, if those do not
+decide, n = 8. A window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the
+logarithms of these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of
+freedom).
 
 GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or more each;
 and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first,
@@ -15,28 +16,34 @@ or at least 0.45 of it if the maxima rise to more than 8/5 in all (no response t
 saturates does that). The maxima of the four quarters of the first half must not fall by 1 % or more each:
 a fall followed by a rise is a V, and needs a longer record.
 
-DECAYS: the upper bound is negative and the line falls by 4 % or more over the half, or nothing in the
-half exceeds `FLOOR_RAD`. STEADY: the upper bound excludes that the envelope doubles within the half. Both
-require that the last quarter of the half is at most twice the one before. A sustained oscillation of any
-size is steady.
+DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half, and the last
+quarter still takes half of its share in that; or nothing in the last quarter exceeds `FLOOR_RAD`. HARDLY: the
+line falls, by 4 % or more, and that is all. STEADY: the bounds exclude that the envelope doubles or halves
+within the half. All require that the last quarter of the half is at most twice the one before. A sustained
+oscillation of any size is steady.
 
 UNDECIDED: everything else: too short, too irregular, growing ever more slowly, a V. No finite record
 excludes growth that begins later, or a beat longer than the run, whose rising flank looks like growth.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
+from ..core.fused_run import PEAK_COLUMNS, largest_of_joints
 from ..core.ticks import BUCKETS_PER_S
+from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..log.log_reader import Log
+from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
+from ..scenario import Scenario
 from .site_signals import SETTLED_ERROR_RAD
 from .timeline import diverged_at_s
+from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
 """The largest speed of the last second of a converged run, rad/s: the arms have come to rest."""
@@ -51,6 +58,26 @@ linearised there."""
 FLOOR_RAD = 1e-6
 """An envelope below this has converged, rad; of speeds, rad/s."""
 
+AGREEMENT_RAD = 2e-2
+"""Sites whose angles of a joint differ by more do not agree, rad."""
+
+HANGING_RAD = 0.3
+"""A link within this of straight down hangs."""
+
+THROWN_RAD = 0.5 * math.pi
+"""Arms that nobody pushed and that end further from every start pose were thrown there, rad."""
+
+DRIFT_RAD = 0.05
+"""A joint that goes by more in one direction over the judged half may drift, rad."""
+
+FORCE_NM = 1e-3
+"""A larger torque of an operator or environment at the end may hold sites apart, N m."""
+
+LEAST_JUDGED_S = 2.0
+"""What follows the last act of an operator is judged by itself if it lasts so long, s, and"""
+LEAST_JUDGED_SHARE = 0.1
+"""this share of the run; else the second half is, and the operator acts in it."""
+
 MIN_SIGN_CHANGES = 6
 """Fewer changes of sign in the second half of a run show no period."""
 
@@ -60,39 +87,51 @@ digits, with which the classes of published runs were made."""
 
 _RISE = math.log(1.01)
 _DOUBLE = math.log(2.0)
+_CALM = math.log(1.25)
+_CALM_STEP = math.log(1.5)
 _FROM_ZERO = math.log(8.0 / 5.0)
+
+
+class Stability(StrEnum):
+    """The one judgement of a run; the text is the word for people."""
+
+    STABLE = "stable"
+    NOT_STABLE = "not stable"
+    OPEN = "open"
 
 
 class EnvelopeTrend(StrEnum):
     """Trend of an envelope at the end of a run; the text is the word for people."""
 
     DECAYS = "decays"
+    HARDLY = "hardly decays"
     STEADY = "steady"
     GROWS = "grows"
     UNDECIDED = "undecided (record longer)"
 
-    @property
-    def grows(self) -> bool | None:
-        """True or False if the run decides it, else None."""
-        return None if self is EnvelopeTrend.UNDECIDED else self is EnvelopeTrend.GROWS
-
 
 class EndBehaviour(StrEnum):
-    """Behaviour of a run at its end; the text is the word for people."""
+    """Behaviour of a run at its end, from the best to the worst; the text is the word for people."""
 
     CONVERGED = "converged"
     DECAYS = "decaying"
+    HARDLY = "hardly decaying"
+    UNDECIDED = "undecided (record longer)"
     BOUNDED = "bounded oscillation"
+    DRIFTS = "drifting"
     GROWS = "growing"
     DIVERGED = "diverged"
-    UNDECIDED = "undecided (record longer)"
 
     @property
-    def grows(self) -> bool | None:
-        """True if the motion grows or diverged, False if it stays bounded, None if undecided."""
-        if self is EndBehaviour.UNDECIDED:
-            return None
-        return self in (EndBehaviour.GROWS, EndBehaviour.DIVERGED)
+    def stability(self) -> Stability:
+        """The judgement of a run of which nothing else is known."""
+        if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
+            return Stability.STABLE
+        undecided = self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
+        return Stability.OPEN if undecided else Stability.NOT_STABLE
+
+
+_SEVERITY = {behaviour: n for n, behaviour in enumerate(EndBehaviour)}
 
 
 class EnvelopeFit(NamedTuple):
@@ -101,10 +140,13 @@ class EnvelopeFit(NamedTuple):
     Attributes:
         rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t). NaN if there
             are too few points.
+        calm: True if it falls, or the upper bound excludes a rise by a quarter within the half; and the last
+            quarter is no more than half as high again as the one before.
     """
 
     trend: EnvelopeTrend
     rate_per_s: float
+    calm: bool = False
 
     @property
     def text(self) -> str:
@@ -114,17 +156,20 @@ class EnvelopeFit(NamedTuple):
     @property
     def rate_text(self) -> str:
         """The rate of what grows or decays; else the trend as a verb."""
-        changes = self.trend in (EnvelopeTrend.GROWS, EnvelopeTrend.DECAYS)
-        return f"{self.rate_per_s:+.3g}/s" if changes else self.text
+        still = self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED)
+        return self.text if still else f"{self.rate_per_s:+.3g}/s"
 
 
 class RunEnd(NamedTuple):
     """End of a run, of all of its sites or of some.
 
     Attributes:
-        behaviour: the class.
-        error, speed: trends of the largest |e| and |qd|.
-        end_error_rad, end_speed_rad_s: largest |e| and |qd| of the last second.
+        behaviour: the class of the worst joint.
+        error, speed: trends of that joint's |e| and |qd|.
+        end_error_rad, end_speed_rad_s: largest |e| and |qd| of the last second, of all joints.
+        where: that joint, in words; "" if there is none.
+        reasons: what leaves the run open, in words.
+        operator_acts: True if an operator acts in the judged part, and not only holds.
         diverged_at_s: when the first site left its limits, or None.
         frequency_hz: frequency of a bounded oscillation; None without one.
         missing_sites: sites without any record, which leave the run undecided.
@@ -135,13 +180,29 @@ class RunEnd(NamedTuple):
     speed: EnvelopeFit
     end_error_rad: float
     end_speed_rad_s: float
+    where: str = ""
+    reasons: tuple[str, ...] = ()
+    operator_acts: bool = False
     diverged_at_s: float | None = None
     frequency_hz: float | None = None
     missing_sites: tuple[str, ...] = ()
 
     @property
+    def stability(self) -> Stability:
+        """The judgement; what may be an operator's doing is open, unless a site left its limits."""
+        own = self.behaviour.stability
+        if own is Stability.NOT_STABLE:
+            excused = self.operator_acts and self.behaviour is not EndBehaviour.DIVERGED
+            return Stability.OPEN if excused else own
+        return Stability.OPEN if self.reasons else own
+
+    @property
     def text(self) -> str:
-        """The class with its numbers; part of the certificate's JSON."""
+        """The class with its numbers and reasons; part of the certificate's JSON."""
+        return "; ".join([self._behaviour_text, *self.reasons])
+
+    @property
+    def _behaviour_text(self) -> str:
         behaviour, error, speed = self.behaviour, self.error, self.speed
         end = f"|e| {self.end_error_rad:.3g} rad and |qd| {self.end_speed_rad_s:.3g} rad/s in the last second"
         if self.diverged_at_s is not None:
@@ -150,87 +211,270 @@ class RunEnd(NamedTuple):
             return f"undecided: no record of {', '.join(self.missing_sites)}"
         if behaviour is EndBehaviour.CONVERGED:
             apart = self.end_error_rad > SETTLED_ERROR_RAD
-            return f"{'at rest, and the sites do not agree' if apart else 'converged'}: {end}"
+            return f"{'at rest, with errors that stay' if apart else 'converged'}: {end}"
+        at = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:
             hertz = self.frequency_hz
             word = "bounded motion" if hertz is None else f"bounded oscillation at {hertz:.3g} Hz"
-            slowly = f" (|qd| {speed.rate_text})" if speed.trend is EnvelopeTrend.DECAYS else ""
-            return f"{word}{slowly}: {end}"
+            return f"{word}{at}: {end}"
         if behaviour is EndBehaviour.UNDECIDED:
-            return f"undecided, record longer: |e| {error.text}, |qd| {speed.text}; {end}"
-        return f"{behaviour.value} (|e| {error.rate_text}, |qd| {speed.rate_text}): {end}"
+            return f"undecided, record longer{at}: |e| {error.text}, |qd| {speed.text}; {end}"
+        return f"{behaviour.value}{at} (|e| {error.rate_text}, |qd| {speed.rate_text}): {end}"
+
+
+class RunTrace(NamedTuple):
+    """What the judgement of a run rests on, per site in scenario order.
+
+    Attributes:
+        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch its `PEAK_COLUMNS`, shape (K, 6);
+            -1 if it has no record. A site's last one may be incomplete: it enters no trend.
+        forced: True if an operator or environment pushes at its last record.
+        diverged_at_s: when the first site left its limits, or None.
+        pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for never.
+    """
+
+    buckets: Sequence[Array]
+    forced: Sequence[bool]
+    diverged_at_s: float | None = None
+    pushed_until_s: float = 0.0
+
+
+def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
+    """Returns buckets with some more records of a site, which follow those in it; there may be spare rows."""
+    lacking = int(bucket[-1]) + 1 - len(into)
+    if lacking > 0:  # by half as much again: a long run is not copied for every batch
+        into = np.vstack([into, np.full((lacking + len(into) // 2, PEAK_COLUMNS), -1.0)])
+    starts = np.flatnonzero(np.diff(bucket, prepend=-1))
+    rows = bucket[starts]
+    peaks = np.maximum.reduceat(np.abs(np.hstack([e, qd])), starts, axis=0)
+    into[rows, : 2 * JOINTS] = np.maximum(into[rows, : 2 * JOINTS], peaks)
+    into[rows, 2 * JOINTS :] = q[np.append(starts[1:], len(q)) - 1]
+    return into
+
+
+def trace_log(log: Log) -> RunTrace:
+    """Returns what the judgement of a log rests on."""
+    parts = [log[site] for site in log.sites]
+    recorded = [part for part in parts if len(part)]
+    outside = [part for part in recorded if part.name in log.scenario.external]
+    return RunTrace(
+        list(map(_reduce_site, parts)),
+        [len(part) > 0 and acts_on_arm(part.tau_x[-1]) for part in parts],
+        min((at_s for part in parts if (at_s := diverged_at_s(part)) is not None), default=None),
+        max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
+    )
+
+
+def acts_on_arm(tau_x: Array) -> bool:
+    """True if a torque of operator and environment, N m, may hold an arm where its controller does not."""
+    return bool(np.abs(tau_x).max() > FORCE_NM)
 
 
 def classify_log_end(log: Log) -> RunEnd:
     """Returns the end of a log's run; torn and empty logs are undecided."""
+    end = classify_run_end(log.scenario, trace_log(log))
     parts = [log[site] for site in log.sites]
-    recorded = [part for part in parts if len(part)]
-    span_s = max((float(part.tick[-1] - part.tick[0]) / part.rate_hz for part in recorded), default=0.0)
-    diverged = min((at_s for part in parts if (at_s := diverged_at_s(part)) is not None), default=None)
-    end = classify_run_end(list(map(_bucket_maxima, parts)), span_s, diverged)
+    bounded = end.behaviour is EndBehaviour.BOUNDED
     return end._replace(
-        frequency_hz=_frequency_hz(recorded) if end.behaviour is EndBehaviour.BOUNDED else None,
+        frequency_hz=_frequency_hz([part for part in parts if len(part)]) if bounded else None,
         missing_sites=tuple(part.name for part in parts if not len(part)),
     )
 
 
-def classify_run_end(maxima: Sequence[Array], span_s: float, diverged_at_s: float | None = None) -> RunEnd:
-    """Returns the end of a run of `span_s` from the maxima of the buckets of all of its sites, or of some.
+def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
+    """Returns the end of a run from its trace."""
+    ends = find_end_maxima([largest_of_joints(site) for site in trace.buckets])
+    count = max(min(map(len, trace.buckets)) - 1, 0)
+    columns = np.array([values[:count] for values in trace.buckets])
+    kept = np.flatnonzero((columns[:, :, 0] >= 0.0).all(axis=0))
+    acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, count / BUCKETS_PER_S))
+    first, acts = _choose_judged_part(kept / BUCKETS_PER_S, acted_s)
+    kept = kept[first:]
+    t_s, columns = np.asarray(kept / BUCKETS_PER_S), columns[:, kept]
+    worst = _find_worst_joint(t_s, columns, trace.buckets)
+    site, joint = divmod(worst.number, JOINTS)
+    where = f"{scenario.names[site]} joint {joint + 1}" if len(t_s) else ""
+    end = RunEnd(worst.behaviour, worst.error, worst.speed, *ends, where)
+    if trace.diverged_at_s is not None:
+        return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
+    if end.behaviour.stability is Stability.STABLE:
+        reasons = (*_find_disagreement(scenario, trace, t_s, columns), *_find_odd_pose(scenario, trace))
+        return end._replace(reasons=reasons)
+    why = f"an operator acts until {acted_s:.4g} s, within the judged part"
+    return end._replace(operator_acts=True, reasons=(why,)) if acts else end
 
-    The maxima are per site the largest |e|, rad, and |qd|, rad/s, of every bucket since the epoch, shape
-    (K, 2); -1 if a bucket has no record. A site's last one may be incomplete: it enters no trend. The first
-    site left its limits at `diverged_at_s`.
+
+def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
+    """Returns from which time on a run counts, of which the second half is judged, and if an operator acts.
+
+    An operator that acts in the second half and then lets go for long enough shortens the judged part.
     """
-    end_error_rad, end_speed_rad_s = find_end_maxima(maxima)
-    count = max(min(map(len, maxima)) - 1, 0)
-    columns = np.array([values[:count] for values in maxima])
-    kept = np.flatnonzero((columns >= 0.0).all(axis=(0, 2)))
-    t_s: Array = kept / BUCKETS_PER_S
-    largest = columns[:, kept].max(axis=0)
-    error, speed = fit_envelope(t_s, largest[:, 0]), fit_envelope(t_s, largest[:, 1])
-    end = RunEnd(EndBehaviour.DIVERGED, error, speed, end_error_rad, end_speed_rad_s, diverged_at_s)
-    return end if diverged_at_s is not None else end._replace(behaviour=_classify(end, 0.5 * span_s))
+    if not len(t_s) or acted_s <= 0.5 * (t_s[0] + t_s[-1]):
+        return 0, False
+    if t_s[-1] - acted_s < max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * (t_s[-1] - t_s[0])):
+        return 0, True
+    return int(np.searchsorted(t_s, 2.0 * acted_s - t_s[-1])), False
 
 
 def find_end_maxima(maxima: Sequence[Array]) -> tuple[float, float]:
-    """Returns the largest |e|, rad, and |qd|, rad/s, of the last second; maxima as in `classify_run_end`."""
+    """Returns the largest |e|, rad, and |qd|, rad/s, of the last second, of these columns of every bucket."""
     last = [values[-BUCKETS_PER_S:].max(axis=0, initial=0.0) for values in maxima]
     error_rad, speed_rad_s = np.max(last, axis=0, initial=0.0).tolist() if last else (0.0, 0.0)
     return error_rad, speed_rad_s
 
 
-def _classify(end: RunEnd, half_s: float) -> EndBehaviour:
-    """Returns the class that the two trends have together, over the second half of a run.
+class _JointEnd(NamedTuple):
+    """The end of one joint: its class, the trends of its |e| and |qd|, its number, site by site."""
 
-    Errors that grow while no arm grows faster may start a drift, or follow from what an operator has just
-    done: undecided. The reverse is growth: arms that swing in unison have no error.
+    behaviour: EndBehaviour
+    error: EnvelopeFit
+    speed: EnvelopeFit
+    number: int
+    end_speed_rad_s: float
+
+
+def _find_worst_joint(t_s: Array, columns: Array, buckets: Sequence[Array]) -> _JointEnd:
+    """Returns the joint of the worst class, the fastest of those."""
+    signals = columns[:, :, : 2 * JOINTS].transpose(1, 0, 2).reshape(len(t_s), 2 * JOINTS * len(buckets))
+    fits = fit_envelopes(t_s, signals)
+    joints = []
+    for n, site in enumerate(buckets):
+        ends = site[-BUCKETS_PER_S:, : 2 * JOINTS].max(axis=0, initial=0.0).tolist()
+        for joint in range(JOINTS):
+            error, speed = (fits[(2 * n + kind) * JOINTS + joint] for kind in (0, 1))
+            end_speed = ends[JOINTS + joint]
+            behaviour = _classify_joint(error, speed, ends[joint], end_speed)
+            if behaviour in (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED):
+                q, fastest = columns[n][:, 2 * JOINTS + joint], columns[n][:, JOINTS + joint]
+                behaviour = _name_motion(behaviour, q, fastest, t_s)
+            joints.append(_JointEnd(behaviour, error, speed, JOINTS * n + joint, end_speed))
+    return max(joints, key=lambda one: (_SEVERITY[one.behaviour], one.end_speed_rad_s))
+
+
+def _classify_joint(
+    error: EnvelopeFit, speed: EnvelopeFit, end_error_rad: float, end_speed_rad_s: float
+) -> EndBehaviour:
+    """Returns the class that the trends of a joint's |e| and |qd| have together.
+
+    Errors that grow while the joint gets no faster may start a drift, or follow from what an operator has
+    just done: undecided. The reverse is growth: arms that swing in unison have no error.
     """
-    error, speed = end.error.trend, end.speed.trend
-    if end.end_speed_rad_s <= FLOOR_RAD and speed is not EnvelopeTrend.GROWS:  # too slow for a trend
-        speed = EnvelopeTrend.DECAYS
-    if speed is EnvelopeTrend.GROWS:
+    if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
-    if error is EnvelopeTrend.GROWS or EnvelopeTrend.UNDECIDED in (error, speed):
+    if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
-    if speed is EnvelopeTrend.STEADY:
-        return EndBehaviour.BOUNDED
-    slow = end.end_speed_rad_s <= SETTLED_SPEED_RAD_S
-    if error is EnvelopeTrend.STEADY and not slow:  # motion that hardly decays counts as a limit cycle
-        halves = end.speed.rate_per_s * half_s <= -_DOUBLE
-        return EndBehaviour.DECAYS if halves else EndBehaviour.BOUNDED
-    settled = slow and (error is EnvelopeTrend.STEADY or end.end_error_rad <= SETTLED_ERROR_RAD)
-    return EndBehaviour.CONVERGED if settled else EndBehaviour.DECAYS
+    falls = speed.trend is EnvelopeTrend.DECAYS or end_speed_rad_s <= FLOOR_RAD  # too slow for a trend
+    rests = end_speed_rad_s <= SETTLED_SPEED_RAD_S
+    slow = rests and (falls or speed.calm)
+    if not slow and not falls:
+        if rests:  # it hardly moves, and its trend says nothing
+            return EndBehaviour.UNDECIDED
+        still = {EnvelopeTrend.HARDLY: EndBehaviour.HARDLY, EnvelopeTrend.STEADY: EndBehaviour.BOUNDED}
+        return still.get(speed.trend, EndBehaviour.UNDECIDED)
+    if error.calm and (end_error_rad <= SETTLED_ERROR_RAD or error.trend is EnvelopeTrend.STEADY):
+        return EndBehaviour.CONVERGED if slow else EndBehaviour.DECAYS
+    if error.trend is EnvelopeTrend.DECAYS:
+        near = slow and end_error_rad <= SETTLED_ERROR_RAD
+        return EndBehaviour.CONVERGED if near else EndBehaviour.DECAYS
+    return EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
 
 
-def _bucket_maxima(part: SiteLog) -> Array:
-    """Returns the largest |e| and |qd| of every bucket; -1 if a bucket has no record."""
+def _name_motion(behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array) -> EndBehaviour:
+    """Returns the class of a joint that moves on, by where it goes in the judged half.
+
+    It drifts if every quarter takes half of its share or more in one way, and its mean speed is at least half
+    of the largest: what swings on its way is no drift. A bounded oscillation changes its sign.
+    """
+    if len(t_s) < BUCKETS_PER_S:
+        return behaviour
+    first = int(np.searchsorted(t_s, 0.5 * (t_s[0] + t_s[-1])))
+    marks = np.linspace(first, len(t_s) - 1, 5).round().astype(int)
+    way = np.diff(q[marks])
+    total = abs(float(way.sum()))
+    steady = float((way * np.sign(way.sum())).min()) >= 0.125 * total
+    if total >= DRIFT_RAD and steady and total >= 0.5 * (t_s[-1] - t_s[first]) * fastest[first:].max():
+        return EndBehaviour.DRIFTS
+    swings = behaviour is not EndBehaviour.BOUNDED or _count_sign_changes(q[first:]) >= MIN_SIGN_CHANGES
+    return behaviour if swings else EndBehaviour.UNDECIDED
+
+
+def _count_sign_changes(values: Array) -> int:
+    """Returns how often a signal passes its mean."""
+    signs = np.sign(values - values.mean())
+    return int(np.count_nonzero(np.diff(signs[signs != 0.0])))
+
+
+def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
+    """Returns the groups of sites that shares connect, at any time and in either direction."""
+    joined = (scenario.alpha > 0.0) | np.eye(len(scenario.names), dtype=bool)
+    for change in scenario.timeline:
+        for peer, share in (change.shares if change.dominance else {}).items():
+            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] |= share > 0.0
+    joined = joined | joined.T
+    for _ in range(len(joined).bit_length()):
+        joined = joined @ joined
+    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in joined}]
+
+
+def _find_disagreement(scenario: Scenario, trace: RunTrace, t_s: Array, columns: Array) -> Iterable[str]:
+    """Yields what is said of sites that do not agree, do not come closer, and are held apart by no force."""
+    for group in find_coupled_sites(scenario):
+        if len(group) < 2 or not len(t_s) or any(trace.forced[n] for n in group):
+            continue
+        q = columns[group][:, :, 2 * JOINTS :]
+        apart = np.ptp(q, axis=0).max(axis=1)
+        end_rad = float(np.ptp(q[:, -1], axis=0).max())
+        if end_rad <= AGREEMENT_RAD or fit_envelope(t_s, apart).trend is EnvelopeTrend.DECAYS:
+            continue
+        joint = int(np.ptp(q[:, -1], axis=0).argmax())
+        ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
+        yield f"{' and '.join(ends)} stand {end_rad:.3g} rad apart, and nothing holds them there"
+
+
+def points_down(q: Array) -> bool:
+    """True if both links of an arm hang."""
+    return all(abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q))
+
+
+def _find_odd_pose(scenario: Scenario, trace: RunTrace) -> Iterable[str]:
+    """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
+    starts = {name: np.array(scenario.sites[name].q0_rad) for name in scenario.names}
+    ends = {
+        name: site[-1, 2 * JOINTS :]
+        for name, site in zip(scenario.names, trace.buckets, strict=True)
+        if len(site)
+    }
+    hanging = [name for name, q in ends.items() if points_down(q) and not points_down(starts[name])]
+    if hanging:
+        yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
+    if any(spec.hands for spec in scenario.sites.values()) or scenario.external:
+        return
+    low, high = (pick(list(starts.values()), axis=0) for pick in (np.min, np.max))
+    away = {name: float(np.maximum(low - q, q - high).max()) for name, q in ends.items()}
+    name = max(away, key=away.__getitem__, default="")
+    if name and not hanging and away[name] > THROWN_RAD:
+        yield f"{name} ends {away[name]:.3g} rad away from every start pose, and nobody pushed"
+
+
+def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
+    """Returns when an operator last changed what it does before the end of a run, s; 0 if none ever did."""
+    t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
+    last_s = 0.0
+    for spec in scenario.sites.values():
+        for source in (hand.actor for hand in spec.hands):
+            script = compute_operator_script(source, t_s, np.eye(JOINTS))
+            changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
+            edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
+            last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))
+    return last_s
+
+
+def _reduce_site(part: SiteLog) -> Array:
+    """Returns the buckets of a site's records."""
+    empty = np.zeros((0, PEAK_COLUMNS))
     if not len(part):
-        return np.zeros((0, 2))
-    bucket = part.tick * BUCKETS_PER_S // part.rate_hz
-    maxima = np.full((int(bucket[-1]) + 1, 2), -1.0)
-    for column, values in enumerate((part.e, part.qd)):
-        np.maximum.at(maxima[:, column], bucket, np.abs(values).max(axis=1))
-    return maxima
+        return empty
+    return reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, empty)
 
 
 def _frequency_hz(parts: list[SiteLog]) -> float | None:
@@ -238,8 +482,7 @@ def _frequency_hz(parts: list[SiteLog]) -> float | None:
     halves = [part.qd[len(part) // 2 :] for part in parts if len(part) > 1]
     part, half = max(zip(parts, halves, strict=False), key=lambda pair: float(np.abs(pair[1]).max()))
     column = half[:, int(np.abs(half).max(axis=0).argmax())]
-    signs = np.sign(column - column.mean())
-    crossings = int(np.count_nonzero(np.diff(signs[signs != 0.0])))
+    crossings = _count_sign_changes(column)
     span_s = float(part.tick[-1] - part.tick[len(part) // 2]) / part.rate_hz
     return None if crossings < MIN_SIGN_CHANGES else 0.5 * crossings / span_s
 
@@ -249,22 +492,29 @@ def fit_envelope(t_s: Array, error_rad: Array) -> EnvelopeFit:
 
     Times ascend, shape (K,), s; the largest |e| is that at each time, or since the time before.
     """
-    fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
+    return fit_envelopes(t_s, error_rad[:, np.newaxis])[0]
+
+
+def fit_envelopes(t_s: Array, values: Array) -> list[EnvelopeFit]:
+    """Returns the trends of several envelopes, shape (K, C), see `fit_envelope`."""
+    fits = [EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)] * values.shape[1]
+    pending = list(range(values.shape[1]))
     for windows in _T_QUANTILES:
-        maxima = _window_maxima(t_s, error_rad, windows)
+        maxima = _window_maxima(t_s, values[:, pending], windows)
         if maxima is None:
             continue
-        fit = _fit_maxima(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows)
-        if fit.trend is not EnvelopeTrend.UNDECIDED:
-            break
-    if fit.trend is EnvelopeTrend.GROWS:
-        first_half = _window_maxima(-t_s[::-1], error_rad[::-1], 4)
-        if first_half is not None and np.diff(np.log(first_half)).min() >= _RISE:  # a fall, then a rise: a V
-            return fit._replace(trend=EnvelopeTrend.UNDECIDED)
-    return fit
+        for n, fit in zip(pending, _fit_maxima(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows), strict=True):
+            fits[n] = fit
+        pending = [n for n in pending if fits[n].trend is EnvelopeTrend.UNDECIDED]
+    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
+    first_half = _window_maxima(-t_s[::-1], values[::-1, growing], 4) if growing else None
+    if first_half is not None:  # a fall, then a rise: a V
+        for n, fell in zip(growing, np.diff(np.log(first_half), axis=0).min(axis=0) >= _RISE, strict=True):
+            fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED) if fell else fits[n]
+    return fits
 
 
-def _window_maxima(t_s: Array, error_rad: Array, windows: int) -> Array | None:
+def _window_maxima(t_s: Array, values: Array, windows: int) -> Array | None:
     """Returns the maxima of equal windows of the second half; None if one has fewer than two points."""
     if not len(t_s):
         return None
@@ -272,29 +522,45 @@ def _window_maxima(t_s: Array, error_rad: Array, windows: int) -> Array | None:
     starts = np.searchsorted(t_s, edges[:-1])
     if np.any(np.diff(np.append(starts, len(t_s))) < 2):
         return None
-    return np.maximum(np.maximum.reduceat(error_rad, starts), FLOOR_RAD)
+    return np.maximum(np.maximum.reduceat(values, starts, axis=0), FLOOR_RAD)
 
 
-def _fit_maxima(maxima: Array, window_s: float) -> EnvelopeFit:
-    """Returns the class of the maxima of equal windows, by a line through their logarithms."""
+def _fit_maxima(maxima: Array, window_s: float) -> list[EnvelopeFit]:
+    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their logarithms."""
     n, values = len(maxima), np.log(maxima)
     x = np.arange(n) - 0.5 * (n - 1)
     spread = float(x @ x)
-    slope = float(x @ values) / spread
-    residual = values - values.mean() - slope * x
-    bound = _T_QUANTILES[n] * math.sqrt(float(residual @ residual) / (n - 2) / spread)
-    steps = np.diff(np.log(maxima.reshape(4, -1).max(axis=1)))
+    slopes = (x[:, np.newaxis] * values).sum(axis=0) / spread  # a matrix product's last bits may vary
+    residual = values - values.mean(axis=0) - x[:, np.newaxis] * slopes
+    bounds = _T_QUANTILES[n] * np.sqrt((residual**2).sum(axis=0) / (n - 2) / spread)
+    quarters = np.log(maxima.reshape(4, n // 4, -1).max(axis=1))
+    fits = []
+    for slope, bound, quarter in zip(slopes.tolist(), bounds.tolist(), quarters.T, strict=True):
+        steps, last = np.diff(quarter), float(quarter[-1])
+        trend = _name_trend(slope * n, bound * n, steps, dead=last <= math.log(FLOOR_RAD))
+        falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+        calm = (falls or (slope + bound) * n <= _CALM) and float(steps[-1]) <= _CALM_STEP
+        fits.append(EnvelopeFit(trend, float(slope / window_s), bool(calm)))
+    return fits
+
+
+def _name_trend(change: float, bound: float, steps: Array, *, dead: bool) -> EnvelopeTrend:
+    """Returns the class of an envelope.
+
+    Args:
+        change: of its logarithm over the half, by the line.
+        bound: of the error of that.
+        steps: of the logarithm of the maxima from quarter to quarter of the half.
+        dead: True if the last quarter is at the floor.
+    """
     lasts = steps[-1] >= 0.75 * steps[0] or (steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0])
-    if maxima.max() <= FLOOR_RAD:
-        trend = EnvelopeTrend.DECAYS
-    elif slope - bound > 0.0 and steps.min() >= _RISE and lasts:
-        trend = EnvelopeTrend.GROWS
-    elif steps[-1] > _DOUBLE:
-        trend = EnvelopeTrend.UNDECIDED
-    elif slope + bound < 0.0 and slope * n <= -4.0 * _RISE:
-        trend = EnvelopeTrend.DECAYS
-    elif (slope + bound) * n <= _DOUBLE:
-        trend = EnvelopeTrend.STEADY
-    else:
-        trend = EnvelopeTrend.UNDECIDED
-    return EnvelopeFit(trend, float(slope / window_s))
+    if dead:
+        return EnvelopeTrend.DECAYS
+    if change > bound and steps.min() >= _RISE and lasts:
+        return EnvelopeTrend.GROWS
+    if steps[-1] > _DOUBLE:
+        return EnvelopeTrend.UNDECIDED
+    if change + bound < 0.0 and change <= -4.0 * _RISE:
+        clear = change <= -_DOUBLE and steps[-1] <= -_DOUBLE / 8.0
+        return EnvelopeTrend.DECAYS if clear else EnvelopeTrend.HARDLY
+    return EnvelopeTrend.STEADY if abs(change) + bound <= _DOUBLE else EnvelopeTrend.UNDECIDED

@@ -1,4 +1,4 @@
-"""`trilat certify`: the Lyapunov certificate of a run: V, its energy balance, premises, growth."""
+"""`trilat certify`: the judgement of a run, V and its energy balance, premises, roots at the end pose."""
 
 from typing import TYPE_CHECKING
 
@@ -22,24 +22,25 @@ _MARKS = {
 }
 
 
-def certify_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
-    """Judges the stability of a run: V and its energy balance, the theorem's premises, growth.
+def certify_command(
+    files: options.LogsArgument, accept: options.AcceptOption = None, as_json: options.JsonOption = False
+) -> None:
+    """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
 
     Nothing is executed; docs/certificate.md defines every word and every key of the JSON.
 
-    Exit code 0: V bounds the run, whether the theorem covers it or not, or e and qd show that nothing grows.
-    1: it diverged or grows; the energy balance is broken; or neither V nor growth decides (record longer).
-    2: no log.
+    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged), or open, each with
+    its word and reasons. 2: no log.
     """
     from ..analysis.certificate.stability_certificate import certificate_to_json
-    from ..analysis.certificate.stability_certificate import certify as certified
+    from ..theory.end_pose import certify_with_roots
 
-    found = certified(terminal.open_with_progress(*files))
+    found = certify_with_roots(terminal.open_with_progress(*files))
     if as_json:
         terminal.print_json(certificate_to_json(found))
     else:
         _show(found)
-    if not found.passed:
+    if not found.accepts(accept or ()):
         raise typer.Exit(1)
 
 

@@ -252,13 +252,18 @@ def _compare_logs(files: list[Path], *, as_json: bool) -> None:
     if len(files) < 2:
         raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
     from ..analysis.metrics.log_metrics import compare_metrics, comparison_to_json
+    from ..reporting.certificate_text import describe_judgement
     from ..scenario.describe import compare_scenarios
     from ..studies.tuning.final_posture import check_final_posture
+    from ..theory.end_pose import certify_with_roots
 
     logs = [terminal.open_with_progress(file) for file in files]
     names = name_columns(files)
     different = compare_scenarios([log.scenario for log in logs])
-    remarks = {name: check_final_posture(log) for name, log in zip(names, logs, strict=True)}
+    remarks = {
+        name: [describe_judgement(certify_with_roots(log)), *check_final_posture(log)]
+        for name, log in zip(names, logs, strict=True)
+    }
     found = compare_metrics(logs, names)
     means = average_repeats(logs, found)
     if not as_json:

@@ -1,6 +1,7 @@
 """Options and arguments that several commands share, and the scenario and connection that they describe."""
 
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -104,6 +105,19 @@ ViewsOption = Annotated[
 
 JobsOption = Annotated[
     int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
+]
+
+
+class Accepted(StrEnum):
+    """What `--accept` lets pass besides a stable run."""
+
+    BOUNDED = "bounded"
+    OPEN = "open"
+
+
+AcceptOption = Annotated[
+    list[Accepted] | None,
+    typer.Option("--accept", help="Exit 0 for a bounded oscillation, or an open judgement, too; repeatable."),
 ]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[

@@ -40,8 +40,16 @@ SUMS_DTYPE = np.dtype(
 """A site's sums over its records: of |tau - G|^2 and of e^2; the largest force of a wall; the work of its
 environments (0: it has none, 1: beside operators, 2: alone). And of the record before: q, the present and
 the held torque of the environments."""
+PEAK_COLUMNS = 3 * JOINTS
+"""Of a bucket: per joint the largest |e|, then per joint the largest |qd|, then the last q of each."""
 
 _DIVERGED = int(Mode.DIVERGED)
+
+
+def largest_of_joints(buckets: Array) -> Array:
+    """Returns the largest |e| and |qd| of any joint, of buckets of `PEAK_COLUMNS`, shape (K, 2)."""
+    found: Array = buckets[:, : 2 * JOINTS].reshape(-1, 2, JOINTS).max(axis=2)
+    return found
 
 
 @leaf
@@ -63,16 +71,17 @@ def _receive(
 
 @leaf
 def _update_peaks(row: Array, t_ns: int, apart_rad: float, progress: Row, peaks: Array, sums: Row) -> None:
-    """Updates the largest |e| and |qd| of the present bucket by a record; a full bucket is left."""
-    error = speed = 0.0
+    """Updates the present bucket by a record, see `PEAK_COLUMNS`; a full bucket is left."""
+    error = 0.0
+    n = progress.bucket
     for i in range(JOINTS):
         e = row[i] - row[RECORD_Q_DES + i]
         sums.errors[i] += e * e
-        error = max(error, abs(e))
-        speed = max(speed, abs(row[JOINTS + i]))
-    n = progress.bucket
-    peaks[n, 0] = max(peaks[n, 0], error)
-    peaks[n, 1] = max(peaks[n, 1], speed)
+        apart = abs(e)
+        error = max(error, apart)
+        peaks[n, i] = max(peaks[n, i], apart)
+        peaks[n, JOINTS + i] = max(peaks[n, JOINTS + i], abs(row[JOINTS + i]))
+        peaks[n, 2 * JOINTS + i] = row[i]
     if error >= apart_rad:
         progress.apart_ns = t_ns
     progress.part += BUCKETS_PER_S
@@ -129,7 +138,7 @@ def run_until(
         progress: of each site, shape (N,), PROGRESS_DTYPE.
         taken: the next sample of each peer to accept, shape (N, P).
         sent: each site's last records, shape (N, a power of two), SENT_DTYPE.
-        peaks: largest |e| and |qd| of each bucket, -1 where there is no record, shape (N, buckets, 2).
+        peaks: of each bucket its `PEAK_COLUMNS`, -1 where there is no record, shape (N, buckets, 6).
         sums: of each site, shape (N,), SUMS_DTYPE.
         arrays: of all sites, see `stack_site_arrays`.
     """

@@ -11,7 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import PROGRESS_DTYPE, SENT_DTYPE, SUMS_DTYPE, run_until
+from ..core.fused_run import (
+    PEAK_COLUMNS,
+    PROGRESS_DTYPE,
+    SENT_DTYPE,
+    SUMS_DTYPE,
+    largest_of_joints,
+    run_until,
+)
 from ..core.site_arrays import stack_site_arrays
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, tick_ns
 from ..core.two_link_arm import JOINTS
@@ -92,7 +99,7 @@ class FusedRun:
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
         kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
         self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
-        self._peaks = np.full((count, 0, 2), -1.0)
+        self._peaks = np.full((count, 0, PEAK_COLUMNS), -1.0)
         self._sums: RowArray = np.zeros(count, SUMS_DTYPE)
         self._sums["environment"] = [
             (1 if spec.hands else 2) if spec.environment else 0 for spec in scenario.sites.values()
@@ -109,7 +116,7 @@ class FusedRun:
             if progress.tick < progress.ticks:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
         buckets = math.ceil(until_s * BUCKETS_PER_S) + 1
-        grown = np.full((len(self._progress), buckets, 2), -1.0)
+        grown = np.full((len(self._progress), buckets, PEAK_COLUMNS), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
@@ -134,8 +141,8 @@ class FusedRun:
         return None if ended else float(progress.apart_ns) / NS_PER_S
 
     @property
-    def maxima(self) -> tuple[Array, ...]:
-        """Largest |e|, rad, and |qd|, rad/s, per 50 ms bucket of each site, shape (buckets, 2) each.
+    def buckets(self) -> tuple[Array, ...]:
+        """The `PEAK_COLUMNS` of every 50 ms of each site, shape (buckets, 6) each.
 
         -1 marks a bucket without a record of that site; the last one may be incomplete.
         """
@@ -143,6 +150,11 @@ class FusedRun:
             self._peaks[n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1]
             for n, progress in enumerate(self._progress)
         )
+
+    @property
+    def maxima(self) -> tuple[Array, ...]:
+        """Largest |e|, rad, and |qd|, rad/s, of any joint, of the same buckets, shape (buckets, 2) each."""
+        return tuple(map(largest_of_joints, self.buckets))
 
     @property
     def totals(self) -> "RunTotals":

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
+from ..analysis.run_end import Stability
 
 MIN_ENERGY_SHARE = 1e-6
 """Smaller shares of the largest energy are not listed."""
@@ -32,33 +33,40 @@ class CertificateMark(StrEnum):
 
 
 class CertificateLine(NamedTuple):
-    """One sentence, and what it does: ok supports the run, FAIL alone fails it, open decides nothing."""
+    """One sentence, and what it says: ok supports the run, FAIL speaks against it, open decides nothing."""
 
     mark: CertificateMark
     text: str
 
 
 def describe_certificate(found: Certificate) -> list[CertificateLine]:
-    """Returns the verdict, the growth, and the balance."""
+    """Returns the judgement, and then what it rests on: V, the end of the run, the balance, the roots."""
     finding = found.verdict.finding
     broken = finding is StabilityFinding.BROKEN
-    verdict = (
-        CertificateMark.FAIL if broken else CertificateMark.OK if found.bounded_by_v else CertificateMark.OPEN
-    )
-    lines = [(verdict, found.verdict.text)]
-    lines.append((_GROWTH[found.end.behaviour.grows], f"e and qd: {found.end.text}"))
+    stable = "FAIL" if broken else _JUDGEMENT[found.stability]
+    verdict = "FAIL" if broken else "ok" if found.bounded_by_v else "open"
+    lines = [(stable, describe_judgement(found)), (verdict, found.verdict.text)]
+    lines.append((_JUDGEMENT[found.end.stability], f"e and qd: {found.end.text}"))
     if found.balance is not None:
-        mark = _BALANCE.get(finding, CertificateMark.OK)
+        mark = _BALANCE.get(finding, "ok")
         lines.append((mark, f"energy balance: {describe_balance(found.balance)}"))
+    if found.roots is not None:
+        decides = found.roots.exact and found.roots.verdict
+        lines.append((_ROOTS.get(decides or "", "note"), found.roots.text))
     if found.ones is not None and found.ones_rise is not None:
         risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
-        text = f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"
-        lines.append((CertificateMark.NOTE, text))
-    return [CertificateLine(*line) for line in lines]
+        lines.append(("note", f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"))
+    return [CertificateLine(CertificateMark(mark), text) for mark, text in lines]
 
 
-_GROWTH = {True: CertificateMark.FAIL, False: CertificateMark.OK, None: CertificateMark.OPEN}
-_BALANCE = {StabilityFinding.BROKEN: CertificateMark.FAIL, StabilityFinding.NOT_JUDGED: CertificateMark.OPEN}
+def describe_judgement(found: Certificate) -> str:
+    """Returns the judgement in one line: the word, how the run ended, and what leaves it open."""
+    return "; ".join([f"{found.stability}: {found.end.behaviour}", *found.reasons])
+
+
+_JUDGEMENT = {Stability.STABLE: "ok", Stability.NOT_STABLE: "FAIL", Stability.OPEN: "open"}
+_BALANCE = {StabilityFinding.BROKEN: "FAIL", StabilityFinding.NOT_JUDGED: "open"}
+_ROOTS = {"stable": "ok", "unstable": "open"}
 
 
 def describe_balance(balance: EnergyBalance) -> str:

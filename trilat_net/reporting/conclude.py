@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.certificate.stability_certificate import certify
 from ..errors import LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import CheckLine, check_log_files
 from ..execution.verify import find_last_ticks
@@ -18,6 +17,8 @@ from ..execution.virtual_comparison import simulate_without_operators
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
+from ..theory.end_pose import certify_with_roots
+from .certificate_text import describe_judgement
 from .summary_text import format_run_lines
 from .text_table import TextTable
 
@@ -53,8 +54,9 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(check_log_files, log.sources)
         twin = _run_without_operators(log)
-        certificate = certify(log)
-        notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
+        certificate = certify_with_roots(log)
+        judgement = f"certificate: {describe_judgement(certificate)}; {certificate.verdict.text}"
+        notes = [*format_run_lines(log), judgement]
 
         def verdicts() -> Iterator[CheckLine]:
             try:

@@ -108,8 +108,7 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     part before, and it fails unless `stable = false` is asked.
 
     Attributes:
-        stable: true: no site diverges and the envelope of the largest |e| does not grow; false: one of the
-            two happens. A run too short to decide fails both, see `analysis.run_end`.
+        stable: true: the run is stable; false: it is not. An open one fails both, see `analysis.run_end`.
         synchronised_by_s: from this time to the end of the run the largest |e| stays below
             `synchronised_rad`.
         synchronised_rad: the limit of |e| below which the sites are synchronised, rad.

@@ -65,12 +65,14 @@ class OperatingConditions(NamedTuple):
         alpha: dominance matrix, shape (N, N), Eq. (6).
         age_s: age of the sample of j that i uses, shape (N, N), s; 0 where it uses none.
         notes: remarks on what was left out or fixed.
+        varying: True if ages vary, and `age_s` holds their means.
     """
 
     sites: tuple[SiteSetup, ...]
     alpha: Array
     age_s: Array
     notes: tuple[str, ...]
+    varying: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,7 +119,7 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
         )
     if any(site.on_stale.action is not StaleAction.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
-    return OperatingConditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)))
+    return OperatingConditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)), bool(varying))
 
 
 def _refuse_unknown_equations(scenario: Scenario) -> None:

@@ -61,9 +61,12 @@ def test_unequal_scalars_of_kd_hold() -> None:
 
 def test_a_hand_that_lets_go_is_no_failure_and_one_that_holds_on_is() -> None:
     assert premises("paper", duration_s=3.0, rate_hz=100)["hands"].holds is False  # until 11 s
-    lets_go = premises("paper", duration_s=11.5, rate_hz=100)["hands"]
+    lets_go = premises("paper", duration_s=12.5, rate_hz=100)["hands"]
     assert lets_go.holds
     assert "nobody pushes after 10.99" in lets_go.text
+    briefly = premises("paper", duration_s=11.5, rate_hz=100)["hands"]
+    assert briefly.holds is False
+    assert "0.5 s of free motion at the end are less than 1 s" in briefly.text
 
 
 def test_a_damper_of_qd_may_give_with_respect_to_r_and_a_wall_does() -> None:

@@ -1,14 +1,22 @@
 """The verdict: covered, outside and yet not risen, risen and by whom, and logs that do not add up."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import msgspec
+import numpy as np
 import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.certificate.stability_certificate import Certificate, StabilityFinding, certify
-from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.analysis.certificate.stability_certificate import (
+    Certificate,
+    EndPoseRoots,
+    StabilityFinding,
+    certify,
+    find_growth,
+)
+from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
 from trilat_net.scenario import parse_scenario
@@ -27,11 +35,13 @@ def test_free_motion_is_covered() -> None:
     found = certify(made())
     assert found.verdict.finding is StabilityFinding.COVERED
     assert found.verdict.text.startswith("covered by the theorem: V did not rise: 29.78 J at 0 s, 12")
-    assert found.passed
+    assert found.bounded_by_v
+    assert found.stability is Stability.OPEN
+    assert not found.passed
 
 
 def test_hands_are_told_of_and_excused() -> None:
-    found = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).certificate
+    found = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
     assert found.verdict.finding is StabilityFinding.COVERED
     assert "covered by the theorem: V rose by no more than the hands gave: 24 J" in found.verdict.text
 
@@ -40,7 +50,7 @@ def test_outside_and_yet_not_risen() -> None:
     found = runs.run("wall").certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.verdict.text.startswith("outside the theorem (hands), yet V rose by no more than the hands")
-    assert found.passed
+    assert found.bounded_by_v
 
 
 def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
@@ -149,8 +159,8 @@ def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
     """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
     found = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.end.behaviour.grows is None
-    assert found.passed
+    assert found.end.stability is Stability.OPEN
+    assert found.bounded_by_v
 
 
 def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
@@ -161,8 +171,65 @@ def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
     assert not found.passed
 
 
+def still() -> Certificate:
+    """The paper's law at rest: nothing leaves it open."""
+    return runs.run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
+
+
+def test_a_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
+    assert still().stability is Stability.STABLE
+    assert still().passed
+    assert still().reasons == ()
+
+
 def test_growth_fails_a_run_whatever_v_did() -> None:
-    found = runs.run("wall").certificate
-    grown = found.end._replace(behaviour=EndBehaviour.GROWS)
-    assert found.passed
-    assert not found._replace(end=grown).passed
+    grown = still()._replace(end=still().end._replace(behaviour=EndBehaviour.GROWS))
+    assert grown.stability is Stability.NOT_STABLE
+    assert not grown.accepts(("bounded", "open"))
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "accepted", "passes"),
+    [
+        (EndBehaviour.BOUNDED, ("bounded",), True),
+        (EndBehaviour.BOUNDED, ("open",), False),
+        (EndBehaviour.HARDLY, ("open",), True),
+        (EndBehaviour.HARDLY, ("bounded",), False),
+        (EndBehaviour.DRIFTS, ("bounded", "open"), False),
+    ],
+)
+def test_only_what_is_accepted_passes_besides_a_stable_run(
+    behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
+) -> None:
+    found = still()._replace(end=still().end._replace(behaviour=behaviour))
+    assert not found.passed
+    assert found.accepts(accepted) is passes
+
+
+def test_a_broken_balance_is_never_accepted() -> None:
+    found = tampered(lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s)
+    assert found.verdict.finding is StabilityFinding.BROKEN
+    assert not found.accepts(("bounded", "open"))
+
+
+def test_an_unstable_rest_leaves_a_run_open_unless_its_ages_vary() -> None:
+    roots = EndPoseRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
+    assert still()._replace(roots=roots).stability is Stability.OPEN
+    assert roots.text in still()._replace(roots=roots).reasons
+    assert still()._replace(roots=roots._replace(exact=False)).passed
+    assert still()._replace(roots=roots._replace(verdict="stable")).passed
+
+
+def test_v_that_rises_at_the_end_or_ends_above_its_beginning_is_named() -> None:
+    balance = still().balance
+    assert balance is not None
+    t_s, V = balance.t_s, balance.unsupplied
+
+    def growth(added: np.ndarray) -> list[str]:
+        changed = replace(balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added})
+        return find_growth(changed, 1e-3)
+
+    assert growth(np.zeros(len(V))) == []
+    assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []
+    assert "V rises at the end: by 0.0" in growth(np.maximum(0.0, t_s - 20.0) * 0.01)[0]
+    assert "above its beginning" in growth(np.where(t_s > 1.0, 100.0, 0.0))[0]

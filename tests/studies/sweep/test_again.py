@@ -10,7 +10,7 @@ from tests.cli.running import trilat
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.cell_result import CLASS_OF_MOTION
+from trilat_net.studies.sweep.cell_result import classify_end
 from trilat_net.studies.sweep.sweep_run import build_reproduce_command
 
 from .quick import SHORT, asked
@@ -40,7 +40,7 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResul
         seen = classify_log_end(log)
         assert seen.end_error_rad == outcome.end_error_rad
         assert seen.end_speed_rad_s == outcome.end_speed_rad_s
-        assert CLASS_OF_MOTION[seen.behaviour] is outcome.verdict
+        assert classify_end(seen) is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)

@@ -21,8 +21,8 @@ from trilat_net.studies.sweep.map_page import tabulate_confirmations
 
 from .maps import KEYS, Row, by_the_line, rows
 
-BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 4.0}
-CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 20.0})
+BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 12.0}
+CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 4.0})
 WILD = load_scenario(
     "p_d_margin", {**BRIEF, "control.d": 0.2, "link.delay_ms": 500.0, "limits.qd_limit_rad_s": 12.0}
 )

@@ -4,7 +4,7 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.analysis.run_end import EndBehaviour, EnvelopeTrend, Stability
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.studies.trials.expectations import ExpectationResult
 from trilat_net.studies.trials.measure_run import LinkAge, RunMetrics
@@ -38,6 +38,9 @@ TOO_MUCH = {"expect.mean_age_max_ms": 1.0}
 CALM = RunMetrics(
     simulated_s=20.0,
     diverged_at_s=None,
+    stability=Stability.STABLE,
+    behaviour=EndBehaviour.DECAYS,
+    reasons=(),
     trend=EnvelopeTrend.DECAYS,
     rate_per_s=-0.2,
     synchronised_at_s=11.0,

@@ -16,7 +16,6 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow
 from trilat_net.studies.record_batches import BATCH_RECORDS, RecordBatch
 from trilat_net.studies.trials.measure_run import (
-    BUCKET_NS,
     RunMetrics,
     SiteStats,
     WindowStats,
@@ -113,6 +112,7 @@ def test_every_missing_record_of_a_log_is_counted() -> None:
 
 PERIOD_NS = 10_000_000
 TALLIED = 400
+BUCKET_NS = 50_000_000
 
 
 def records(seed: int) -> RecordBatch:
@@ -138,7 +138,7 @@ def test_the_cut_into_blocks_changes_no_statistics_of_a_site(seed: int, cuts: li
     for figure in ("records", "peak_error_rad", "peak_torque_nm", "peak_speed_rad_s", "apart_ns", "last_ns"):
         assert getattr(cut, figure) == getattr(whole, figure)
     assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
-    assert cut.peaks().tolist() == whole.peaks().tolist()
+    assert cut.buckets.tolist() == whole.buckets.tolist()
     assert cut.rms_error_rad == pytest.approx(whole.rms_error_rad)
     assert cut.mean_age_ms == pytest.approx(whole.mean_age_ms)
     end, end_of_whole = cut.end(cut.last_ns), whole.end(whole.last_ns)
@@ -160,8 +160,10 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
     assert tally.mean_age_ms[1] == pytest.approx(np.mean(ages))
     assert tally.age_max_ms[1] == pytest.approx(max(ages))
-    for bucket, peak in enumerate(tally.peaks()):
-        assert peak == error[rows.t_ns // BUCKET_NS == bucket].max()
+    for bucket, row in enumerate(tally.buckets):
+        inside = rows.t_ns // BUCKET_NS == bucket
+        peaks = (error[inside].max(axis=0), np.abs(rows.qd[inside]).max(axis=0), rows.q[inside][-1])
+        assert row.tolist() == np.concatenate(peaks).tolist()
 
 
 def test_what_it_keeps_does_not_grow_with_the_records() -> None:
@@ -184,7 +186,7 @@ def test_a_bucket_without_records_says_so() -> None:
     keep = (rows.t_ns // BUCKET_NS) != 7
     tally = SiteStats([100, 50], 1.0)
     tally.add(RecordBatch(*(part[keep] for part in rows)))
-    assert [n for n, peak in enumerate(tally.peaks()) if peak < 0] == [7]
+    assert [n for n, row in enumerate(tally.buckets) if row[0] < 0] == [7]
 
 
 WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}

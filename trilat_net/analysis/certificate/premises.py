@@ -21,6 +21,10 @@ from .energy_terms import SiteConstants, derive_site_constants, explain_missing_
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages that differ by no more are one: stamps are whole nanoseconds."""
+MIN_FREE_S = 1.0
+"""The least free motion at the end of a run of which the theorem speaks, s; and so many times the largest age
+of a sample in use:"""
+MIN_FREE_AGES = 5.0
 MAX_LISTED_NAMES = 4
 """Links or sites that a sentence names."""
 
@@ -172,9 +176,23 @@ def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance)
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(pushed_s[site][-1] for site in sites)
     text = f"the {who} gave up to {gave:.3g} J with respect to r = qd + Lambda e"
-    if let_go_s < balance.t_s[-1] - 1e-9:
+    free_s, least_s = float(balance.t_s[-1] - let_go_s), _least_free_motion_s(energies)
+    if free_s >= least_s:
         return Premise("hands", True, f"{text}; nobody pushes after {let_go_s:.3f} s")
+    if free_s > 1e-9:
+        short = f"{free_s:.3g} s of free motion at the end are less than {least_s:.3g} s"
+        return Premise("hands", False, f"{text}, and push until {let_go_s:.3f} s: {short}")
     return Premise("hands", False, f"{text}, and push to the end: not passive with respect to r")
+
+
+def _least_free_motion_s(energies: Mapping[str, SiteEnergy]) -> float:
+    ages_s = [
+        float(np.nanmax(energy.motion.records.t_s - view.stamp_s))
+        for energy in energies.values()
+        for peer, view in energy.motion.peers.items()
+        if peer in energy.followed and np.isfinite(view.stamp_s).any()
+    ]
+    return max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s, default=0.0))
 
 
 def _check_records(balance: EnergyBalance) -> Premise:

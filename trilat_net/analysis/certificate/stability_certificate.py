@@ -6,7 +6,7 @@ a log cannot decide is stated: without a functional the end of the run alone dec
 their unit, and unknown values are null.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ..health import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
-from ..run_end import RunEnd, classify_log_end
+from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from .energy_balance import (
     EXTERNAL_SOURCES,
     ZERO_ENERGY_J,
@@ -92,6 +92,22 @@ class StabilityVerdict(NamedTuple):
     tolerance: float = 0.0
 
 
+class EndPoseRoots(NamedTuple):
+    """The loop linearised where a run ended.
+
+    Attributes:
+        verdict: stable, unstable or at the edge, of small motions there; "" if there is no such loop.
+        rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None without one.
+        exact: False if ages vary, and the roots are those of their means: they decide nothing then.
+        text: the rest and its roots, or why there are none.
+    """
+
+    verdict: str
+    rate_per_s: float | None
+    exact: bool
+    text: str
+
+
 class Certificate(NamedTuple):
     """Stability certificate of a log.
 
@@ -101,6 +117,7 @@ class Certificate(NamedTuple):
         balance: of all sites; None without a functional, or if beta is not unique.
         ones: the same with the paper's weights; None if those are right, or without a balance.
         groups: closed groups of sites, if there are several: then beta is not unique.
+        roots: of the loop where the run ended; None if nobody looked.
     """
 
     premises: list[Premise]
@@ -110,6 +127,7 @@ class Certificate(NamedTuple):
     balance: EnergyBalance | None
     ones: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
+    roots: EndPoseRoots | None = None
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
@@ -131,15 +149,34 @@ class Certificate(NamedTuple):
         return bool((self.balance.beta > 0.0).all()) or (failed == ["shares"] and constant)
 
     @property
-    def passed(self) -> bool:
-        """Decides the exit code: the balance closes, and V or the end of the run shows that it is bounded.
+    def reasons(self) -> tuple[str, ...]:
+        """What leaves the run open or false, in words: of its end, of V, of the roots at its end pose."""
+        broken = self.verdict.finding is StabilityFinding.BROKEN
+        found = [self.verdict.text] if broken else []
+        if self.balance is not None and not broken:
+            found += find_growth(self.balance, self.verdict.tolerance)
+        if self.roots is not None and self.roots.exact and self.roots.verdict == "unstable":
+            found.append(self.roots.text)
+        return (*self.end.reasons, *found)
 
-        An undecided end does not pass, as for `stable` of `trilat test`.
-        """
-        grows = self.end.behaviour.grows
-        if self.verdict.finding is StabilityFinding.BROKEN or grows:
+    @property
+    def stability(self) -> Stability:
+        """The judgement of the run: that of its end; what else is known may only make a stable one open."""
+        own = self.end.stability
+        return Stability.OPEN if own is Stability.STABLE and self.reasons else own
+
+    @property
+    def passed(self) -> bool:
+        """Decides the exit code: the run is stable."""
+        return self.accepts(())
+
+    def accepts(self, accepted: Collection[str]) -> bool:
+        """True if the run is stable, or bounded or open where that is accepted; a broken balance never is."""
+        if self.verdict.finding is StabilityFinding.BROKEN:
             return False
-        return self.bounded_by_v or grows is False
+        bounded = "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED
+        opened = "open" in accepted and self.stability is Stability.OPEN
+        return bounded or opened or self.stability is Stability.STABLE
 
 
 def certify(log: Log) -> Certificate:
@@ -265,6 +302,26 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     return FunctionalRise(float(balance.t_s[first]), float(balance.t_s[last]), float(rise[last]), notable)
 
 
+def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
+    """Returns what V, less the work of operator and environment, says against a run that looks stable.
+
+    It must not end above its beginning, nor rise at the end of the judged half: to above its least value
+    there, by more than half of what it fell within that half.
+    """
+    V, half = balance.unsupplied, len(balance.unsupplied) // 2
+    found = []
+    gained = float(V[-1] - V[0])
+    if gained > tolerance:
+        found.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
+    judged = V[half:]
+    lowest = int(judged.argmin())
+    risen, fell = float(judged[-1] - judged[lowest]), float(judged[0] - judged[lowest])
+    if risen > tolerance and risen > 0.5 * fell:
+        from_s = float(balance.t_s[half + lowest])
+        found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
+    return found
+
+
 def _describe_rise(rise: FunctionalRise, balance: EnergyBalance) -> str:
     causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4])
     who = f"; given by {causes}" if causes else "; nobody gave it"
@@ -285,6 +342,8 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
     verdict, end, balance = certificate.verdict, certificate.end, certificate.balance
     return {
         "passed": certificate.passed,
+        "stability": certificate.stability.value,
+        "reasons": list(certificate.reasons),
         "verdict": verdict.finding.name.lower(),
         "text": verdict.text,
         "rise": _rise_to_json(verdict.rise),
@@ -294,11 +353,13 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
         "growth": {
             "motion": end.behaviour.name.lower(),
             "text": end.text,
+            "where": end.where or None,
             "error_rate_per_s": finite_or_none(end.error.rate_per_s),
             "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
             "end_error_rad": end.end_error_rad,
             "end_speed_rad_s": end.end_speed_rad_s,
         },
+        "roots": None if certificate.roots is None else certificate.roots._asdict(),
         "functional": None if balance is None else _functional_to_json(certificate, balance),
     }
 

@@ -11,8 +11,10 @@ from enum import StrEnum
 
 import msgspec
 
-from ...analysis.run_end import EndBehaviour, classify_run_end
+from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, acts_on_arm, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...core.site_arrays import RECORD_TAU_X
+from ...core.two_link_arm import JOINTS
 from ...errors import ScenarioError
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
@@ -28,19 +30,15 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """True if errors die away, False if they stay or grow; None if undecided."""
+        """True if the run is stable, False if it is not; None if that is open."""
         return None if self is CellClass.UNDECIDED else self is CellClass.CONVERGED
 
 
-CLASS_OF_MOTION = {
-    EndBehaviour.CONVERGED: CellClass.CONVERGED,
-    EndBehaviour.DECAYS: CellClass.CONVERGED,
-    EndBehaviour.BOUNDED: CellClass.BOUNDED,
-    EndBehaviour.GROWS: CellClass.DIVERGED,
-    EndBehaviour.DIVERGED: CellClass.DIVERGED,
-    EndBehaviour.UNDECIDED: CellClass.UNDECIDED,
-}
-"""The class of a cell for each end of its run."""
+def classify_end(end: RunEnd) -> CellClass:
+    """Returns the class of a cell for the judgement of its run; what drifts or grows has left."""
+    if end.stability is Stability.NOT_STABLE:
+        return CellClass.BOUNDED if end.behaviour is EndBehaviour.BOUNDED else CellClass.DIVERGED
+    return CellClass.CONVERGED if end.stability is Stability.STABLE else CellClass.UNDECIDED
 
 
 class CellResult(msgspec.Struct, frozen=True):
@@ -49,6 +47,7 @@ class CellResult(msgspec.Struct, frozen=True):
     Attributes:
         verdict: its class.
         motion: the word of the certificate, which tells growing from diverged and decaying from converged.
+        reasons: what leaves the run open, in words.
         ran_s: how long it ran in the end, extensions and an early stop included, s.
         extended: how often its time was doubled because it had not been decided.
         end_error_rad: the largest abs(e) of the last second, rad.
@@ -78,6 +77,13 @@ class CellResult(msgspec.Struct, frozen=True):
     effort_nm: float | None = None
     force_peak_n: float | None = None
     walls_j: float | None = None
+    reasons: str = ""
+
+    @property
+    def stability(self) -> Stability:
+        """The judgement that the class stands for."""
+        known = {True: Stability.STABLE, False: Stability.NOT_STABLE, None: Stability.OPEN}
+        return known[self.verdict.stable]
 
 
 FLAT_LOG_CHANGE = 0.02
@@ -116,7 +122,7 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     ends_s = scenario.duration_s
     run.advance(ends_s)
     totals, extended = run.totals, 0
-    while not is_conclusive(outcome := _cell_result(run, totals, extended)) and ends_s < longest_s:
+    while not is_conclusive(outcome := _cell_result(run, scenario, totals, extended)) and ends_s < longest_s:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
         run.advance(ends_s)
@@ -129,15 +135,15 @@ def is_conclusive(outcome: CellResult) -> bool:
     """True where a longer run would hardly be called something else.
 
     That is: it left its limits; or it came to rest; or it grows, and the largest speed at least doubled over
-    the second half; or neither that nor the largest error changed by more than `FLAT_LOG_CHANGE`. Near the
-    edge of stability a finite run looks steady whatever it does later, and what decays may hide what grows
-    slowly until it is gone.
+    the second half; or neither that nor the largest error changed by more than `FLAT_LOG_CHANGE`; or it
+    drifts. Near the edge of stability a finite run looks steady whatever it does later, and what decays may
+    hide what grows slowly until it is gone.
     """
     if outcome.motion is EndBehaviour.BOUNDED:
         return max(map(abs, _changes(outcome))) <= FLAT_LOG_CHANGE
     if outcome.motion is EndBehaviour.GROWS:
         return _pronounced(outcome)
-    return outcome.motion in (EndBehaviour.DIVERGED, EndBehaviour.CONVERGED)
+    return outcome.motion in (EndBehaviour.DIVERGED, EndBehaviour.CONVERGED, EndBehaviour.DRIFTS)
 
 
 def _pronounced(outcome: CellResult) -> bool:
@@ -152,13 +158,13 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
     return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
 
 
-def _cell_result(run: FusedRun, totals: RunTotals, extended: int) -> CellResult:
-    maxima = run.maxima
-    end = classify_run_end(maxima, run.ran_s, run.diverged_s)
+def _cell_result(run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int) -> CellResult:
+    forced = [acts_on_arm(row) for row in run.records[:, RECORD_TAU_X : RECORD_TAU_X + JOINTS]]
+    end = classify_run_end(scenario, RunTrace(run.buckets, forced, run.diverged_s))
     rates = (end.error.rate_per_s, end.speed.rate_per_s)
     error_rate, speed_rate = (rate if math.isfinite(rate) else None for rate in rates)
     return CellResult(
-        verdict=CLASS_OF_MOTION[end.behaviour],
+        verdict=classify_end(end),
         motion=end.behaviour,
         ran_s=run.ran_s,
         extended=extended,
@@ -166,8 +172,9 @@ def _cell_result(run: FusedRun, totals: RunTotals, extended: int) -> CellResult:
         end_speed_rad_s=end.end_speed_rad_s,
         error_rate_per_s=error_rate,
         speed_rate_per_s=speed_rate,
-        peak_error_rad=max(float(values[:, 0].max()) for values in maxima),
+        peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,
         **totals._asdict(),
+        reasons="; ".join(end.reasons),
     )

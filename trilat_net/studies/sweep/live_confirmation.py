@@ -15,7 +15,7 @@ from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
 from ...scenario import Scenario, parse_scenario
-from .cell_result import CLASS_OF_MOTION, CellClass
+from .cell_result import CellClass, classify_end
 from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
@@ -114,7 +114,7 @@ def confirm_cell(row: ResultRow, run: SessionRunner, longest_s: float = MAX_SESS
         return ConfirmedCell(row, virtual, None, "; ".join([*session.problems, str(error)]), log)
     if session.problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
         return ConfirmedCell(row, virtual, None, "; ".join(session.problems), log)
-    return ConfirmedCell(row, virtual, CLASS_OF_MOTION[found.behaviour], found.text, log)
+    return ConfirmedCell(row, virtual, classify_end(found), found.text, log)
 
 
 GridIndex = tuple[Any, ...]

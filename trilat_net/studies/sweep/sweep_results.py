@@ -119,6 +119,7 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
         **dict.fromkeys(CellResult.__struct_fields__, float),
         "verdict": str,
         "motion": str,
+        "reasons": str,
         "extended": int,
         **dict.fromkeys(("scenario_sha256", "command", "scenario"), str),
     }

@@ -9,6 +9,7 @@ from operator import attrgetter
 
 import msgspec
 
+from ...analysis.run_end import EnvelopeTrend, Stability
 from ...scenario import Expect
 from .measure_run import RunMetrics
 
@@ -57,11 +58,12 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
     diverged = metrics.diverged_at_s is not None
     if expect.stable is None and not diverged:
         return
-    grows, rate = metrics.trend.grows, metrics.rate_per_s
-    text = metrics.trend.value + ("" if rate is None or grows is None else f", {rate:+.3g}/s")
-    if diverged:
-        grows, text = True, f"diverged at {metrics.diverged_at_s:.4g} s"
-    yield ExpectationResult("stable", grows is not wanted and grows is not None, text, str(wanted).lower())
+    found = f"diverged at {metrics.diverged_at_s:.4g} s" if diverged else metrics.behaviour.value
+    rate = metrics.rate_per_s if metrics.trend in (EnvelopeTrend.GROWS, EnvelopeTrend.DECAYS) else None
+    text = f"{metrics.stability}: {found}" + ("" if rate is None or diverged else f", |e| {rate:+.3g}/s")
+    asked = Stability.STABLE if wanted else Stability.NOT_STABLE
+    held = metrics.stability is asked
+    yield ExpectationResult("stable", held, "; ".join([text, *metrics.reasons]), str(wanted).lower())
 
 
 _UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}

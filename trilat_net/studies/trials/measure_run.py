@@ -2,7 +2,7 @@
 
 Invariant: every metric has one definition: both sources feed the same running statistics of their sites with
 the same records, in time order; a metric that a run cannot give is None, never a guess. Memory is bounded:
-kept are extrema, sums, the last second, and the largest |e| of every `BUCKET_NS`. How a run is cut into
+kept are extrema, sums, the last second, and the buckets on which the judgement rests. How a run is cut into
 batches changes only the last bits of a mean.
 """
 
@@ -14,14 +14,23 @@ import msgspec
 import numpy as np
 
 from ...analysis.arm_rows import compute_end_effector
-from ...analysis.run_end import EnvelopeFit, EnvelopeTrend, fit_envelope
+from ...analysis.run_end import (
+    EndBehaviour,
+    EnvelopeTrend,
+    RunEnd,
+    RunTrace,
+    Stability,
+    acts_on_arm,
+    classify_run_end,
+    reduce_to_buckets,
+)
 from ...analysis.torque_sources import wall_force
-from ...core.ticks import NS_PER_S
+from ...core.fused_run import PEAK_COLUMNS
+from ...core.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import find_late_samples
 from ...log.log_reader import Log
-from ...log.record_columns import Ints
 from ...scenario import Expect, Scenario, SiteSpec
 from ...scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
 from ...scenario.operators import Wall
@@ -98,10 +107,7 @@ class WindowStats:
         return {**spans, **{key: Range(value, value) for key, value in single.items()}}
 
 
-BUCKET_NS = 50_000_000
-"""The envelope of |e| is kept as one largest value per so many nanoseconds."""
-
-_NO_RECORD = -1.0
+_BUCKET_NS = NS_PER_S // BUCKETS_PER_S
 _END_NS = round(END_WINDOW_S * NS_PER_S)
 
 
@@ -131,7 +137,7 @@ class SiteStats:
         self._age_sum_ms = np.zeros(len(peer_rates))
         self._age_records = np.zeros(len(peer_rates), dtype=np.int64)
         self._squares = np.zeros(JOINTS)
-        self._peaks = np.zeros(0)
+        self._buckets = np.zeros((0, PEAK_COLUMNS))
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
@@ -149,7 +155,8 @@ class SiteStats:
         if len(apart):
             self.apart_ns = int(rows.t_ns[apart[-1]])
         self._add_ages(rows)
-        self._add_peaks(rows.t_ns // BUCKET_NS, largest)
+        bucket = rows.t_ns // _BUCKET_NS
+        self._buckets = reduce_to_buckets(bucket, rows.q - rows.q_des, rows.qd, rows.q, self._buckets)
         for stretch in filter(None, self.stretches):
             stretch.add(rows)
         self._tail.append(rows)
@@ -163,12 +170,6 @@ class SiteStats:
         self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
         self._age_sum_ms += age_ms.sum(axis=0)
         self._age_records += known.sum(axis=0)
-
-    def _add_peaks(self, buckets: Ints, largest: Array) -> None:
-        lacking = int(buckets[-1]) + 1 - len(self._peaks)
-        if lacking > 0:  # by half as much again: a long run is not copied for every block
-            self._peaks = np.append(self._peaks, np.full(lacking + len(self._peaks) // 2, _NO_RECORD))
-        np.maximum.at(self._peaks, buckets, largest)
 
     @property
     def last_ns(self) -> int:
@@ -192,9 +193,15 @@ class SiteStats:
         """Returns the records of the last second before `end_ns`, which is not before the last record."""
         return join_batches(self._tail).since(end_ns - _END_NS)
 
-    def peaks(self) -> Array:
-        """Returns the largest |e| of every bucket that ended, from the first on; -1 where it has none."""
-        return self._peaks[: self.last_ns // BUCKET_NS]
+    @property
+    def buckets(self) -> Array:
+        """What `RunTrace.buckets` asks of a site."""
+        return self._buckets[: self.last_ns // _BUCKET_NS + 1]
+
+    @property
+    def forced(self) -> bool:
+        """True if an operator or environment pushes at the last record."""
+        return bool(self._tail) and acts_on_arm(self._tail[-1].tau_x[-1])
 
 
 class LinkAge(msgspec.Struct, frozen=True):
@@ -207,13 +214,18 @@ class LinkAge(msgspec.Struct, frozen=True):
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     """One run, measured; the docstring of `Expect` defines every metric.
 
-    None stands for what the run cannot give: too short, or it did not come to it. `end_...` is of the last
-    second, `ages` has links "j->i", `late_samples` came too late for what their link meant to do with them,
-    `missing` counts ticks without a record, and a window has no quantities where the run ended before it did.
+    `stability`, `behaviour` and `reasons` are the judgement of `analysis.run_end`, `trend` and `rate_per_s`
+    those of |e| of its worst joint. None stands for what the run cannot give: too short, or it did not come
+    to it. `end_...` is of the last second, `ages` has links "j->i", `late_samples` came too late for what
+    their link meant to do with them, `missing` counts ticks without a record, and a window has no quantities
+    where the run ended before it did.
     """
 
     simulated_s: float
     diverged_at_s: float | None
+    stability: Stability
+    behaviour: EndBehaviour
+    reasons: tuple[str, ...]
     trend: EnvelopeTrend
     rate_per_s: float | None
     synchronised_at_s: float | None
@@ -242,7 +254,7 @@ def compute_run_metrics(
     ran = {name: tally for name, tally in tallies.items() if tally.records}
     whole = len(ran) == len(tallies)
     end_ns = max((tally.last_ns for tally in ran.values()), default=0)
-    trend = _envelope(ran)
+    end = _judge(scenario, tallies, diverged_at_s)
     span_s = [tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz for name, tally in ran.items()]
     apart_ns = [tally.apart_ns for tally in ran.values()]
     synchronised = whole and not any(tally.apart_ns == tally.last_ns for tally in ran.values())
@@ -254,8 +266,11 @@ def compute_run_metrics(
     return RunMetrics(
         simulated_s=max(span_s, default=0.0),  # to the end of the period that follows the last tick
         diverged_at_s=diverged_at_s,
-        trend=trend.trend,
-        rate_per_s=None if np.isnan(trend.rate_per_s) else trend.rate_per_s,
+        stability=end.stability,
+        behaviour=end.behaviour,
+        reasons=end.reasons,
+        trend=end.error.trend,
+        rate_per_s=None if np.isnan(end.error.rate_per_s) else end.error.rate_per_s,
         synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
         peak_error_rad=largest("peak_error_rad"),
         rms_error_rad=largest("rms_error_rad"),
@@ -298,14 +313,10 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
     }
 
 
-def _envelope(ran: Mapping[str, SiteStats]) -> EnvelopeFit:
-    """Returns the trend of the largest |e| of all sites; a site's last, unfinished bucket is left out."""
-    parts = [tally.peaks() for tally in ran.values()]
-    count = min(map(len, parts), default=0)
-    largest = np.max(np.reshape([part[:count] for part in parts], (len(parts), count)), axis=0, initial=-1.0)
-    kept = np.flatnonzero(largest >= 0.0)
-    t_s: Array = kept.astype(np.float64) * (BUCKET_NS / NS_PER_S)
-    return fit_envelope(t_s, largest[kept].astype(np.float64))
+def _judge(scenario: Scenario, tallies: Mapping[str, SiteStats], diverged_at_s: float | None) -> RunEnd:
+    forced = [tally.forced for tally in tallies.values()]
+    buckets = [tally.buckets for tally in tallies.values()]
+    return classify_run_end(scenario, RunTrace(buckets, forced, diverged_at_s))
 
 
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:

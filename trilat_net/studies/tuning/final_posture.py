@@ -12,7 +12,6 @@ at the end and did not at the start; arms fell if their mean ends more than 0.2 
 without a push that could explain it.
 """
 
-import math
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ import msgspec
 import numpy as np
 
 from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
-from ...analysis.run_end import EnvelopeTrend
+from ...analysis.run_end import EnvelopeTrend, points_down
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...errors import ScenarioError
@@ -199,8 +198,6 @@ def classify_candidate(
 
 _SHORT_S = 0.5
 _LOOKS = 2000
-HANGING_RAD = 0.3
-"""A link within this of straight down hangs."""
 
 
 def check_final_posture(log: Log) -> list[str]:
@@ -219,7 +216,7 @@ def check_final_posture(log: Log) -> list[str]:
     wanted_s = log.scenario.duration_s
     if last_s <= wanted_s - _SHORT_S:
         warnings.append(f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run")
-    hanging = [site for site, q in ends.items() if _points_down(q) and not _points_down(log[site].q[0])]
+    hanging = [site for site, q in ends.items() if points_down(q) and not points_down(log[site].q[0])]
     if not hanging:
         return [*warnings, *_warn_fallen(log, ends)]
     verb = "hangs" if len(hanging) == 1 else "hang"
@@ -245,7 +242,3 @@ def _warn_fallen(log: Log, ends: dict[str, Array]) -> list[str]:
         f"the arms end {abs(away[joint]):.2g} rad (joint {joint + 1}) from where a weightless consensus "
         "would stand: they sank, or drifted"
     ]
-
-
-def _points_down(q: Array) -> bool:
-    return all(abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q))

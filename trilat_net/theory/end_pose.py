@@ -1,0 +1,73 @@
+"""The loop linearised where a recorded run ended, beside the certificate of its log.
+
+Invariant: the roots are those at the log's own end pose and estimates, under the conditions at its end; they
+speak of small motions there. Nothing is executed.
+"""
+
+import msgspec
+import numpy as np
+
+from ..analysis.certificate.stability_certificate import Certificate, EndPoseRoots, certify
+from ..analysis.run_end import SETTLED_SPEED_RAD_S
+from ..analysis.timeline import recorded_end_s
+from ..core.vectors import Array
+from ..errors import ScenarioError
+from ..log.log_reader import Log
+from ..log.site_log import SiteLog
+from .characteristic_roots import compute_delay_spectrum
+from .equilibrium import follow_equilibrium
+from .linear_loop import linearise_loop
+from .operating_point import Equilibrium, derive_operating_conditions
+from .tick_map import compute_sampled_spectrum
+
+_ROOTS = 2
+"""Roots that are looked for: the rightmost ones."""
+
+
+def certify_with_roots(log: Log) -> Certificate:
+    """Returns the certificate of a log, with the roots of the loop where the run ended.
+
+    Raises:
+        LogError: a record cannot be read, or names a change that is none.
+    """
+    return certify(log)._replace(roots=find_end_pose_roots(log))
+
+
+def find_end_pose_roots(log: Log) -> EndPoseRoots:
+    """Returns the roots of the loop where a run ended, or why there are none."""
+    parts = [log[site] for site in log.sites]
+    if not all(map(len, parts)):
+        return _no_roots("a site has no records")
+    if any(part.mode[-1] == "diverged" for part in parts):
+        return _no_roots("the run diverged")
+    if any(log.changes(site) for site in log.sites):
+        return _no_roots("commands changed the loop while it ran")
+    scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
+    q = np.array([_end_of(part, part.q) for part in parts])
+    theta_hat = np.array([_end_of(part, part.theta_hat) for part in parts])
+    try:
+        conditions = derive_operating_conditions(scenario)
+        rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
+    except ScenarioError as error:
+        return _no_roots(error.problem)
+    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
+    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
+    decisive = compute_sampled_spectrum(conditions, rest, near, _ROOTS) or continuous
+    root, verdict = decisive.rightmost, decisive.verdict
+    if root is None:
+        return EndPoseRoots(verdict, None, not conditions.varying, f"this rest: {verdict}, without roots")
+    omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
+    mean = ", of the mean ages" if conditions.varying else ""
+    text = f"this rest: {verdict}, {root.s.real:+.3g} /s{omega}{mean}"
+    return EndPoseRoots(verdict, root.s.real, not conditions.varying, text)
+
+
+def _no_roots(why: str) -> EndPoseRoots:
+    return EndPoseRoots("", None, False, f"this rest: no roots: {why}")
+
+
+def _end_of(part: SiteLog, values: Array) -> Array:
+    """Returns a signal at the last record of an arm at rest, else its mean over the last quarter."""
+    t_s, last = part.t_s, np.asarray(values[-1])
+    at_rest = float(np.abs(part.qd[t_s > t_s[-1] - 1.0]).max()) <= SETTLED_SPEED_RAD_S
+    return last if at_rest else np.asarray(values[t_s >= 0.75 * t_s[-1]].mean(axis=0))
