@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -72,6 +74,41 @@ def test_another_seed_draws_again_wherever_the_scenario_came_from() -> None:
     assert spring.from_rad == spring.to_rad == found.sites["m1"].q0_rad
     a, b = found.sites["m1"].q0_rad
     assert tip.from_m == pytest.approx((np.cos(a) + np.cos(a + b), np.sin(a) + np.sin(a + b)))
+
+
+PLACES = (
+    "arm.l1_m",
+    "control.Lambda",
+    "limits.tau_limit_nm",
+    "sites.m2.q0_rad",
+    "sites.s.control.Gamma",
+    "sites.s.qd0_rad_s",
+    "sites.m1.hands.0.stiffness_nm_rad",
+    "sites.m1.hands.1.to_m",
+    "sites.m1.hands.2.peak_nm",
+)
+ends = st.tuples(st.floats(0.5, 2.0), st.floats(2.0, 9.0)).map(list)
+
+
+@given(
+    drawn_there=st.dictionaries(st.sampled_from(PLACES), ends),
+    seeds=st.tuples(*[st.integers(0, 2**63 - 1)] * 2),
+)
+def test_there_and_back_is_the_same_experiment(
+    drawn_there: dict[str, list[float]], seeds: tuple[int, int]
+) -> None:
+    """Whatever is drawn: the text loads to itself, and the first seed again gives the first experiment."""
+    ranges = {key: {"uniform": two} for key, two in drawn_there.items() if key != "sites.m1.hands.1.to_m"}
+    if "sites.m1.hands.1.to_m" in drawn_there:
+        ranges["sites.m1.hands.1.to_m"] = [{"uniform": drawn_there["sites.m1.hands.1.to_m"]}, 0.5]
+    first = load_scenario("free", {**EXAMPLE, **ranges, "seed": seeds[0]})
+    assert parse_scenario(first.text).text == first.text
+    other = reseed_scenario(first, seeds[1])
+    assert parse_scenario(other.text).text == other.text
+    assert reseed_scenario(other, seeds[0]) == first
+    for key, one in other.drawn.items():
+        if one.uniform:
+            assert one.uniform[0] - 1e-8 <= one.value <= one.uniform[1] + 1e-8, key
 
 
 def test_a_number_that_was_replaced_stays() -> None:

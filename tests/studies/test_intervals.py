@@ -1,6 +1,7 @@
 """Means over seeds: what is drawn spreads them, and their intervals hold the truth as often as they say."""
 
 import json
+import shlex
 from pathlib import Path
 
 import msgspec
@@ -70,6 +71,14 @@ def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
     assert str(row.mean) in report.text()
     again = load_scenario(file, [f"seed={SEEDS[-1]}"])
     assert report.results[-1].trial.scenario == again
+
+
+def test_a_trial_of_a_distribution_names_the_command_that_repeats_it(file: Path) -> None:
+    trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
+    words = shlex.split(trial.look)
+    settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]
+    assert load_scenario(words[2], [*settings, f"seed={words[words.index('--seed') + 1]}"]) == trial.scenario
+    assert len(set(trial.scenario.sites["m"].control.d)) == 2
 
 
 def test_a_swept_cell_has_the_means_of_its_seeds(file: Path) -> None:
