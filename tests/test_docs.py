@@ -125,7 +125,9 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
     functions = {name for path in files.values() for name in names_of(path)}
     for named in re.findall(r"`(tests/[\w/.]+)`", text):
         assert (ROOT / named).exists(), named
-    for name, rest in re.findall(r"`(?:tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text):
+    names = re.findall(r"`(?:tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text)
+    assert len(names) > 25 or page.name != "errata.md"
+    for name, rest in names:
         known = name in files or any(one.startswith(name) if rest else one == name for one in functions)
         assert known, name
 

@@ -1,8 +1,6 @@
 """The corrections of docs/errata.md, 5 and 8: the derivative of V by the chain rule, in symbols."""
 
-import re
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,18 +21,6 @@ from tests.theory.symbols import (
     pair,
     zero,
 )
-
-
-def test_every_test_that_the_errata_name_is_there() -> None:
-    here = Path(__file__).parent
-    named = re.findall(
-        r"`(test_\w+?)(?:_\.\.\.)?`", (here / "../../docs/errata.md").read_text(encoding="utf-8")
-    )
-    files = [here / f"test_errata{part}.py" for part in ("", "_arm", "_weights")]
-    written = "".join(file.read_text(encoding="utf-8") for file in files)
-    assert len(named) > 15
-    assert [name for name in named if f"def {name}" not in written] == []
-
 
 # --- 5: the derivative of V_i ---------------------------------------------------------------------------
 
