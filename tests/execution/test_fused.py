@@ -21,6 +21,7 @@ from trilat_net.scenario import Scenario, list_shipped, load_scenario
 Array = NDArray[np.float64]
 TOTALS = ("rms_error_rad", "force_peak_n", "walls_j")
 VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 2.0}
+HELD = {**VISCOUS, "sampled": True}
 
 LINKS: tuple[dict[str, Any], ...] = (
     {"link.delay_ms": 0.0},
@@ -121,7 +122,7 @@ def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
     [
         ("contact", {"duration_s": 6.0, "rate_hz": 500}),
         ("contact", {"duration_s": 6.0, "rate_hz": 500, "sites.s.environment.0.sampled": True}),
-        ("windup", {"duration_s": 6.0, "sites.m1.rate_hz": 250, "sites.m2.environment": [VISCOUS]}),
+        ("windup", {"duration_s": 6.0, "sites.m1.rate_hz": 250, "sites.m1.environment": [VISCOUS, HELD]}),
         ("free", {"duration_s": 3.0, "limits.qd_limit_rad_s": 1.5}),
     ],
 )

@@ -254,26 +254,6 @@ def torque_on_arm(
 
 
 @leaf
-def environment_torque(
-    t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows, table: TorqueTable
-) -> tuple[Pair, Pair]:
-    """Returns the torque of environments on the arm: what follows the present, and what is sampled."""
-    now_0 = now_1 = held_0 = held_1 = 0.0
-    for n in range(actors.shape[0]):
-        actor: Row = actors[n]
-        if actor.acts != _VISCOUS and actor.acts != _WALL:
-            continue
-        torque = source_torque(t_s, q, qd, lengths, actor, table)
-        if actor.sampled == 1:
-            held_0 += torque[0]
-            held_1 += torque[1]
-        else:
-            now_0 += torque[0]
-            now_1 += torque[1]
-    return (now_0, now_1), (held_0, held_1)
-
-
-@leaf
 def largest_wall_force(t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows) -> float:
     """Returns the largest force of a wall on the end effector, N."""
     largest_n = 0.0

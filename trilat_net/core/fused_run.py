@@ -6,7 +6,7 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 
 import numpy as np
 
-from .exogenous import TorqueSourceRows, TorqueTable, environment_torque, largest_wall_force
+from .exogenous import TorqueSourceRows, TorqueTable, largest_wall_force, torque_on_arm
 from .jit import leaf
 from .kernel import act_stages, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
@@ -31,15 +31,15 @@ SUMS_DTYPE = np.dtype(
     (
         np.record,
         [
-            ("environment", "i8"),
+            ("first_environment", "i8"),
             *((name, "f8") for name in ("effort", "force_peak_n", "environment_j")),
             *((name, "f8", _PAIR) for name in ("errors", "q", "now", "held")),
         ],
     )
 )
 """A site's sums over its records: of |tau - G|^2 and of e^2; the largest force of a wall; the work of its
-environments (0: it has none, 1: beside operators, 2: alone). And of the record before: q, the present and
-the held torque of the environments."""
+environments, from which of its actors on (-1: it has none). And of the record before: q, the present and the
+held torque of the environments."""
 PEAK_COLUMNS = 3 * JOINTS
 """Of a bucket: per joint the largest |e|, then per joint the largest |qd|, then the last q of each."""
 
@@ -102,13 +102,15 @@ def _update_sums(
     off_0 = row[RECORD_TAU] - (s.Y[0, 3] * s.theta[3] + outer)
     off_1 = row[RECORD_TAU + 1] - outer
     sums.effort += off_0 * off_0 + off_1 * off_1
-    if sums.environment == 0:
+    first = sums.first_environment
+    if first < 0:
         return
     t_s, q, qd, lengths = t_ns * 1e-9, (row[0], row[1]), (row[2], row[3]), pair(s.lengths)
     held = pair(s.held)
     now = (s.on_arm[0] - held[0], s.on_arm[1] - held[1])
-    if sums.environment == 1:  # beside operators
-        now, held = environment_torque(t_s, q, qd, lengths, actors, table)
+    if first > 0:  # beside operators, whose rows come first
+        now = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 0)
+        held = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 1)
     if now[0] != 0.0 or now[1] != 0.0 or held[0] != 0.0 or held[1] != 0.0:
         sums.force_peak_n = max(sums.force_peak_n, largest_wall_force(t_s, q, qd, lengths, actors))
     if k > 0:

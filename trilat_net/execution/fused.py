@@ -101,8 +101,8 @@ class FusedRun:
         self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
         self._peaks = np.full((count, 0, PEAK_COLUMNS), -1.0)
         self._sums: RowArray = np.zeros(count, SUMS_DTYPE)
-        self._sums["environment"] = [
-            (1 if spec.hands else 2) if spec.environment else 0 for spec in scenario.sites.values()
+        self._sums["first_environment"] = [
+            len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self.ran_s = 0.0
 
@@ -166,7 +166,9 @@ class FusedRun:
             rms_error_rad=float(np.sqrt(self._sums["errors"] / ticks[:, None]).max()),
             effort_nm=float(np.sqrt(np.mean(self._sums["effort"] / (JOINTS * ticks)))),
             force_peak_n=float(self._sums["force_peak_n"].max()) if touched else None,
-            walls_j=float(self._sums["environment_j"].sum()) if self._sums["environment"].any() else None,
+            walls_j=float(self._sums["environment_j"].sum())
+            if (self._sums["first_environment"] >= 0).any()
+            else None,
         )
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from trilat_net.analysis.metrics.impedance import estimate_response
+from trilat_net.analysis.metrics.impedance import FrequencyResponse, estimate_responses
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 
 from .written import simulated
@@ -21,11 +21,17 @@ def noise(seed: int) -> np.ndarray:
     return signal.lfilter(b, a, white)
 
 
+def strongest(
+    drive: np.ndarray, x: np.ndarray, y: np.ndarray, usable: np.ndarray, rate_hz: int, least: float
+) -> FrequencyResponse:
+    return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
+
+
 def test_a_filter_is_found_again() -> None:
     """Gain and phase of a known system, by SciPy's freqz."""
     b, a = signal.butter(1, 3.0, fs=RATE_HZ)
     x = noise(1)
-    found = estimate_response(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
+    found = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
     _, H = signal.freqz(b, a, worN=[found.frequency_hz], fs=RATE_HZ)
     assert found.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * found.error))
     assert found.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
@@ -34,7 +40,7 @@ def test_a_filter_is_found_again() -> None:
 
 def test_what_does_not_belong_together_is_undecided() -> None:
     x = noise(1)
-    found = estimate_response(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
+    found = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
     assert found.gain is None
     assert "the coherence" in found.why
 
@@ -42,17 +48,17 @@ def test_what_does_not_belong_together_is_undecided() -> None:
 def test_one_push_is_not_enough() -> None:
     """A single event is coherent with anything."""
     x = np.where(np.abs(np.arange(len(EVERYTHING)) - 2000) < 100, 1.0, 0.0)
-    found = estimate_response(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
+    found = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
     assert found.gain is None
     assert "stretches of 4 s" in found.why
 
 
 def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     x = noise(1)
-    assert estimate_response(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why == "nothing drives it"
+    assert strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why == "nothing drives it"
     gaps = EVERYTHING.copy()
     gaps[::700] = False
-    assert "no 4 s are recorded" in estimate_response(x, x, x, gaps, RATE_HZ, 1e-3).why
+    assert "no 4 s are recorded" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
 def test_in_a_closed_loop_the_one_who_drives_tells_whose_impedance_it_is() -> None:
@@ -72,12 +78,12 @@ def test_in_a_closed_loop_the_one_who_drives_tells_whose_impedance_it_is() -> No
             q += h * speed[n]
 
     shake(2.0 * noise(4))
-    plain = estimate_response(speed, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    plain = strongest(speed, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert plain.gain is None or abs(plain.gain - b) > 0.2 * b
-    driven = estimate_response(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    driven = strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert driven.gain is None  # half of what moves is not the hand's
     shake(0.0 * x)
-    alone = estimate_response(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    alone = strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert alone.gain == pytest.approx(b, rel=1e-6)
 
 

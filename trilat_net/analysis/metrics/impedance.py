@@ -64,13 +64,6 @@ class FrequencyResponse(NamedTuple):
     why: str = ""
 
 
-def estimate_response(
-    drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
-) -> FrequencyResponse:
-    """Returns the ratio of two signals at the line with the strongest drive, see `estimate_responses`."""
-    return estimate_responses(drive, put_in, came_out, usable, rate_hz, least)[0]
-
-
 def estimate_responses(
     drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
 ) -> list[FrequencyResponse]:
