@@ -19,7 +19,7 @@ RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 ROWS = re.findall(
     r"^\| \*\*(\w+)\*\*[^|]*\| (.+) \|$", (ROOT / "docs" / "log-tools.md").read_text(), re.MULTILINE
 )
-COMMANDS = ("log check", "verify", "report", "log recover")
+COMMANDS = ("log check", "verify", "certify", "report", "log recover")
 
 
 def whole() -> bytes:

@@ -23,7 +23,10 @@ _MARKS = {
 
 
 def certify_command(
-    files: options.LogsArgument, accept: options.AcceptOption = None, as_json: options.JsonOption = False
+    files: options.LogsArgument,
+    accept: options.AcceptOption = None,
+    min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
 
@@ -35,7 +38,7 @@ def certify_command(
     from ..analysis.certificate.stability_certificate import certificate_to_json
     from ..theory.end_pose import certify_with_roots
 
-    found = certify_with_roots(terminal.open_with_progress(*files))
+    found = certify_with_roots(terminal.open_with_progress(*files), min_coverage=min_coverage)
     if as_json:
         terminal.print_json(certificate_to_json(found))
     else:

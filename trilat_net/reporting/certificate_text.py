@@ -53,6 +53,10 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     if found.roots is not None:
         decides = found.roots.exact and found.roots.verdict
         lines.append((_ROOTS.get(decides or "", "note"), found.roots.text))
+    if found.evidence is not None:
+        intact = "ok" if found.evidence.integrity.passed else "FAIL"
+        mark = "open" if intact == "ok" and found.evidence.reasons else intact
+        lines.append((mark, f"log: {found.evidence.text}"))
     if found.ones is not None and found.ones_rise is not None:
         risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
         lines.append(("note", f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"))

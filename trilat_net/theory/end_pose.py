@@ -12,6 +12,7 @@ from ..analysis.run_end import SETTLED_SPEED_RAD_S
 from ..analysis.timeline import recorded_end_s
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from .characteristic_roots import compute_delay_spectrum
@@ -24,13 +25,15 @@ _ROOTS = 2
 """Roots that are looked for: the rightmost ones."""
 
 
-def certify_with_roots(log: Log) -> Certificate:
+def certify_with_roots(log: Log, *, min_coverage: float = MIN_COVERAGE) -> Certificate:
     """Returns the certificate of a log, with the roots of the loop where the run ended.
+
+    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end is open.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    return certify(log)._replace(roots=find_end_pose_roots(log))
+    return certify(log, min_coverage=min_coverage)._replace(roots=find_end_pose_roots(log))
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:

@@ -351,6 +351,18 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     return _trapezoid(site, power[:-1], power[1:])
 
 
+def measure_torque_error(site: SiteMotion) -> Array:
+    """Returns by how much recorded torques differ from Eq. (13) within its limit, shape (K,), N m.
+
+    The larger of both joints; 0 where there is no record.
+    """
+    at, c = site.records, site.constants
+    every = np.arange(len(at.known))
+    law = _control_torque(c, site.regressor(every), at.theta_hat, site.r, at.qd - at.qd_des)
+    error: Array = np.abs(at.tau - np.clip(law, -c.tau_limit, c.tau_limit)).max(axis=1)
+    return np.where(at.known, error, 0.0)
+
+
 def estimate_work(site: SiteMotion) -> Increment:
     """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed and wrong.
 

@@ -13,10 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.vectors import Array
+from ...log.integrity import MIN_COVERAGE
 from ...log.log_reader import Log
 from ..health import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
+from . import energy_terms
 from .energy_balance import (
     EXTERNAL_SOURCES,
     ZERO_ENERGY_J,
@@ -26,6 +28,7 @@ from .energy_balance import (
     compute_site_energies,
     find_dominance_matrices,
 )
+from .evidence import Evidence, collect_evidence
 from .premises import (
     Premise,
     check_run_premises,
@@ -42,6 +45,8 @@ CLEAR_BREAK_SHARE = 1e-3
 """With more than this, and no uncertainty of that size, the period is not the cause."""
 SAMPLING_RISE_SHARE = 1e-4
 """Rises up to this share of the scale are attributed to sampling if the residual is as large."""
+TORQUE_TOLERANCE = 1e-6
+"""A recorded torque that differs from Eq. (13) by more, relative to 1 + |tau|, was not made by it."""
 COARSE_TOLERANCE_SHARE = 1e-2
 """A tolerance above this share of the scale decides nothing about a rise."""
 
@@ -118,6 +123,7 @@ class Certificate(NamedTuple):
         ones: the same with the paper's weights; None if those are right, or without a balance.
         groups: closed groups of sites, if there are several: then beta is not unique.
         roots: of the loop where the run ended; None if nobody looked.
+        evidence: how much of the run the log has, and that nothing was changed; None if nobody looked.
     """
 
     premises: list[Premise]
@@ -128,6 +134,7 @@ class Certificate(NamedTuple):
     ones: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
     roots: EndPoseRoots | None = None
+    evidence: Evidence | None = None
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
@@ -150,14 +157,15 @@ class Certificate(NamedTuple):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What leaves the run open or false, in words: of its end, of V, of the roots at its end pose."""
+        """What leaves the run open or false, in words: of the log, its end, V, the roots at its end pose."""
         broken = self.verdict.finding is StabilityFinding.BROKEN
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
         if self.roots is not None and self.roots.exact and self.roots.verdict == "unstable":
             found.append(self.roots.text)
-        return (*self.end.reasons, *found)
+        absent = self.evidence.reasons if self.evidence is not None else ()
+        return (*self.end.reasons, *found, *absent)
 
     @property
     def stability(self) -> Stability:
@@ -171,20 +179,32 @@ class Certificate(NamedTuple):
         return self.accepts(())
 
     def accepts(self, accepted: Collection[str]) -> bool:
-        """True if the run is stable, or bounded or open where that is accepted; a broken balance never is."""
-        if self.verdict.finding is StabilityFinding.BROKEN:
+        """True if the run is stable, or bounded or open where that is accepted.
+
+        Never with a broken balance or a changed log.
+        """
+        changed = self.evidence is not None and not self.evidence.integrity.passed
+        if self.verdict.finding is StabilityFinding.BROKEN or changed:
             return False
         bounded = "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED
         opened = "open" in accepted and self.stability is Stability.OPEN
         return bounded or opened or self.stability is Stability.STABLE
 
 
-def certify(log: Log) -> Certificate:
+def certify(log: Log, *, min_coverage: float = MIN_COVERAGE) -> Certificate:
     """Returns the certificate of a log; torn, short and empty ones too.
+
+    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end is open.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
+    found = _certify_records(log)
+    return found._replace(evidence=collect_evidence(log, found.balance, min_coverage))
+
+
+def _certify_records(log: Log) -> Certificate:
+    """Returns the certificate of the records that are there."""
     premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
     premises += check_sampled_walls(log)
 
@@ -266,7 +286,7 @@ def _judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -
     ours = [site for site in wrong if not outside & {site, *energies[site].followed}]
     site = max(ours or wrong, key=worst.__getitem__, default=None)
     if site is None:
-        return None
+        return _find_false_torque(energies)
     energy = energies[site]
     above = np.abs(energy.unexplained) > allow(site)
     at_s = energy.motion.records.t_s[int(np.argmax(above))]
@@ -280,6 +300,19 @@ def _judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -
     certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * balance.scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
     return StabilityVerdict(StabilityFinding.BROKEN, f"{StabilityFinding.BROKEN}: {text}: {why}")
+
+
+def _find_false_torque(energies: Mapping[str, SiteEnergy]) -> StabilityVerdict | None:
+    """Returns the verdict if recorded torques are not those of Eq. (13); None if all are."""
+    for site, energy in energies.items():
+        error, records = energy_terms.measure_torque_error(energy.motion), energy.motion.records
+        wrong = error > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            off = f"{error.max():.3g} N m, from {records.t_s[first]:.4g} s on"
+            text = f"the torque of {site} is not that of Eq. (13), by up to {off}: {FALSE_RECORDS_TEXT}"
+            return StabilityVerdict(StabilityFinding.BROKEN, f"{StabilityFinding.BROKEN}: {text}")
+    return None
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
@@ -359,6 +392,7 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
             "end_error_rad": end.end_error_rad,
             "end_speed_rad_s": end.end_speed_rad_s,
         },
+        "evidence": None if certificate.evidence is None else certificate.evidence.to_json(),
         "roots": None if certificate.roots is None else certificate.roots._asdict(),
         "functional": None if balance is None else _functional_to_json(certificate, balance),
     }
