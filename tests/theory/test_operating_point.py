@@ -30,6 +30,16 @@ def test_hands_that_have_let_go_are_not_there_and_those_that_hold_are() -> None:
     assert any("still moves at the end" in note for note in moving.notes)
 
 
+def test_two_recorded_torques_stay_as_they_are_and_one_that_swings_is_left_out() -> None:
+    recorded = [{"kind": "recorded", "points": [[0.0, push, 0.0], [60.0, push, 0.0]]} for push in (1.0, 2.0)]
+    swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
+    scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})
+    found = derive_operating_conditions(scenario)
+    assert [actor.a for actor in found.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
+    assert any("still swings at the end" in note for note in found.notes)
+    assert len(prolong_scenario(scenario, 100.0).sites["m1"].hands) == 2
+
+
 def test_what_varies_is_said_with_its_mean() -> None:
     found = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
     assert found.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
