@@ -1,4 +1,4 @@
-"""A sampled wall: the map from tick to tick in contact, and the bound of passivity."""
+"""A sampled wall: the map from tick to tick in contact, the bound of passivity, and what runs do."""
 
 from functools import cache
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
 from trilat_net.theory import find_linear_edge
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.linear_edge import LinearEdge
@@ -53,3 +54,22 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
     bound = 2.0 * 1000.0 * (own - B)
     found = edge(B, b)
     assert found is None or found.value > bound > 0.0
+
+
+def say(K: float) -> CellClass:
+    return classify_cell(windup(K).text, 480.0).verdict
+
+
+def test_runs_have_the_edge_of_the_map() -> None:
+    """Stable 5 % below it, and never stable above."""
+    found = edge()
+    assert found is not None
+    assert say(0.95 * found.value) is CellClass.CONVERGED
+    assert say(1.05 * found.value) is not CellClass.CONVERGED
+
+
+@pytest.mark.long
+def test_the_sweep_over_stiffness_is_monotone() -> None:
+    stable = [say(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)]
+    assert stable == sorted(stable, reverse=True)
+    assert 15 <= sum(stable) <= 16

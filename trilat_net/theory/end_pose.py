@@ -4,6 +4,8 @@ Invariant: the roots are those at the log's own end pose and estimates, under th
 speak of small motions there. Nothing is executed.
 """
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 
@@ -15,8 +17,10 @@ from ..errors import ScenarioError
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
+from ..scenario import Scenario
 from .characteristic_roots import compute_delay_spectrum
 from .equilibrium import follow_equilibrium
+from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, derive_operating_conditions
 from .tick_map import compute_sampled_spectrum
@@ -46,8 +50,7 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
     if any(log.changes(site) for site in log.sites):
         return _no_roots("commands changed the loop while it ran")
     scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    q = np.array([_end_of(part, part.q) for part in parts])
-    theta_hat = np.array([_end_of(part, part.theta_hat) for part in parts])
+    q, theta_hat = _choose_state(scenario, parts)
     try:
         conditions = derive_operating_conditions(scenario)
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
@@ -69,8 +72,28 @@ def _no_roots(why: str) -> EndPoseRoots:
     return EndPoseRoots("", None, False, f"this rest: no roots: {why}")
 
 
+def _choose_state(scenario: Scenario, parts: Sequence[SiteLog]) -> tuple[Array, Array]:
+    """Returns angles and estimates of all sites: at the end of those at rest, else the last quarter's mean.
+
+    Of arms that chatter at a sampled wall, it is the state of the last quarter that is deepest in it.
+    """
+    count = min(map(len, parts))
+    rows = slice(3 * count // 4, count)
+    together = all(np.array_equal(part.t_s[rows], parts[0].t_s[rows]) for part in parts)
+    if together and not all(map(_rests, parts)):
+        q = np.stack([part.q[rows] for part in parts], axis=1)
+        deepest = find_deepest_contact(scenario, q)
+        if deepest is not None:
+            return q[deepest], np.array([part.theta_hat[rows][deepest] for part in parts])
+    ends = [(_end_of(part, part.q), _end_of(part, part.theta_hat)) for part in parts]
+    return np.array([q for q, _ in ends]), np.array([theta_hat for _, theta_hat in ends])
+
+
+def _rests(part: SiteLog) -> bool:
+    t_s = part.t_s
+    return float(np.abs(part.qd[t_s > t_s[-1] - 1.0]).max()) <= SETTLED_SPEED_RAD_S
+
+
 def _end_of(part: SiteLog, values: Array) -> Array:
     """Returns a signal at the last record of an arm at rest, else its mean over the last quarter."""
-    t_s, last = part.t_s, np.asarray(values[-1])
-    at_rest = float(np.abs(part.qd[t_s > t_s[-1] - 1.0]).max()) <= SETTLED_SPEED_RAD_S
-    return last if at_rest else np.asarray(values[t_s >= 0.75 * t_s[-1]].mean(axis=0))
+    return np.asarray(values[-1] if _rests(part) else values[part.t_s >= 0.75 * part.t_s[-1]].mean(axis=0))

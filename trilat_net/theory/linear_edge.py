@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core.exogenous import TorqueKind
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
@@ -18,6 +19,7 @@ from .equilibrium import choose_equilibrium, find_equilibrium, follow_equilibriu
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import has_estimate
+from .textbook_arm import end_effector_position
 from .tick_map import compute_sampled_spectrum
 
 EDGE_SCAN_POINTS = 24
@@ -51,6 +53,37 @@ def find_rightmost_root(
         return continuous.rightmost
     near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
     return (compute_sampled_spectrum(conditions, rest, near, 1) or continuous).rightmost
+
+
+def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
+    """Returns which of some states, shape (K, N, 2), rad, is deepest in a sampled wall; None if none is."""
+    depth_m = np.full(len(q), -np.inf)
+    for n, name in enumerate(scenario.names):
+        site = scenario.setup(name)
+        for wall in site.actors:
+            if wall.acts is TorqueKind.WALL and wall.sampled:
+                at = end_effector_position(site.lengths_m, q[:, n].T)
+                depth_m = np.maximum(depth_m, (np.array(wall.a) - at.T) @ np.array(wall.b))
+    deepest = int(depth_m.argmax())
+    return deepest if depth_m[deepest] > 0.0 else None
+
+
+def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
+    """Returns how fast small motions grow in contact with sampled walls, 1/s; NaN if none is pressed.
+
+    That is the real part of the sampled loop's rightmost root at the rest next to the state, of those given,
+    that is deepest in a wall: angles, shape (K, N, 2), rad, and estimates, shape (K, N, 5). Chatter leaves
+    the wall in between, and its mean may be no contact.
+    """
+    deepest = find_deepest_contact(scenario, q)
+    if deepest is None:
+        return np.nan
+    try:
+        rest = follow_equilibrium(scenario, Equilibrium(q[deepest], theta_hat[deepest], "", 0.0))
+        root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
+    except ScenarioError:
+        return np.nan
+    return -np.inf if root is None else root.s.real
 
 
 class LinearEdge(NamedTuple):

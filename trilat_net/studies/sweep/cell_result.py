@@ -10,6 +10,7 @@ import math
 from enum import StrEnum
 
 import msgspec
+import numpy as np
 
 from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, acts_on_arm, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
@@ -18,6 +19,8 @@ from ...core.two_link_arm import JOINTS
 from ...errors import ScenarioError
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
+from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
+from ...theory.linear_edge import find_contact_growth
 
 
 class CellClass(StrEnum):
@@ -86,6 +89,8 @@ class CellResult(msgspec.Struct, frozen=True):
         return known[self.verdict.stable]
 
 
+_CONTACT_STATES = 100
+"""States of the last quarter of which the deepest in a sampled wall is linearised."""
 FLAT_LOG_CHANGE = 0.02
 """An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
 
@@ -111,7 +116,9 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
     A run that is not conclusive when its time is over (see `is_conclusive`) goes on for as long again, and
     so on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for
-    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance.
+    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance. If small
+    motions grow in contact with a sampled wall it is not extended: such chatter may die in minutes, when the
+    estimates have drifted, and that makes no cell stable.
 
     Args:
         text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
@@ -120,8 +127,14 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     scenario = parse_scenario(text)
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     ends_s = scenario.duration_s
-    run.advance(ends_s)
+    growth_per_s = _advance_in_contact(scenario, run)
     totals, extended = run.totals, 0
+    if growth_per_s > STABILITY_EDGE_PER_S:
+        outcome = _cell_result(run, scenario, totals, extended)
+        left = outcome.verdict is CellClass.DIVERGED
+        verdict = CellClass.DIVERGED if left else CellClass.BOUNDED
+        reason = f"in contact with a sampled wall small motions grow by {growth_per_s:+.3g} /s"
+        return msgspec.structs.replace(outcome, verdict=verdict, reasons=reason)
     while not is_conclusive(outcome := _cell_result(run, scenario, totals, extended)) and ends_s < longest_s:
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
@@ -129,6 +142,22 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
     wanders = scenario.links_random and trend and not _pronounced(outcome)
     return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED) if wanders else outcome
+
+
+def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
+    """Makes a run of a scenario's own time; returns how fast small motions grow at a sampled wall, 1/s.
+
+    NaN without one that is touched in the last quarter, see `find_contact_growth`.
+    """
+    states = []
+    if any(one.actor.sampled for spec in scenario.sites.values() for one in spec.environment):
+        for t_s in np.linspace(0.75, 1.0, _CONTACT_STATES) * scenario.duration_s:
+            run.advance(float(t_s))
+            states.append((run.q, run.theta_hat))
+    run.advance(scenario.duration_s)
+    if not states or run.diverged_s is not None:
+        return math.nan
+    return find_contact_growth(scenario, *map(np.array, zip(*states, strict=True)))
 
 
 def is_conclusive(outcome: CellResult) -> bool:

@@ -1,0 +1,96 @@
+"""Runs that try to fool the judgement: those made by hand, and any number that are drawn."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import trilat_net
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import Scenario
+
+from .adversaries import ROWS, Drawn, Row, find_truth, judge_experiment, tally, under_noise
+
+SLOW = ("F2", "F2=", "F4", "F4=", "F8", "F8=")
+"""Rows at 1 kHz, or that take minutes of their own time."""
+CHEAP = ("a sampled wall of 5 kN/m at 100 Hz", "a sampled wall of 8 kN/m", "a push without end")
+
+
+def _named(row: Row) -> str:
+    return f"{row.mark} {row.what}"
+
+
+def _marked(row: Row) -> object:
+    slow = row.mark in SLOW and row.what not in CHEAP
+    return pytest.param(row, id=_named(row), marks=pytest.mark.long if slow else ())
+
+
+@pytest.mark.parametrize("row", list(map(_marked, ROWS)))
+def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
+    found = trilat_net.certify(trilat_net.simulate(row.make()))
+    assert found.stability in row.words
+    assert row.reason in " ".join([found.end.text, *found.reasons]).lower()
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named)
+def test_a_mirror_is_stable_on_live_links_too(row: Row) -> None:
+    assert trilat_net.certify(trilat_net.simulate(under_noise(row.make()))).stability == "stable"
+
+
+def test_every_row_has_its_mirror() -> None:
+    marks = {row.mark for row in ROWS}
+    assert {f"{mark.rstrip('=')}=" for mark in marks} <= marks
+
+
+def _speed(scenario: Scenario, *at_s: float) -> list[float]:
+    """The largest |qd| of the second before each time."""
+    run, found = FusedRun(scenario), []
+    for end_s in at_s:
+        run.advance(end_s - 1.0)
+        peaks = []
+        for t_s in np.linspace(end_s - 1.0, end_s, 50):
+            run.advance(float(t_s))
+            peaks.append(np.abs(run.records[:, 2:4]).max())
+        found.append(max(peaks))
+    return found
+
+
+def _row(what: str) -> Scenario:
+    return next(row.make() for row in ROWS if row.what == what)
+
+
+def test_the_truth_of_rows_that_die_out_later() -> None:
+    """Parametric resonance detunes itself after minutes, and so does the limit cycle; both grew before."""
+    first, last = _speed(_row("the delay swings at 1.7 Hz"), 60.0, 120.0)
+    assert last > 5.0 * first > 1.0
+    first, last = _speed(_row("100 Hz, no delay: a limit cycle"), 100.0, 170.0)
+    assert last > first > 0.5
+
+
+LATER = [pytest.param(first, marks=pytest.mark.long) for first in range(100, 2000, 100)]
+GROW = [row for row in ROWS if row.mark in ("F1", "F5", "F2") or "hammers" in row.what]
+
+
+@pytest.mark.parametrize("row", GROW, ids=_named)
+def test_the_truth_of_rows_that_grow(row: Row) -> None:
+    assert find_truth(Drawn("row", row.make())).unstable
+
+
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(100, 2000, 100))]
+)
+def test_random_runs_do_not_fool_it(first: int) -> None:
+    """What certify and a sweep say of a hundred runs, of which a third are near an edge of stability."""
+    judged = list(map(judge_experiment, range(first, first + 100)))
+    for by in ("certified", "swept"):
+        found = tally(judged, by)
+        assert found.false_ok == 0
+        assert found.false_alarm <= 0.02 * found.runs
+        assert found.undecided <= (0.2 if first else 0.15) * found.runs
+        assert found.near >= (0.25 if first else 0.3) * found.runs
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**32 - 1))
+def test_no_seed_makes_it_call_unstable_runs_stable(seed: int) -> None:
+    assert not any(tally([judge_experiment(seed)], by).false_ok for by in ("certified", "swept"))
