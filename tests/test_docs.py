@@ -14,6 +14,7 @@ from typer.main import get_command
 from recorder import backfill
 from sites import change_server, external_arm, retransmit_buffer, shutdown
 from trilat_net.analysis import run_end, site_signals
+from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.metrics import impedance, static_windows
 from trilat_net.cli import app
 from trilat_net.core import delay, link
@@ -81,6 +82,11 @@ STATED: list[tuple[str, str, float, float]] = [
     ("recording.md", "does not send for 10 s", 10, backfill.GIVE_UP_NS / 1e9),
     ("recording.md", "of more than 50 000 in one channel", 50_000, accounting.MAX_GAPS),
     ("recording.md", "synced once a second", 1, log_file.SYNC_PERIOD_NS / 1e9),
+    ("definitions.md", "by 0.05 rad or more", 0.05, run_end.DRIFT_RAD),
+    ("definitions.md", "differ by more than 0.02 rad", 0.02, run_end.AGREEMENT_RAD),
+    ("definitions.md", "within 0.3 rad of straight down", 0.3, run_end.HANGING_RAD),
+    ("definitions.md", "lets the run go for 2 s or more", 2, run_end.LEAST_JUDGED_S),
+    ("certificate.md", "they let go 1 s and five times", 1, premises.MIN_FREE_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
     ("sweep.md", "by more than 2 %", 2, 100 * cell_result.FLAT_LOG_CHANGE),
     ("sweep.md", "in batches of about 2 s", 2, executor.CLUSTER_BATCH_S),

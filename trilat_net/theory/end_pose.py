@@ -22,7 +22,7 @@ from .characteristic_roots import compute_delay_spectrum
 from .equilibrium import follow_equilibrium
 from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
-from .operating_point import Equilibrium, derive_operating_conditions
+from .operating_point import Equilibrium, derive_operating_conditions, is_constant_link
 from .tick_map import compute_sampled_spectrum
 
 _ROOTS = 2
@@ -49,6 +49,8 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _no_roots("the run diverged")
     if any(log.changes(site) for site in log.sites):
         return _no_roots("commands changed the loop while it ran")
+    if not all(map(is_constant_link, log.scenario.links.values())):
+        return _no_roots("delays vary")
     scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
     q, theta_hat = _choose_state(scenario, parts)
     try:

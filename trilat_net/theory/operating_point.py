@@ -122,6 +122,11 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
     return OperatingConditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)), bool(varying))
 
 
+def is_constant_link(link: LinkBase) -> bool:
+    """True if a link delays every sample alike."""
+    return link.core().kind == DelayKind.CONSTANT and not link.loss and not link.measured
+
+
 def _refuse_unknown_equations(scenario: Scenario) -> None:
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
@@ -165,7 +170,7 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
     """
     own_hz, peer_hz = scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz
     model = link.core()
-    constant = model.kind == DelayKind.CONSTANT and not link.loss
+    constant = is_constant_link(link)
     if constant and own_hz == peer_hz:
         delay_us = max(round(model.location), model.playout_us)
         age_s = max(1, -(-delay_us * own_hz // 1_000_000)) / own_hz
