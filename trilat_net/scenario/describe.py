@@ -43,7 +43,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
     weights = (
         "none: alpha is reducible, some site's weight is zero"
         if beta is None
-        else ", ".join(f"{name} {weight:.4g}" for name, weight in zip(scenario.names, beta, strict=True))
+        else ", ".join(f"{name} {len(beta) * pi:.4g}" for name, pi in zip(scenario.names, beta, strict=True))
     )
     words = {name: link.describe() for name, link in scenario.links.items()}
     links = [f"link {name}: {text}" for name, text in words.items()]
@@ -52,7 +52,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
         + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
         *(links if len(set(words.values())) > 1 else [f"every link: {next(iter(words.values()))}"]),
-        f"beta, the left null vector of Upsilon: {weights}",
+        f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
         *(f"assumed: {text}" for text in scenario.assumed),
