@@ -164,11 +164,11 @@ ROWS = (
     Row("F1", "and of that only one joint", _pairs(p_d(4.0), p_d([1.2, 4.0])), NEVER_STABLE, "joint"),
     Row("F1=", "both groups decay", _pairs(p_d(4.0), p_d(4.0)), STABLE),
     Row("F2", "a sampled wall of 20 kN/m", _wall(20.0), NEVER_STABLE, "this rest: unstable"),
-    Row("F2", "a sampled wall of 28 kN/m", _wall(28.0), NEVER_STABLE, "bounded oscillation"),
+    Row("F2", "a sampled wall of 28 kN/m", _wall(28.0), NEVER_STABLE, "this rest: unstable"),
     Row("F2", "a sampled wall of 5 kN/m at 100 Hz", _wall(5.0, rate_hz=100), NEVER_STABLE),
     Row("F2=", "a sampled wall of 8 kN/m", _wall(8.0), STABLE),
     Row("F2=", "a wall of 28 kN/m that is not sampled", _wall(28.0, sampled=False), STABLE),
-    Row("F4", "the delay swings at 1.7 Hz", _load("free", PARAMETRIC), NEVER_STABLE, "V rises"),
+    Row("F4", "the delay swings at 1.7 Hz", _load("free", PARAMETRIC), NEVER_STABLE, "v rises"),
     Row("F4=", "by a tenth of that", _load("free", PARAMETRIC, link__amplitude_ms=20.0), STABLE),
     Row("F5", "P+d, 1.6 s, d 2.7", _margin(d=2.7, T_ms=1600.0, duration_s=60.0), NEVER_STABLE, "unstable"),
     Row("F5", "P+d, 0.8 s, d 2", _margin(d=2.0, T_ms=800.0, duration_s=60.0), NEVER_STABLE, "unstable"),
@@ -182,7 +182,7 @@ ROWS = (
     Row(
         "F8=", "a fifth of the force", _load("contact", {"sites.m.control.k_f": 0.2}, duration_s=60.0), STABLE
     ),
-    Row("F8", "100 Hz, no delay: a limit cycle", _load("free", CYCLE), NEVER_STABLE, "V rises"),
+    Row("F8", "100 Hz, no delay: a limit cycle", _load("free", CYCLE), NEVER_STABLE, "v rises"),
     Row("F8=", "500 Hz, no delay", _load("free", CYCLE, rate_hz=500, duration_s=60.0), STABLE),
     Row("F8", "a push without end", _margin({"sites.m1.hands": PUSH}), NEVER_STABLE, "drift"),
     Row(
