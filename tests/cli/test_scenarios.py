@@ -50,7 +50,7 @@ def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
 
 def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
-    assert "m1 0.42" in text
+    assert "m1 1.279, m2 0.4655, s 1.256" in text
     assert "20000 ticks of m1" in text
     assert "m2->s: 310 ms" in text
     assert "assumed: " in text
