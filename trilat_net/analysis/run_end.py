@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import PEAK_COLUMNS, largest_of_joints
+from ..core.fused_run import PEAK_COLUMNS
 from ..core.ticks import BUCKETS_PER_S
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
@@ -131,9 +131,6 @@ class EndBehaviour(StrEnum):
         return Stability.OPEN if undecided else Stability.NOT_STABLE
 
 
-_SEVERITY = {behaviour: n for n, behaviour in enumerate(EndBehaviour)}
-
-
 class EnvelopeFit(NamedTuple):
     """Trend of an envelope over the second half of a run.
 
@@ -228,19 +225,25 @@ class RunTrace(NamedTuple):
     Attributes:
         buckets: of every `BUCKETS_PER_S`-th of a second since the epoch its `PEAK_COLUMNS`, shape (K, 6);
             -1 if it has no record. A site's last one may be incomplete: it enters no trend.
-        forced: True if an operator or environment pushes at its last record.
+        tau_x: the torque of operator and environment at its last record, shape (2,), N m.
         diverged_at_s: when the first site left its limits, or None.
         pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for never.
     """
 
     buckets: Sequence[Array]
-    forced: Sequence[bool]
+    tau_x: Sequence[Array]
     diverged_at_s: float | None = None
     pushed_until_s: float = 0.0
 
 
+NO_BUCKETS = np.zeros((0, PEAK_COLUMNS))
+"""The buckets of a site without records."""
+
+
 def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
     """Returns buckets with some more records of a site, which follow those in it; there may be spare rows."""
+    if not len(bucket):
+        return into
     lacking = int(bucket[-1]) + 1 - len(into)
     if lacking > 0:  # by half as much again: a long run is not copied for every batch
         into = np.vstack([into, np.full((lacking + len(into) // 2, PEAK_COLUMNS), -1.0)])
@@ -258,32 +261,25 @@ def trace_log(log: Log) -> RunTrace:
     recorded = [part for part in parts if len(part)]
     outside = [part for part in recorded if part.name in log.scenario.external]
     return RunTrace(
-        list(map(_reduce_site, parts)),
-        [len(part) > 0 and acts_on_arm(part.tau_x[-1]) for part in parts],
+        [
+            reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, NO_BUCKETS)
+            for part in parts
+        ],
+        [part.tau_x[-1] if len(part) else np.zeros(JOINTS) for part in parts],
         min((at_s for part in parts if (at_s := diverged_at_s(part)) is not None), default=None),
         max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
     )
 
 
-def acts_on_arm(tau_x: Array) -> bool:
-    """True if a torque of operator and environment, N m, may hold an arm where its controller does not."""
-    return bool(np.abs(tau_x).max() > FORCE_NM)
-
-
 def classify_log_end(log: Log) -> RunEnd:
     """Returns the end of a log's run; torn and empty logs are undecided."""
     end = classify_run_end(log.scenario, trace_log(log))
-    parts = [log[site] for site in log.sites]
     bounded = end.behaviour is EndBehaviour.BOUNDED
-    return end._replace(
-        frequency_hz=_frequency_hz([part for part in parts if len(part)]) if bounded else None,
-        missing_sites=tuple(part.name for part in parts if not len(part)),
-    )
+    return end._replace(frequency_hz=_frequency_hz([log[site] for site in log.sites]) if bounded else None)
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     """Returns the end of a run from its trace."""
-    ends = find_end_maxima([largest_of_joints(site) for site in trace.buckets])
     count = max(min(map(len, trace.buckets)) - 1, 0)
     columns = np.array([values[:count] for values in trace.buckets])
     kept = np.flatnonzero((columns[:, :, 0] >= 0.0).all(axis=0))
@@ -291,10 +287,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     first, acts = _choose_judged_part(kept / BUCKETS_PER_S, acted_s)
     kept = kept[first:]
     t_s, columns = np.asarray(kept / BUCKETS_PER_S), columns[:, kept]
-    worst = _find_worst_joint(t_s, columns, trace.buckets)
-    site, joint = divmod(worst.number, JOINTS)
-    where = f"{scenario.names[site]} joint {joint + 1}" if len(t_s) else ""
-    end = RunEnd(worst.behaviour, worst.error, worst.speed, *ends, where)
+    missing = tuple(name for name, site in zip(scenario.names, trace.buckets, strict=True) if not len(site))
+    end = _find_worst_joint(scenario, t_s, columns, trace.buckets)._replace(missing_sites=missing)
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
@@ -316,39 +310,27 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     return int(np.searchsorted(t_s, 2.0 * acted_s - t_s[-1])), False
 
 
-def find_end_maxima(maxima: Sequence[Array]) -> tuple[float, float]:
-    """Returns the largest |e|, rad, and |qd|, rad/s, of the last second, of these columns of every bucket."""
-    last = [values[-BUCKETS_PER_S:].max(axis=0, initial=0.0) for values in maxima]
-    error_rad, speed_rad_s = np.max(last, axis=0, initial=0.0).tolist() if last else (0.0, 0.0)
-    return error_rad, speed_rad_s
-
-
-class _JointEnd(NamedTuple):
-    """The end of one joint: its class, the trends of its |e| and |qd|, its number, site by site."""
-
-    behaviour: EndBehaviour
-    error: EnvelopeFit
-    speed: EnvelopeFit
-    number: int
-    end_speed_rad_s: float
-
-
-def _find_worst_joint(t_s: Array, columns: Array, buckets: Sequence[Array]) -> _JointEnd:
-    """Returns the joint of the worst class, the fastest of those."""
+def _find_worst_joint(scenario: Scenario, t_s: Array, columns: Array, buckets: Sequence[Array]) -> RunEnd:
+    """Returns the end of the joint of the worst class, the fastest of those; the maxima are of all."""
     signals = columns[:, :, : 2 * JOINTS].transpose(1, 0, 2).reshape(len(t_s), 2 * JOINTS * len(buckets))
     fits = fit_envelopes(t_s, signals)
     joints = []
-    for n, site in enumerate(buckets):
+    for n, (name, site) in enumerate(zip(scenario.names, buckets, strict=True)):
         ends = site[-BUCKETS_PER_S:, : 2 * JOINTS].max(axis=0, initial=0.0).tolist()
         for joint in range(JOINTS):
             error, speed = (fits[(2 * n + kind) * JOINTS + joint] for kind in (0, 1))
-            end_speed = ends[JOINTS + joint]
-            behaviour = _classify_joint(error, speed, ends[joint], end_speed)
+            end_error, end_speed = ends[joint], ends[JOINTS + joint]
+            behaviour = _classify_joint(error, speed, end_error, end_speed)
             if behaviour in (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED):
                 q, fastest = columns[n][:, 2 * JOINTS + joint], columns[n][:, JOINTS + joint]
                 behaviour = _name_motion(behaviour, q, fastest, t_s)
-            joints.append(_JointEnd(behaviour, error, speed, JOINTS * n + joint, end_speed))
-    return max(joints, key=lambda one: (_SEVERITY[one.behaviour], one.end_speed_rad_s))
+            where = f"{name} joint {joint + 1}" if len(t_s) else ""
+            joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
+    worst = max(joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s))
+    return worst._replace(
+        end_error_rad=max(one.end_error_rad for one in joints),
+        end_speed_rad_s=max(one.end_speed_rad_s for one in joints),
+    )
 
 
 def _classify_joint(
@@ -419,16 +401,15 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
 def _find_disagreement(scenario: Scenario, trace: RunTrace, t_s: Array, columns: Array) -> Iterable[str]:
     """Yields what is said of sites that do not agree, do not come closer, and are held apart by no force."""
     for group in find_coupled_sites(scenario):
-        if len(group) < 2 or not len(t_s) or any(trace.forced[n] for n in group):
+        if len(group) < 2 or max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM:
             continue
         q = columns[group][:, :, 2 * JOINTS :]
-        apart = np.ptp(q, axis=0).max(axis=1)
-        end_rad = float(np.ptp(q[:, -1], axis=0).max())
-        if end_rad <= AGREEMENT_RAD or fit_envelope(t_s, apart).trend is EnvelopeTrend.DECAYS:
-            continue
-        joint = int(np.ptp(q[:, -1], axis=0).argmax())
-        ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
-        yield f"{' and '.join(ends)} stand {end_rad:.3g} rad apart, and nothing holds them there"
+        apart = np.ptp(q, axis=0)
+        joint = int(apart[-1].argmax())
+        nearer = fit_envelope(t_s, apart.max(axis=1)).trend is EnvelopeTrend.DECAYS
+        if apart[-1, joint] > AGREEMENT_RAD and not nearer:
+            ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
+            yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
 
 
 def points_down(q: Array) -> bool:
@@ -438,22 +419,16 @@ def points_down(q: Array) -> bool:
 
 def _find_odd_pose(scenario: Scenario, trace: RunTrace) -> Iterable[str]:
     """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
-    starts = {name: np.array(scenario.sites[name].q0_rad) for name in scenario.names}
-    ends = {
-        name: site[-1, 2 * JOINTS :]
-        for name, site in zip(scenario.names, trace.buckets, strict=True)
-        if len(site)
-    }
-    hanging = [name for name, q in ends.items() if points_down(q) and not points_down(starts[name])]
+    starts = np.array([spec.q0_rad for spec in scenario.sites.values()])
+    ends = np.array([site[-1, 2 * JOINTS :] for site in trace.buckets])
+    poses = zip(scenario.names, starts, ends, strict=True)
+    hanging = [name for name, start, end in poses if points_down(end) and not points_down(start)]
+    away = np.maximum(starts.min(axis=0) - ends, ends - starts.max(axis=0)).max(axis=1)
+    n = int(away.argmax())
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
-    if any(spec.hands for spec in scenario.sites.values()) or scenario.external:
-        return
-    low, high = (pick(list(starts.values()), axis=0) for pick in (np.min, np.max))
-    away = {name: float(np.maximum(low - q, q - high).max()) for name, q in ends.items()}
-    name = max(away, key=away.__getitem__, default="")
-    if name and not hanging and away[name] > THROWN_RAD:
-        yield f"{name} ends {away[name]:.3g} rad away from every start pose, and nobody pushed"
+    elif away[n] > THROWN_RAD and not (scenario.external or any(s.hands for s in scenario.sites.values())):
+        yield f"{scenario.names[n]} ends {away[n]:.3g} rad away from every start pose, and nobody pushed"
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
@@ -469,18 +444,10 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     return last_s
 
 
-def _reduce_site(part: SiteLog) -> Array:
-    """Returns the buckets of a site's records."""
-    empty = np.zeros((0, PEAK_COLUMNS))
-    if not len(part):
-        return empty
-    return reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, empty)
-
-
 def _frequency_hz(parts: list[SiteLog]) -> float | None:
     """Returns the frequency of the fastest joint in the second half, by its changes of sign, or None."""
-    halves = [part.qd[len(part) // 2 :] for part in parts if len(part) > 1]
-    part, half = max(zip(parts, halves, strict=False), key=lambda pair: float(np.abs(pair[1]).max()))
+    halves = [(part, part.qd[len(part) // 2 :]) for part in parts]
+    part, half = max(halves, key=lambda pair: float(np.abs(pair[1]).max()))
     column = half[:, int(np.abs(half).max(axis=0).argmax())]
     crossings = _count_sign_changes(column)
     span_s = float(part.tick[-1] - part.tick[len(part) // 2]) / part.rate_hz

@@ -18,12 +18,10 @@ from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
-from .characteristic_roots import compute_delay_spectrum
 from .equilibrium import follow_equilibrium
 from .linear_edge import find_deepest_contact
-from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, derive_operating_conditions, is_constant_link
-from .tick_map import compute_sampled_spectrum
+from .tick_map import compute_decisive_spectrum
 
 _ROOTS = 2
 """Roots that are looked for: the rightmost ones."""
@@ -58,9 +56,7 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
     except ScenarioError as error:
         return _no_roots(error.problem)
-    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
-    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    decisive = compute_sampled_spectrum(conditions, rest, near, _ROOTS) or continuous
+    decisive = compute_decisive_spectrum(conditions, rest, _ROOTS, _ROOTS)
     root, verdict = decisive.rightmost, decisive.verdict
     if root is None:
         return EndPoseRoots(verdict, None, not conditions.varying, f"this rest: {verdict}, without roots")

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S, find_end_maxima
+from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S
 from ..core.site_setup import Law
+from ..core.ticks import BUCKETS_PER_S
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
@@ -74,7 +75,7 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
         for t_s in np.linspace(0.75 * until_s, until_s, _MEAN_STATES):
             run.advance(float(t_s))
             states.append((run.q, run.theta_hat))
-        _, speed_rad_s = find_end_maxima(run.maxima)
+        speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
         if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
             break
         until_s *= 2.0

@@ -20,7 +20,7 @@ from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import has_estimate
 from .textbook_arm import end_effector_position
-from .tick_map import compute_sampled_spectrum
+from .tick_map import compute_decisive_spectrum
 
 EDGE_SCAN_POINTS = 24
 EDGE_TOLERANCE = 1e-6
@@ -46,13 +46,9 @@ def find_rightmost_root(
 
     It is of the sampled loop if asked for, and if the sites have one rate.
     """
-    continuous = compute_delay_spectrum(
-        linearise_loop(conditions, rest), _CONTINUOUS_GUESSES if sampled else 1
-    )
-    if not sampled:
-        return continuous.rightmost
-    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    return (compute_sampled_spectrum(conditions, rest, near, 1) or continuous).rightmost
+    if sampled:
+        return compute_decisive_spectrum(conditions, rest, 1, _CONTINUOUS_GUESSES).rightmost
+    return compute_delay_spectrum(linearise_loop(conditions, rest), 1).rightmost
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:

@@ -26,13 +26,14 @@ from .characteristic_roots import (
     MovingPart,
     Pencil,
     Spectrum,
+    compute_delay_spectrum,
     count_zero_roots,
     extract_moving_part,
     limit_blas_threads,
     refine_roots,
     sort_root_guesses,
 )
-from .linear_loop import STATE_NAMES, differentiate_rates
+from .linear_loop import STATE_NAMES, differentiate_rates, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
     ARGUMENT_COUNT,
@@ -157,6 +158,18 @@ def compute_sampled_spectrum(
             tries = len(guesses)
         roots, dropped = refine_roots(pencil, guesses, names, wanted, tries, 2.0 * math.pi / h_s)
     return Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
+
+
+def compute_decisive_spectrum(
+    conditions: OperatingConditions, rest: Equilibrium, wanted: int, guesses: int
+) -> Spectrum:
+    """Returns the rightmost roots of the sampled loop; of the continuous one if there are several rates.
+
+    The sampled ones are sought near `guesses` roots of the continuous loop.
+    """
+    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), guesses)
+    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
+    return compute_sampled_spectrum(conditions, rest, near, wanted) or continuous
 
 
 def build_companion_matrix(pencil: Pencil) -> Array:

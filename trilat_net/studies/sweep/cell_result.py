@@ -12,7 +12,7 @@ from enum import StrEnum
 import msgspec
 import numpy as np
 
-from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, acts_on_arm, classify_run_end
+from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.site_arrays import RECORD_TAU_X
 from ...core.two_link_arm import JOINTS
@@ -188,8 +188,8 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
 
 
 def _cell_result(run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int) -> CellResult:
-    forced = [acts_on_arm(row) for row in run.records[:, RECORD_TAU_X : RECORD_TAU_X + JOINTS]]
-    end = classify_run_end(scenario, RunTrace(run.buckets, forced, run.diverged_s))
+    tau_x = run.records[:, RECORD_TAU_X : RECORD_TAU_X + JOINTS]
+    end = classify_run_end(scenario, RunTrace(run.buckets, list(tau_x), run.diverged_s))
     rates = (end.error.rate_per_s, end.speed.rate_per_s)
     error_rate, speed_rate = (rate if math.isfinite(rate) else None for rate in rates)
     return CellResult(

@@ -15,17 +15,16 @@ import numpy as np
 
 from ...analysis.arm_rows import compute_end_effector
 from ...analysis.run_end import (
+    NO_BUCKETS,
     EndBehaviour,
     EnvelopeTrend,
     RunEnd,
     RunTrace,
     Stability,
-    acts_on_arm,
     classify_run_end,
     reduce_to_buckets,
 )
 from ...analysis.torque_sources import wall_force
-from ...core.fused_run import PEAK_COLUMNS
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
@@ -137,7 +136,7 @@ class SiteStats:
         self._age_sum_ms = np.zeros(len(peer_rates))
         self._age_records = np.zeros(len(peer_rates), dtype=np.int64)
         self._squares = np.zeros(JOINTS)
-        self._buckets = np.zeros((0, PEAK_COLUMNS))
+        self._buckets = NO_BUCKETS
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
@@ -199,9 +198,9 @@ class SiteStats:
         return self._buckets[: self.last_ns // _BUCKET_NS + 1]
 
     @property
-    def forced(self) -> bool:
-        """True if an operator or environment pushes at the last record."""
-        return bool(self._tail) and acts_on_arm(self._tail[-1].tau_x[-1])
+    def tau_x(self) -> Array:
+        """The torque of operator and environment at the last record, shape (2,), N m."""
+        return self._tail[-1].tau_x[-1] if self._tail else np.zeros(JOINTS)
 
 
 class LinkAge(msgspec.Struct, frozen=True):
@@ -314,9 +313,9 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _judge(scenario: Scenario, tallies: Mapping[str, SiteStats], diverged_at_s: float | None) -> RunEnd:
-    forced = [tally.forced for tally in tallies.values()]
-    buckets = [tally.buckets for tally in tallies.values()]
-    return classify_run_end(scenario, RunTrace(buckets, forced, diverged_at_s))
+    found = tallies.values()
+    trace = RunTrace([one.buckets for one in found], [one.tau_x for one in found], diverged_at_s)
+    return classify_run_end(scenario, trace)
 
 
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
