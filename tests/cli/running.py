@@ -6,9 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
-from trilat_net.cli import main
+from typer.main import get_command
+
+from trilat_net.cli import app, main
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""
@@ -39,6 +42,17 @@ class Done:
         assert lines[0].startswith("error: "), self
         for fact in facts:
             assert fact in self.err, self
+
+
+def parses(words: list[str]) -> None:
+    """A command line, `trilat` included, has a command, and no option or argument that this does not take."""
+    program, *rest = words
+    assert program == "trilat"
+    command: Any = get_command(app)
+    while hasattr(command, "commands"):
+        command = command.commands[rest.pop(0)]
+    with command.make_context(command.name, rest) as context:
+        assert context.args == []
 
 
 def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:

@@ -8,6 +8,7 @@ import pytest
 
 from tests.theory.figures_of_runs import measured, peak, printed
 from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
@@ -68,3 +69,16 @@ def test_a_play_out_buffer_makes_jitter_a_constant_delay_and_the_run_leaves_the_
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
     assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s
+
+
+@pytest.mark.parametrize(
+    ("changes", "leaves"),
+    [({"link.order": "in_order"}, True), ({"rate_hz": 100}, False)],
+    ids=["order", "rate"],
+)
+def test_order_makes_jitter_leave_its_limits_and_a_slower_rate_does_not(
+    changes: dict[str, str | int], leaves: bool
+) -> None:
+    made = FusedRun(load_scenario("jitter", changes))
+    made.advance(40.0)
+    assert (made.diverged_s is not None) is leaves

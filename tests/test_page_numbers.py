@@ -1,0 +1,405 @@
+"""Numbers on the pages are what the program makes of the commands, runs and formulas beside them.
+
+A row has a page's words with `{}` for each number (and `…` for any other cell of a table), and what makes the
+numbers, in that order, or a text in which the same words stand. A number of the page must agree with the one
+that is made to six tenths of its last printed digit.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.stats import uniform
+
+from tests.analysis.certificate import runs
+from tests.analysis.test_link_summary import in_order, newest_wins
+from tests.cli.running import trilat
+from tests.theory.figures_of_runs import measured, value
+from tests.theory.loops import RODS
+from tests.virtual_runs import sampled
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.delay_models import DELAY_MODELS
+from trilat_net.theory import analyse_linear_loop, find_equilibrium, find_linear_edge
+from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
+
+ROOT = Path(__file__).parents[1]
+NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
+WORDS = {"Seventeen": "17", "eleven": "11", "−": "-"}
+G = 9.81
+WALL = "sites.s.environment.0"
+DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
+CONSTANT = {"link__model": "constant", "link__delay_ms": 200.0}
+NO_BOX = {"control__law": "adaptive", "control__theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
+KNOWN = {"control__Gamma": 0.0, "control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]}
+EQUAL_KD = {"sites__m1__control__Kd": 3.0, "sites__s__control__Kd": 3.0}
+SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
+SHEET = {
+    "link.delay_ms": 20,
+    "control.d": 0.25,
+    "dominance": SHARES,
+    **{f"sites.m2.arm.{key}": one for key, one in (("m1_kg", 0.5), ("m2_kg", 0.5))},
+    **{f"sites.m2.arm.I{n}_kg_m2": 0.0416667 for n in (1, 2)},
+    **{f"sites.s.arm.m{n}_kg": 0.667 for n in (1, 2)},
+    **{f"sites.s.arm.I{n}_kg_m2": 0.0555833 for n in (1, 2)},
+}
+ONE_WAY = {"control.d": 4, "dominance": {"m1": {"m2": 1}, "m2": {"s": 1}, "s": {"m1": 1}}}
+PAPER_END = (-0.1729, 0.0874)
+Pose = tuple[float, float]
+Numbers = Iterable[float | None]
+Make = Callable[[], Numbers | str]
+Changes = dict[str, Any]
+
+
+def keys(changes: Changes) -> Changes:
+    return {key.replace("__", "."): one for key, one in changes.items()}
+
+
+# -- the linear loop
+
+
+def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
+    found = analyse_linear_loop(load_scenario(name, changes), pose=pose, roots=1).continuous.rightmost
+    assert found is not None
+    return found.s.real, abs(found.s.imag)
+
+
+def root(name: str, changes: Changes | None = None, pose: Pose | None = None) -> tuple[float, float]:
+    """The rightmost root that decides, the upper one of a pair."""
+    found = analyse_linear_loop(load_scenario(name, changes or {}), pose=pose, roots=1).decisive.rightmost
+    assert found is not None
+    return found.s.real, abs(found.s.imag)
+
+
+def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
+    """The largest common delay, ms, and the frequency there, rad/s."""
+    high = analyse_linear_loop(load_scenario(name, changes or {}), roots=1).margin.intervals[0].high
+    assert high is not None
+    return 1e3 * high.delay_s, high.omega_rad_s
+
+
+def edge(name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None) -> float:
+    scenario = load_scenario(name, changes)
+    rest = None if pose is None else find_equilibrium(scenario, pose)
+    found = find_linear_edge(scenario, key, low, high, rest)
+    assert found is not None
+    return found.value
+
+
+def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
+    line = share * 10.0 * delay_ms / 1e3
+    return edge(name, "control.d", 0.05 * line, 1.2 * line, {"link.delay_ms": delay_ms})
+
+
+def common_motion() -> tuple[float, float, float]:
+    """What the common motion asks of d, of K T: the largest -sin x / x; the mass there, two factors of it."""
+    x = brentq(lambda x: math.tan(x) - x, 4.4, 4.6)
+    return -math.sin(x) / x, 1.0 - math.cos(x), x**2
+
+
+# -- ports
+
+
+def ports(name: str, **changes: Any) -> PortAnalysis:
+    scenario = load_scenario(name, keys(changes))
+    return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
+
+
+def felt(made: PortAnalysis) -> Any:
+    return next(one for one in made.transparency if (one.at, one.joint) == ("m", 1))
+
+
+def learning(delay_ms: float) -> Numbers:
+    made = ports("two_sites", link__delay_ms=delay_ms)
+    assert made.proof is not None
+    assert made.proof.passive
+    (band,), least = made.velocity.minima.below, made.velocity.minima
+    return (*band[:2], least.least, least.least_hz, *felt(made).size_at(1.0), felt(made).ratio_db)
+
+
+def known(delay_ms: float) -> float:
+    made = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
+    assert made.velocity.passive
+    return float(felt(made).ratio_db)
+
+
+def lacking() -> Numbers:
+    made = ports("p_d_margin_two", control__d=1.96).velocity
+    (band,) = made.minima.below
+    return (*band[:2], made.minima.least, made.minima.least_hz, made.lacking_nm_s_rad)
+
+
+def reflecting(delay_ms: float, d: float) -> PortAnalysis:
+    open_ends = {"sites__m__hands": [], "sites__s__environment": []}
+    return ports("contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d)
+
+
+def stable_with_any(delay_ms: float, d: float) -> Numbers:
+    made = reflecting(delay_ms, d)
+    assert not made.absolute.below
+    return [felt(made).ratio_db]
+
+
+# -- runs
+
+
+def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
+    scenario = load_scenario(name, keys(changes))
+    made = FusedRun(scenario)
+    made.advance(duration_s or scenario.duration_s)
+    return made
+
+
+def rms_of_free(delay_ms: float) -> float:
+    """Of e over 20 s, of all joints and sites together, rad."""
+    made = sampled(load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02))
+    return float(np.sqrt(((made[..., :2] - made[..., 4:6]) ** 2).mean()))
+
+
+def seen(name: str, asked: str, *windows: tuple[float, float, str], **changes: Any) -> list[float]:
+    """Quantities of windows of a run, window by window."""
+    made = measured(name, keys(changes), *windows)
+    return [value(made, key, n) for n in range(len(windows)) for key in asked.split()]
+
+
+def age(**changes: Any) -> float:
+    """Mean age of the samples in use in `jitter`, ms."""
+    return float(np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()]))
+
+
+def anchored(delay_s: float, duration_s: float) -> Numbers:
+    """The final angle of the first joint in `paper`: predicted, and of a run."""
+    predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
+    return predicted, fused("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
+
+
+def pi() -> Any:
+    alpha = np.array([[SHARES[i].get(j, 0.0) for j in SHARES] for i in SHARES])
+    values, vectors = np.linalg.eig(alpha.T)
+    vector = vectors[:, values.real.argmax()].real
+    return vector / vector.sum()
+
+
+def lyapunov(ones: bool = False, **changes: Any) -> EnergyBalance:
+    return compute_energy_balance(runs.run("lyapunov", keys(changes)).energies, ones=ones)
+
+
+def rise(V: Any) -> Numbers:
+    return (V - np.minimum.accumulate(V)).max(), V[0]
+
+
+def energy_of_healing() -> Numbers:
+    """What the links give to the slave of `outage` as they heal, J."""
+    balance = runs.run("outage").balance
+    healed = slice(*np.searchsorted(balance.t_s, (6.19, 6.21)))
+    return (float(np.ptp(balance.work[f"{peer}->s"][healed])) for peer in ("m1", "m2"))
+
+
+@cache
+def certified(folder: Path) -> str:
+    trilat("sim", "paper", "-o", "run.mcap", cwd=folder)
+    return trilat("certify", "run.mcap", cwd=folder).out
+
+
+def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
+    """The mean age in use by the sums of docs/definitions.md, at 1 kHz, ms."""
+    return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
+
+
+DELAYS_MS = (20, 100, 200, 400, 800, 1600)
+SETTLING_MS = (0, 20, 50, 100, 200, 400, 800)
+
+LINEAR: dict[str, Make] = {
+    "a delay decays at {}/s": lambda: [-root("jitter")[0]],
+    "at 400 ms grows at {}/s": lambda: root("jitter", {"link.playout_ms": 400})[:1],
+    "| point masses | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
+        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T})
+    ],
+    "| rods | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
+        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T, **RODS})
+    ],
+    "for good at {}, {}, {}, {}, {}, {} and {} s": lambda: [
+        fused("free", link__delay_ms=T).settled_s for T in SETTLING_MS
+    ],
+    "with every delay, from {} to {} rad": lambda: [rms_of_free(T) for T in (0, 800)],
+    "in e: {}/s at 0, {}/s at 200 ms, {}/s at 1.6 s": lambda: [
+        root("free", {"link.delay_ms": T}, (-0.124, 0.337))[0] for T in (0, 200, 1600)
+    ],
+    "up to {} K T, at mu = K T² {} / {}, which": common_motion,
+    "| 8 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
+        edge_of_p_d("p_d_margin", 0.5, T) for T in DELAYS_MS
+    ],
+    "| 16 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
+        edge_of_p_d("p_d_margin_two", 1.0, T) for T in DELAYS_MS
+    ],
+    "the continuous loop decays at {}/s": lambda: [-continuous("paper", DIGITAL, PAPER_END)[0]],
+    "as computed grows at {}/s": lambda: root("paper", DIGITAL, PAPER_END)[:1],
+    "is stable from {} Hz on": lambda: [edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)],
+    "unstable, {} ± {} j": lambda: root("contact"),
+    "the margin is {} ms ({} rad/s)": lambda: margin("contact"),
+    "force gain for 200 ms is {}": lambda: [edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})],
+    "and a margin of {} ms at them": lambda: margin("paper", {"link.delay_ms": 0})[:1],
+}
+PORTS: dict[str, Make] = {
+    **{
+        f"| {T} | {{}}-{{}} Hz | {{}} at {{}} Hz | yes | {{}} / {{}} | {{}} |": lambda T=T: learning(T)
+        for T in (0, 50, 200, 800)
+    },
+    "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
+    "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [known(0), known(200)],
+    "make it unstable, at {}-{} Hz. Direct": lambda: ports(
+        "training", timeline=[], sites__m1__hands=[], sites__m2__hands=[]
+    ).absolute.below[0][:2],
+    **{
+        f"| {T} | {d} | some make it unstable, {{}}-{{}} Hz": lambda T=T, d=d: reflecting(
+            T, d
+        ).absolute.below[0][:2]
+        for T, d in ((20, 5), (200, 5), (200, 30))
+    },
+    **{
+        f"| {T} | {d} | stable | stable | {{}} |": lambda T=T, d=d: stable_with_any(T, d)
+        for T, d in ((20, 30), (200, 60))
+    },
+}
+ERRATA: dict[str, Make] = {
+    "rises by {} J of {} J while": lambda: rise(lyapunov(ones=True).V),
+    "M = {} kg m²": lambda: [3.0 + math.sqrt(8.0)],
+    "that is T' <= {}.": lambda: [6.0 / (6.0 + (6.0 + math.sqrt(8.0)) ** 2)],
+    "at x = 0, and {} K T for a = 1, at tan x = x = {}. So": lambda: [
+        (asked := common_motion())[0],
+        math.sqrt(asked[2]),
+    ],
+    "m = {} K T² / {}, equal": lambda: common_motion()[1:],
+    "K T, grow by {}/s": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
+    "200 ms and d = 4 grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
+    "1/6 of K T is {}, 0.2172 of it {}.": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
+    "it is {}, {} and {} N m s/rad at 20, 200": lambda: [(200 * T + 40) ** 2 / 160 for T in (0.02, 0.2, 1)],
+}
+LAB: dict[str, Make] = {
+    "only the first decays: {} rad at 38 s": lambda: seen("jitter", "error_peak_rad", (38, 40, "")),
+    "against {} rad at a constant 200 ms": lambda: seen("jitter", "error_peak_rad", (38, 40, ""), **CONSTANT),
+    "the age in use is {} ms on average": lambda: [age()],
+    "order makes it {} ms": lambda: [age(link__order="in_order")],
+    "to choose from: {} ms": lambda: [age(rate_hz=100)],
+    "so {} rad, and the run ends at {}.": lambda: anchored(0.2, 20),
+    "At 400 ms it is {}, and {}.": lambda: anchored(0.4, 40),
+    "(1 + Lambda T) = {} N m/rad": lambda: [G**2 * 1.2],
+    "moves the slave to {} rad for good": lambda: [fused("box").q[-1, 0]],
+    "without the box it returns to {}.": lambda: [fused("box", **NO_BOX).q[-1, 0]],
+    "pi = ({}, {}, {}), so": pi,
+    "proportional to ({}, {}, {}).": lambda: pi() / (10.0, 3.0, 0.3),
+    "V falls from {} to {} J": lambda: lyapunov().V[[0, -1]],
+    "With ones it rises by {} of {} J": lambda: rise(lyapunov(ones=True).V),
+    "ones still fail, by {} J": lambda: rise(lyapunov(True, **EQUAL_KD).V)[:1],
+    "At 20 ms one hit, then {} N.": lambda: seen(
+        "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
+    ),
+    "{} +- {} N, peaks of {} N": lambda: seen(
+        "contact", "wall_mean_n wall_deviation_n wall_peak_n", (9, 15, "s")
+    ),
+    "A fifth of the force settles at {} N": lambda: seen(
+        "contact", "wall_mean_n", (14, 15, "s"), sites__m__control__k_f=0.2
+    ),
+    "integrate it: {} N at 6 s, {} N at 10 s, {} N at 20 s, {} N at 59 s": lambda: seen(
+        "windup", "wall_mean_n", *[(t - 0.1, t + 0.1, "s") for t in (6, 10, 20, 59)]
+    ),
+    "With gravity known it stays at {} N": lambda: seen(
+        "windup", "wall_mean_n", (58.9, 59.1, "s"), control__Gamma=[1.0, 1.0, 1.0, 0.0, 0.0]
+    ),
+    "feels 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[0], 5 * p[2] / p[0]],
+    "trainee 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[1], 5 * p[2] / p[1]],
+    "torques with it: {} rad/s and {} N m, where {} N m": lambda: [
+        *seen("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
+        *seen("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
+    ],
+    "smoothly takes {} N m": lambda: seen("outage", "torque_peak_nm", (6, 15, "s"), on_stale__action="hold"),
+    "from the link, {} and {} J at 6.2 s": energy_of_healing,
+}
+PAGES: dict[str, dict[str, Make]] = {
+    "docs/linear.md": LINEAR,
+    "docs/ports.md": PORTS,
+    "docs/errata.md": ERRATA,
+    "docs/lab.md": LAB,
+    "docs/laws.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
+    "docs/definitions.md": {
+        "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
+            uniform_age(order, *ends) for ends in ((150, 250), (0, 400)) for order in (newest_wins, in_order)
+        ]
+    },
+    "docs/certificate.md": {
+        "prints its edge, {} kN/m": lambda: [
+            1e-3 * edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
+        ],
+        "ever more for 200 s, to {} rad/s": lambda: [
+            fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
+        ],
+    },
+    "README.md": {
+        "{} scenarios show one": lambda: [len(list((ROOT / "trilat_net/scenarios").glob("[a-z0-9]*.toml")))],
+        "seeded: {} delay models": lambda: [len(DELAY_MODELS)],
+    },
+}
+CERTIFIED = (
+    "hands gave: {} J at 0 s, {} J at {} s",
+    "converged: |e| {} rad and |qd| {} rad/s in the last second",
+    "closes to {} of the largest energy, {} J; to {} once",
+    "this rest: stable, {} /s at {} rad/s",
+    "judged all {} ticks; the digest chain agrees over {} messages",
+)
+LONG = (
+    "| roots |",
+    "prints its edge",
+    "ones still fail",
+    "rises by",
+    "from the link",
+    "integrate it",
+    "gravity known",
+)
+"""Beginnings of words whose numbers take more than 3 s; other tests have their facts."""
+ROWS = [
+    pytest.param(page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ())
+    for page, entries in PAGES.items()
+    for words, make in entries.items()
+    for slow in [any(word in words for word in LONG)]
+]
+
+
+def numbers(words: str, text: str) -> list[str]:
+    """The numbers in the one place of a text that has these words."""
+    pattern = NUMBER.join(map(re.escape, words.split("{}"))).replace("…", "[^|]*")
+    found = re.findall(pattern, " ".join(text.split()))
+    assert len(found) == 1, f"{len(found)} places"
+    return [found[0]] if isinstance(found[0], str) else list(found[0])
+
+
+def check(page: str, words: str, made: Numbers | str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for word, plain in WORDS.items():
+        text = text.replace(word, plain)
+    wanted = list(map(float, numbers(words, made))) if isinstance(made, str) else list(made)
+    printed = numbers(words, text)
+    digits = [
+        10.0 ** (int(e or 0) - len(m.partition(".")[2])) for m, _, e in (p.partition("e") for p in printed)
+    ]
+    off = [
+        one is None or abs(one - float(word)) > 0.6 * digit
+        for one, word, digit in zip(wanted, printed, digits, strict=True)
+    ]
+    assert not any(off), f"{printed} on the page, made: {wanted}"
+
+
+@pytest.mark.parametrize(("page", "words", "make"), ROWS)
+def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -> None:
+    check(page, words, make())
+
+
+def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
+    for words in CERTIFIED:
+        check("docs/certificate.md", words, certified(tmp_path))
