@@ -1,0 +1,95 @@
+"""Chains with their dynamics and kinematics as Pinocchio computed them: `chain_references.json`, typed.
+
+`make_chain_references.py` makes the file anew; to read it, nothing but the file is needed.
+"""
+
+import functools
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trilat_net
+from trilat_net.scenario.urdf import UrdfChain, UrdfJoint
+
+Array = NDArray[np.float64]
+
+PATH = Path(__file__).with_name("chain_references.json")
+ARMS = Path(trilat_net.__file__).with_name("scenarios")
+
+
+class ChainState(NamedTuple):
+    """What a chain is asked in one state, and the answers; frames and units of `UrdfJoint`.
+
+    Velocity terms are the Christoffel ones, which make Mdot - 2C skew.
+    """
+
+    gravity: Array
+    """In the base's axes, m/s^2."""
+    q: Array
+    qd: Array
+    v: Array
+    a: Array
+    r: Array
+    tau: Array
+    inverse_dynamics: Array
+    """M(q) a + C(q, qd) v + G(q)."""
+    regressor_transpose_r: Array
+    """Y(q, qd, v, a)' r, ten numbers a joint."""
+    forward_dynamics: Array
+    """Accelerations under tau."""
+    inertia: Array
+    """M(q)."""
+    tip_position: Array
+    """Of the end link in the base."""
+    tip_rotation: Array
+    jacobian: Array
+    """Of the end link's origin in the base's axes, (6, n): three linear rows, then three angular ones."""
+
+
+class ChainReference(NamedTuple):
+    """A chain and its states."""
+
+    chain: UrdfChain
+    states: list[ChainState]
+
+
+@functools.cache
+def chain_references() -> dict[str, ChainReference]:
+    """Chains by name: random1, random2, random3, arm6, arm7, random12."""
+    return {
+        name: ChainReference(
+            to_chain(name, entry),
+            [
+                ChainState(**{key: np.array(value) for key, value in state.items()})
+                for state in entry["states"]
+            ],
+        )
+        for name, entry in json.loads(PATH.read_text())["chains"].items()
+    }
+
+
+def to_chain(name: str, entry: dict) -> UrdfChain:
+    """A chain from plain numbers, without limits and friction."""
+    joints = [
+        UrdfJoint(
+            joint["name"],
+            joint["link"],
+            joint["kind"],
+            tuple(joint["axis"]),
+            _rows(joint["rotation"]),
+            tuple(joint["origin_m"]),
+            tuple(joint["inertia"]),
+            *(-math.inf, math.inf, math.inf, math.inf, 0.0, 0.0),
+        )
+        for joint in entry["joints"]
+    ]
+    tip_rotation, tip_origin_m = _rows(entry["tip_rotation"]), tuple(entry["tip_origin_m"])
+    return UrdfChain(name, "base", "tip", tuple(joints), tip_rotation, tip_origin_m, ())
+
+
+def _rows(matrix: list) -> tuple:
+    return tuple(map(tuple, matrix))

@@ -1,0 +1,456 @@
+"""Arms from URDF: what is read, against NumPy; what is refused, and by which words."""
+
+import copy
+import json
+import math
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.chain_references import ARMS, PATH, Array, chain_references, to_chain
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario.urdf import CONSISTENCY, UrdfChain, UrdfPayload, read_urdf
+
+ARM6, ARM7 = ((ARMS / f"arm{n}.urdf").read_text() for n in (6, 7))
+BODY = (
+    '<inertial><origin xyz="0.1 0 0"/><mass value="2"/>'
+    '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial>'
+)
+LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="4"/>'
+
+
+def link(name: str, body: str = BODY) -> str:
+    return f'<link name="{name}">{body}</link>'
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="0 0 0.5"/><parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="0 0 1"/>{inside}</joint>'
+    )
+
+
+def robot(*elements: str) -> str:
+    return f'<robot name="r">{"".join(elements)}</robot>'
+
+
+TWO = robot(
+    link("base", ""),
+    joint("one", "base", "upper"),
+    link("upper"),
+    joint("two", "upper", "lower"),
+    link("lower"),
+)
+GRIPPER = robot(
+    link("base", ""),
+    joint("one", "base", "upper"),
+    link("upper"),
+    joint("mount", "upper", "camera", "fixed"),
+    link("camera"),
+    joint("two", "upper", "palm"),
+    link("palm"),
+    joint("left", "palm", "finger", "prismatic"),
+    link("finger"),
+    joint("right", "palm", "thumb", "prismatic", f'{LIMIT}<mimic joint="left"/>'),
+    link("thumb"),
+    joint("hand", "palm", "tcp", "fixed"),
+    link("tcp", ""),
+)
+
+
+def refusal(text: str, **ends: str) -> str:
+    with pytest.raises(ScenarioError) as caught:
+        read_urdf(text, **ends)
+    return str(caught.value)
+
+
+# What is read
+
+
+@pytest.mark.parametrize(("text", "name", "n"), [(ARM6, "arm6", 6), (ARM7, "arm7", 7)])
+def test_the_shipped_arms_are_those_of_the_references(text: str, name: str, n: int) -> None:
+    """Bit for bit: the references were made of the files as they are."""
+    chain = read_urdf(text)
+    stored = chain_references()[name].chain
+    assert (chain.name, chain.tip, len(chain.joints), chain.notes) == (name, "flange", n, ())
+    geometry = [(j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia) for j in chain.joints]
+    assert geometry == [
+        (j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia) for j in stored.joints
+    ]
+    assert (chain.tip_rotation, chain.tip_origin_m) == (stored.tip_rotation, stored.tip_origin_m)
+    assert all(math.isfinite(j.effort_limit) and j.lower < j.upper for j in chain.joints)
+
+
+def test_the_references_are_one_power_balance_and_one_position() -> None:
+    """r'tau = (Y'r)'pi; the Jacobian's columns are r = z x (x - p), by NumPy; the file is small."""
+    assert PATH.stat().st_size <= 200_000
+    assert json.loads(PATH.read_text())["source"].startswith("Pinocchio")
+    for chain, states in chain_references().values():
+        pi = np.concatenate([j.inertia for j in chain.joints])
+        for s in states:
+            assert s.r @ s.inverse_dynamics == pytest.approx(
+                s.regressor_transpose_r @ pi, rel=1e-12, abs=1e-12
+            )
+            x, R, axes = walk(chain, s.q)
+            assert np.abs(x - s.tip_position).max() < 1e-13
+            assert np.abs(R - s.tip_rotation).max() < 1e-13
+            for (kind, z, p), column in zip(axes, s.jacobian.T, strict=True):
+                expected = [*np.cross(z, x - p), *z] if kind == "revolute" else [*z, 0, 0, 0]
+                assert np.abs(column - expected).max() < 1e-13
+
+
+def walk(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
+    """Pose of the end link in the base, and axis and place of every joint."""
+    R, x, axes = np.eye(3), np.zeros(3), []
+    for j, qi in zip(chain.joints, q, strict=True):
+        x, R = x + R @ j.origin_m, R @ np.array(j.rotation)
+        axes.append((j.kind, R @ j.axis, x))
+        if j.kind == "revolute":
+            R = R @ turn(np.array(j.axis), qi)
+        else:
+            x = x + R @ j.axis * qi
+            axes[-1] = (j.kind, R @ j.axis, x)
+    return x + R @ chain.tip_origin_m, R @ np.array(chain.tip_rotation), axes
+
+
+def turn(axis: Array, angle: float) -> Array:
+    """Rodrigues."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
+
+
+def rpy(angles: Array) -> Array:
+    roll, pitch, yaw = angles
+    x, y, z = np.eye(3)
+    return turn(z, yaw) @ turn(y, pitch) @ turn(x, roll)
+
+
+def points(random: np.random.Generator) -> tuple[Array, Array]:
+    """Masses and places of a body."""
+    return random.uniform(0.1, 1.0, 6), random.normal(0.0, 0.2, (6, 3))
+
+
+def tensor(masses: Array, places: Array) -> Array:
+    return sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True))
+
+
+def six(I: Array) -> list[float]:  # noqa: E741 - the symbol of an inertia
+    return [I[0, 0], I[0, 1], I[1, 1], I[0, 2], I[1, 2], I[2, 2]]
+
+
+def stated(masses: Array, places: Array, angles: Array) -> str:
+    """An <inertial>, its tensor in a turned frame at the centre of mass."""
+    c, R = masses @ places / masses.sum(), rpy(angles)
+    moments = six(R.T @ tensor(masses, places - c) @ R)
+    keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
+    inertia = " ".join(f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True))
+    origin, mass = f'xyz="{words(c)}" rpy="{words(angles)}"', float(masses.sum())
+    return f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
+
+
+def words(vector: Array) -> str:
+    return " ".join(repr(float(x)) for x in vector)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_fixed_links_and_the_payload_are_lumped_and_fixed_frames_composed(seed: int) -> None:
+    """Every body is a cloud of masses: what is read must be the cloud's own sums in the joint's frame."""
+    random = np.random.default_rng(seed)
+    angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
+    origins = [f'<origin xyz="{words(x)}" rpy="{words(a)}"/>' for x, a in zip(offsets, angles, strict=True)]
+
+    def edge(n: int, kind: str, parent: str, child: str) -> str:
+        inside = f'{origins[n]}<parent link="{parent}"/><child link="{child}"/><axis xyz="0 3 4"/>{LIMIT}'
+        return f'<joint name="j{n}" type="{kind}">{inside}</joint>'
+
+    clouds = [points(random) for _ in range(4)]
+    text = robot(
+        *(link(f"l{n}", "" if n in (0, 1) else stated(*clouds[n - 2], angles[n])) for n in range(5)),
+        edge(0, "fixed", "l0", "l1"),
+        edge(1, "revolute", "l1", "l2"),
+        edge(2, "fixed", "l2", "l3"),
+        edge(3, "revolute", "l2", "l4"),
+        link("tip", ""),
+        edge(4, "fixed", "l4", "tip"),
+    )
+    masses, places = clouds[3]
+    c = masses @ places / masses.sum()
+    load = UrdfPayload(float(masses.sum()), tuple(c), six(tensor(masses, places - c)))
+    chain = read_urdf(text, tip="tip", payload=load)
+    R = [rpy(a) for a in angles]
+    first, second = chain.joints
+    assert np.abs(first.rotation - R[0] @ R[1]).max() < 1e-14
+    assert np.abs(first.origin_m - (offsets[0] + R[0] @ offsets[1])).max() < 1e-14
+    assert np.abs(second.rotation - R[3]).max() < 1e-14
+    assert np.abs(chain.tip_rotation - R[4]).max() < 1e-14
+    assert chain.tip_origin_m == tuple(offsets[4])
+    assert second.axis == (0.0, 0.6, 0.8)
+    for body, own, carried, n in ((first, clouds[0], clouds[1], 2), (second, clouds[2], clouds[3], 4)):
+        m = np.concatenate([own[0], carried[0]])
+        p = np.concatenate([own[1], offsets[n] + carried[1] @ R[n].T])
+        expected = [m.sum(), *(m @ p), *six(tensor(m, p))]
+        assert np.abs(np.array(body.inertia) - expected).max() < 1e-13
+
+
+def test_limits_friction_and_kinds() -> None:
+    inside = f'{LIMIT}<dynamics damping="0.5" friction="0.25"/>'
+    text = robot(
+        link("base", ""),
+        joint("one", "base", "a", "prismatic", inside),
+        link("a"),
+        joint("two", "a", "b", "continuous"),
+        link("b"),
+        joint("three", "b", "c", inside='<limit effort="0" velocity="0"/>'),
+        link("c"),
+        joint("four", "c", "d", inside='<limit lower="-1e16" upper="1e16" effort="1e16" velocity="2"/>'),
+        link("d"),
+    ).replace('<axis xyz="0 0 1"/><limit lower="-1e16"', '<limit lower="-1e16"')
+    one, two, three, four = read_urdf(text).joints
+    inf = math.inf
+    assert (one.kind, one.lower, one.upper, one.effort_limit, one.velocity_limit) == (
+        "prismatic",
+        -1,
+        2,
+        30,
+        4,
+    )
+    assert (one.viscous, one.coulomb, two.viscous, two.coulomb) == (0.5, 0.25, 0, 0)
+    assert (two.kind, two.lower, two.upper, two.effort_limit) == ("revolute", -inf, inf, 30)
+    assert three[7:11] == (-inf, inf, inf, inf)
+    assert four[7:11] == (-inf, inf, inf, 2)
+    assert four.axis == (1.0, 0.0, 0.0)  # of a joint that states none
+    assert read_urdf(text).notes == (
+        "joint 'three' states no limit, or 0, of position and effort and velocity: none is kept",
+    )
+
+
+def test_a_gripper_is_held_at_zero_and_a_note_says_so() -> None:
+    chain = read_urdf(GRIPPER, tip="tcp")
+    assert [j.inertia[0] for j in chain.joints] == [4.0, 6.0]
+    assert [re.findall("'(.*?)'", note) for note in chain.notes] == [
+        ["left", "finger", "palm"],
+        ["right", "thumb", "palm"],
+    ]
+    shorter = read_urdf(GRIPPER, tip="upper")
+    assert [j.inertia[0] for j in shorter.joints] == [10.0]
+    assert len(shorter.notes) == 3
+
+
+def test_a_base_or_a_tip_within_a_robot() -> None:
+    whole = read_urdf(ARM7)
+    part = read_urdf(ARM7, base="link2", tip="link5")
+    assert [j.name for j in part.joints] == ["joint3", "joint4", "joint5"]
+    assert part.joints[:2] == whole.joints[2:4]  # not the fifth: it carries the rest
+    assert part.tip_origin_m == (0.0, 0.0, 0.0)
+
+
+def test_files_that_the_text_names_are_not_opened() -> None:
+    mesh = '<visual><geometry><mesh filename="package://nowhere/a.dae"/></geometry></visual>'
+    assert read_urdf(TWO.replace('<link name="upper">', f'<link name="upper">{mesh}')) == read_urdf(TWO)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('<mass value="2"/>', '<mass value="-2"/>', ["link 'upper'", "-2 kg"]),
+        ('<mass value="2"/>', '<mass value="0"/>', ["link 'upper'", "no mass"]),
+        ('<mass value="2"/>', "", ["link 'upper'", "<mass>"]),
+        (BODY, "", ["link 'upper'", "joint 'one'", "<inertial>"]),
+        ('izz="0.04"', 'izz="0.06"', ["link 'upper'", "0.06", "two others"]),
+        ('izz="0.04"', 'izz="-0.04"', ["link 'upper'", "positive"]),
+        ('izz="0.04"', "", ["link 'upper'", "izz"]),
+        ('ixy="0"', 'ixy="0.03"', ["link 'upper'", "positive"]),
+        ('ixx="0.02"', 'ixx="0.02kg"', ["link 'upper'", "inertia ixx", "'0.02kg'"]),
+        ('ixx="0.02"', 'ixx="nan"', ["link 'upper'", "finite"]),
+        ('ixx="0.02"', 'ixx="1e400"', ["link 'upper'", "finite"]),
+        ('xyz="0.1 0 0"', 'xyz="0.1 0"', ["link 'upper'", "2 numbers", "three"]),
+        ('xyz="0.1 0 0"', 'xyz="425 0 0"', ["link 'upper'", "425", "100"]),
+        ('xyz="0 0 0.5"', 'xyz="0 0 x"', ["joint 'one'", "'x'"]),
+        ('xyz="0 0 0.5"', 'quat_xyzw="0 0 0 1"', ["joint 'one'", "'quat_xyzw'", "rpy"]),
+        ('axis xyz="0 0 1"', 'axis xyz="0 0 0"', ["joint 'one'", "no length"]),
+        ('lower="-1"', 'lower="3"', ["joint 'one'", "lower limit is 3", "2"]),
+        ('lower="-1"', 'lower="2"', ["joint 'one'", "'fixed'"]),
+        ('effort="30"', 'effort="-30"', ["joint 'one'", "effort", "-30"]),
+        ('velocity="4"', 'velocity="-4"', ["joint 'one'", "velocity", "-4"]),
+        (LIMIT, LIMIT + '<dynamics damping="-1"/>', ["joint 'one'", "damping", "-1"]),
+        (LIMIT, LIMIT + '<mimic joint="two"/>', ["joint 'one'", "mimic"]),
+        (LIMIT, LIMIT + LIMIT, ["joint 'one'", "2 <limit>"]),
+        ('type="revolute"', 'type="floating"', ["joint 'one'", "floating", "'upper'"]),
+        ('type="revolute"', 'type="revolut"', ["joint 'one'", "'revolut'", "did you mean 'revolute'"]),
+        ('<parent link="base"/>', "", ["joint 'one'", "<parent>"]),
+        ('<parent link="base"/>', '<parent link="bas"/>', ["joint 'one'", "'bas'", "'base'"]),
+        ('<child link="upper"/>', '<child link="lower"/>', ["link 'lower'", "'one'", "'two'"]),
+        ('<parent link="base"/>', '<parent link="lower"/>', ["hangs on itself", "loop"]),
+        ('name="two"', 'name="one"', ["joint 'one'", "two of that name"]),
+        ('name="lower"', 'name="upper"', ["link 'upper'", "two of that name"]),
+        ('name="two"', "", ["joint number 2", "no name"]),
+        ("<robot", "<!DOCTYPE robot><robot", ["line 1", "DOCTYPE"]),
+        ("<robot", "<sdf/><robot", ["line 1", "XML"]),
+        ("</robot>", "", ["line 1", "XML"]),
+        ("robot", "sdf", ["<sdf>", "<robot>"]),
+        ('value="2"', 'value="${mass}"', ["xacro FILE.urdf.xacro > FILE.urdf"]),
+        ("<link", '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"/><link', ["<macro>", "xacro FILE"]),
+    ],
+)
+def test_a_mistake_is_refused_with_its_place_and_the_remedy(old: str, new: str, words: list[str]) -> None:
+    assert old in TWO
+    text = TWO.replace(old, new) if old == "robot" else TWO.replace(old, new, 1)
+    message = refusal(text)
+    assert [word for word in words if word not in message] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "ends", "words"),
+    [
+        (TWO, {"base": "bass"}, ["'bass'", "did you mean 'base'"]),
+        (TWO, {"tip": "lowr"}, ["'lowr'", "did you mean 'lower'"]),
+        (TWO, {"base": "lower", "tip": "upper"}, ["link 'upper'", "not below", "'lower'"]),
+        (TWO, {"base": "upper", "tip": "upper"}, ["'upper'", "0 joints"]),
+        (GRIPPER, {}, ["'finger', 'thumb', 'tcp'", "as tip"]),
+        (robot(link("a"), link("b")), {}, ["'a', 'b'", "as base"]),
+        (robot(link("a")), {}, ["link 'a'", "no joint"]),
+        (robot(), {}, ["no links"]),
+        (GRIPPER, {"tip": "thumb"}, ["joint 'right'", "mimic", "'palm'"]),
+        (GRIPPER.replace("prismatic", "planar"), {"tip": "tcp"}, ["joint 'left'", "planar"]),
+    ],
+)
+def test_ends_that_make_no_arm_are_refused_by_name(text: str, ends: dict, words: list[str]) -> None:
+    message = refusal(text, **ends)
+    assert [word for word in words if word not in message] == []
+
+
+def test_thirteen_joints_are_one_too_many() -> None:
+    def arm(n: int) -> str:
+        edges = [joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(n)]
+        return robot(*edges, *(link(f"l{i}") for i in range(n + 1)))
+
+    assert len(read_urdf(arm(12)).joints) == 12
+    assert "13 joints" in refusal(arm(13))
+
+
+def test_hostile_texts_are_refused_at_once() -> None:
+    bomb = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>\n<robot>&b;</robot>'
+    assert "line 1" in refusal(bomb)
+    deep = "<link>" * 60_000 + "</link>" * 60_000
+    assert "link number 1" in refusal(f"<robot>{deep}</robot>")
+    assert "1000000" in refusal(" " * 1_000_001)
+    assert "line 1" in refusal("<robot>\x00</robot>")
+    assert "XML" in refusal("<robot>\ud800</robot>")
+    long = refusal(TWO.replace('"upper"', f'"{"u" * 5000}"', 1).replace('"lower"', '"x"'))
+    assert len(long) < 400
+    links = "".join(link(f"l{n}") for n in range(2000))
+    ring = "".join(joint(f"j{n}", f"l{n}", f"l{(n + 1) % 2000}") for n in range(2000))
+    assert "loop" in refusal(f"<robot>{links}{ring}</robot>")
+
+
+# Mutations of good files
+
+_NASTY = st.sampled_from(
+    [
+        "",
+        "x",
+        "nan",
+        "-inf",
+        "1e309",
+        "1e-320",
+        "0",
+        "-1",
+        "-0.0",
+        "1 2",
+        "0 0 0",
+        "1,5",
+        "١",
+        "base",
+        "link3",
+    ]
+)
+
+
+def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
+    """One element or attribute dropped, doubled, garbled or scaled."""
+    parents = [e for e in root.iter() if len(e)]
+    parent = data.draw(st.sampled_from(parents))
+    child = data.draw(st.sampled_from(list(parent)))
+    kind = data.draw(st.sampled_from(["drop", "double", "tag", "attribute", "attribute", "number", "number"]))
+    if kind == "drop":
+        parent.remove(child)
+    elif kind == "double":
+        parent.append(copy.deepcopy(child))
+    elif kind == "tag":
+        child.tag = data.draw(st.sampled_from(["inertial", "joint", "link", "mass", "origin", "x"]))
+    elif child.attrib:
+        key = data.draw(st.sampled_from(sorted(child.attrib)))
+        if kind == "number":
+            numbers = child.attrib[key].split()
+            n = data.draw(st.integers(0, len(numbers) - 1)) if numbers else 0
+            factor = data.draw(st.sampled_from([-1.0, 0.0, 1e-9, 0.5, 1.5, 3.0, 1e3, 1e200]))
+            if re.fullmatch(r"-?[\d.e-]+", "".join(numbers[n : n + 1])):
+                numbers[n] = repr(float(numbers[n]) * factor)
+            child.set(key, " ".join(numbers))
+        elif data.draw(st.booleans()):
+            del child.attrib[key]
+        else:
+            child.set(key, data.draw(_NASTY))
+
+
+def garble(text: str, data: st.DataObject) -> str:
+    """A stretch of the text cut out, or characters put in."""
+    start = data.draw(st.integers(0, len(text)))
+    end = data.draw(st.integers(start, min(len(text), start + 80)))
+    return text[:start] + data.draw(st.text('<>/="& \n.0-eé\x00', max_size=4)) + text[end:]
+
+
+def check_physical(chain: UrdfChain) -> None:
+    """A chain that can be: bodies with a positive pseudo-inertia, right-handed frames, limits in order."""
+    assert 1 <= len(chain.joints) <= 12
+    for j in chain.joints:
+        assert all(map(math.isfinite, (*j.axis, *j.origin_m, *j.inertia, j.viscous, j.coulomb)))
+        m, x, y, z, xx, xy, yy, xz, yz, zz = j.inertia
+        c = np.array([x, y, z]) / m
+        moments = np.linalg.eigvalsh(
+            np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - m * (c @ c * np.eye(3) - np.outer(c, c))
+        )
+        assert m > 0.0
+        assert moments[0] > 0.0
+        assert moments[0] + moments[1] >= moments[2] * (1 - 10 * CONSISTENCY)
+        R = np.array(j.rotation)
+        assert np.abs(R @ R.T - np.eye(3)).max() < 1e-14
+        assert np.linalg.det(R) > 0.0
+        assert np.linalg.norm(j.axis) == pytest.approx(1.0, abs=1e-15)
+        assert j.lower < j.upper
+        assert min(j.effort_limit, j.velocity_limit) > 0.0
+        assert min(j.viscous, j.coulomb) >= 0.0
+
+
+@given(data=st.data(), source=st.sampled_from([(ARM6, ""), (ARM7, ""), (GRIPPER, "tcp")]))
+@settings(max_examples=200)
+def test_a_mutated_file_is_refused_with_its_place_or_physical(data: st.DataObject, source: tuple) -> None:
+    text, tip = source
+    if data.draw(st.booleans()):
+        text = garble(text, data)
+    else:
+        root = ElementTree.fromstring(text)
+        mutate(root, data)
+        text = ElementTree.tostring(root, encoding="unicode")
+    try:
+        chain = read_urdf(text, tip=tip)
+    except ScenarioError as error:
+        message = str(error)
+    else:
+        check_physical(chain)
+        return
+    assert re.search(r"\b(link|links|joint|line|tip)\b|<\w+>", message)
+
+
+def test_the_chains_of_the_references_are_physical() -> None:
+    for name, entry in json.loads(PATH.read_text())["chains"].items():
+        check_physical(to_chain(name, entry))
