@@ -27,6 +27,8 @@ from trilat_net.analysis.certificate.energy_balance import EnergyBalance, comput
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
+from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
+from trilat_net.studies.tuning.search_space import build_model_information, select_search_spaces
 from trilat_net.theory import analyse_linear_loop, find_equilibrium, find_linear_edge
 from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
@@ -403,3 +405,44 @@ def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -
 def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
     for words in CERTIFIED:
         check("docs/certificate.md", words, certified(tmp_path))
+
+
+TUNED = re.findall(
+    r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| (\w+ \d.*) \|$",
+    (ROOT / "docs/fair-comparison.md").read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
+AS_PRINTED = {"": [0.0, 0.0, 0.0, 2.0, 1.0], ", told nothing": 0.0}
+ENDS = [
+    pytest.param(n, id=f"{law} {reached}", marks=pytest.mark.long if n < 4 else ())
+    for n, (law, reached, _, _) in enumerate(TUNED)
+]
+
+
+def tuned(duration_s: float, changes: Changes) -> CandidateScore:
+    scenario = load_scenario("free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes})
+    return measure_candidate(scenario.text, None)
+
+
+@pytest.mark.parametrize("row", ENDS)
+def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
+    """Of the tables of docs/fair-comparison.md with gains: four of the error, then four of settling."""
+    assert len(TUNED) == 8
+    law, reached, effort_nm, gains = TUNED[row]
+    (space,) = select_search_spaces([law], load_scenario("free"))
+    values = {name: float(number) for name, number in (gain.split() for gain in gains.split(", "))}
+    controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
+    made = tuned(
+        30.0 if row < 4 else 6.0, {f"sites.{name}.control": table for name, table in controls.items()}
+    )
+    digit = 10.0 ** -len(reached.partition(".")[2])
+    assert (made.error_rad if row < 4 else made.settled_s) == pytest.approx(float(reached), abs=0.6 * digit)
+    assert made.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
+    assert made.outcome == "settled"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("told", AS_PRINTED)
+def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
+    made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
+    check("docs/fair-comparison.md", f"| as printed{told} | {{}} | {{}} |", [made.error_rad, made.effort_nm])
