@@ -36,13 +36,17 @@ $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/dev.lock
 	@touch $@
 
+$(VENV)/robots.stamp: requirements/robots.lock $(VENV)/dev.stamp
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/robots.lock
+	@touch $@
+
 test: pytest live lint
 
 pytest: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
 	$(BIN)/python -m pytest -q -m "live and not long"
 
-test-long: $(VENV)/dev.stamp
+test-long: $(VENV)/robots.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
@@ -68,6 +72,8 @@ lock:
 		pyproject.toml --extra frames --group build -o requirements/runtime.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
+	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		--group robots -c requirements/dev.lock -o requirements/robots.lock
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -31,6 +31,7 @@ CONSISTENCY = 1e-9
 """By so much of the largest principal moment of inertia the physical inequalities may fail, for rounding."""
 LEAST_MASS_KG = 1e-9
 LEAST_MOMENT_KG_M2 = 1e-12
+"""Of a body that moves; of a single link less than it counts as none."""
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -536,18 +537,20 @@ def _check_stated(place: str, mass: float, tensor: Matrix) -> None:
     """Refuses a body that cannot be; points and rods without thickness may."""
     if mass < 0.0:
         _refuse(place, f"its mass is {mass:g} kg, must not be negative")
-    least, middle, most = _principal_moments(tensor)
     if mass == 0.0 and any(map(any, tensor)):
         _refuse(place, "has moments of inertia and no mass: give both, or neither")
-    _check_moments(place, least, middle, most, -CONSISTENCY * abs(most))
+    moments = _principal_moments(tensor)
+    slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
+    _check_moments(place, moments, -slack, slack)
 
 
-def _check_moments(place: str, least: float, middle: float, most: float, bound: float) -> None:
-    """Refuses principal moments of inertia of which the least is below a bound, or against the triangle."""
+def _check_moments(place: str, moments: Sequence[float], bound: float, slack: float) -> None:
+    """Refuses principal moments below a bound, and one that exceeds the two others together."""
+    least, middle, most = moments
     stated = f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
     if least < bound:
         _refuse(place, f"{stated}: all must be positive")
-    if least + middle < most * (1.0 - CONSISTENCY):
+    if most - least - middle > slack:
         _refuse(place, f"{stated}: of a body, no one is more than the two others together")
 
 
@@ -587,8 +590,9 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[BodyParameters]) -> BodyParameter
         _refuse(place, f"has {mass:g} kg with all that is fixed to it: a body that moves needs mass")
     x, y, z = (moment / mass for moment in total[1:4])
     back = _move_body(-mass, _Pose(_UNIT, (x, y, z)), _fill_tensor(total[4:]), _Pose())
-    least, middle, most = _principal_moments(_fill_tensor(back[4:]))
-    _check_moments(place, least, middle, most, max(LEAST_MOMENT_KG_M2, CONSISTENCY * most))
+    moments = _principal_moments(_fill_tensor(back[4:]))
+    slack = CONSISTENCY * moments[2]
+    _check_moments(place, moments, max(LEAST_MOMENT_KG_M2, slack), slack)
     return total
 
 

@@ -1,0 +1,257 @@
+"""Every robot of `example-robot-data` that has a chain, against Pinocchio's reading of the same file.
+
+The packages come with `make test-long` (`requirements/robots.lock`, 0.9 GB); no mesh is opened.
+"""
+
+import functools
+from importlib import metadata
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario.urdf import UrdfChain, read_urdf
+
+pin = pytest.importorskip(
+    "pinocchio", reason="the dependency group 'robots' is not installed: make test-long"
+)
+
+from tests.core.make_chain_references import answer, build_model, random_state  # noqa: E402 - needs Pinocchio
+
+pytestmark = pytest.mark.long
+
+CHAINS = """
+a1_description/urdf/a1.urdf FR_foot:3 FL_foot:3 RR_foot:3 RL_foot:3
+alex_description/urdf/alex_nub_hands.urdf Head:5 leftNub:10 rightNub:10
+alex_description/urdf/alex_psyonic_hands.urdf Torso>Head:2
+alex_description/urdf/alex_sake_hands.urdf Head:5 LeftSakeFingerTip1:11 LeftSakeFingerTip2:11
+    RightSakeFingerTip1:11 RightSakeFingerTip2:11
+alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf LEFT_FOOT_IMU_LINK:6 RIGHT_FOOT_IMU_LINK:6
+anymal_b_simple_description/robots/anymal-kinova.urdf LF_FOOT:3 RF_FOOT:3 LH_FOOT:3 RH_FOOT:3
+    j2s6s200_end_effector:6
+anymal_b_simple_description/robots/anymal.urdf LF_FOOT:3 RF_FOOT:3 LH_FOOT:3 RH_FOOT:3
+anymal_c_simple_description/urdf/anymal.urdf LF_FOOT:3 RF_FOOT:3 LH_FOOT:3 RH_FOOT:3
+asr_twodof_description/urdf/TwoDofs.urdf Tip:2
+b1_description/urdf/b1-z1.urdf FR_foot:3 FL_foot:3 RR_foot:3 RL_foot:3 gripperMover:7
+b1_description/urdf/b1.urdf FR_foot:3 FL_foot:3 RR_foot:3 RL_foot:3
+baxter_description/urdf/baxter.urdf r_gripper_l_finger_tip:8 l_gripper_l_finger_tip:8 right_wrist:7
+borinot_description/urdf/borinot_flying_arm_2.urdf flying_arm_2__ee:2
+centauro_description/urdf/centauro.urdf ball1_tip:7 ball2_tip:7 velodyne_motor:2 D435_head_camera_link:2
+    wheel_1:6 wheel_2:6
+double_pendulum_description/urdf/double_pendulum.urdf link2:2
+double_pendulum_description/urdf/double_pendulum_continuous.urdf link2:2
+double_pendulum_description/urdf/double_pendulum_simple.urdf link3:2
+finger_edu_description/robots/finger_edu.urdf finger_tip_link:3
+g1_description/urdf/g1_29dof_rev_1_0.urdf left_ankle_roll_link:6 right_ankle_roll_link:6
+    left_rubber_hand:10 right_rubber_hand:10
+g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf left_ankle_roll_link:6 right_ankle_roll_link:6
+    left_hand_middle_1_link:12 left_hand_index_1_link:12 right_hand_middle_1_link:12
+    right_hand_index_1_link:12
+go1_description/urdf/go1.urdf FR_foot:3 FL_foot:3 RR_foot:3 RL_foot:3
+go2_description/urdf/go2.urdf FL_foot:3 FR_foot:3 RL_foot:3 RR_foot:3
+hextilt_description/urdf/hextilt_flying_arm_5.urdf flying_arm_5__gripper:5
+human_description/robots/human.urdf left_upperleg_virtual_2>left_foot_virtual:3
+    middle_thorax_virtual_2>left_upperarm_virtual:3
+icub_description/robots/icub.urdf codyco_balancing_world:6 l_forearm_dh_frame:8 r_forearm_dh_frame:8
+    base_link>l_wrist_1:9 base_link>r_wrist_1:9
+icub_description/robots/icub_reduced.urdf codyco_balancing_world:6 l_forearm_dh_frame:8
+    r_forearm_dh_frame:8 base_link>l_wrist_1:9 base_link>r_wrist_1:9
+kinova_description/robots/kinova.urdf j2s6s200_end_effector:6 j2s6s200_link_6:6
+laikago_description/urdf/laikago.urdf FR_foot:3 FL_foot:3 RR_foot:3 RL_foot:3
+panda_description/urdf/panda.urdf panda_leftfinger:8 panda_hand_tcp:7
+panda_description/urdf/panda_collision.urdf panda_leftfinger:8 panda_link0>panda_hand_tcp:7
+pr2_description/urdf/pr2.urdf torso_lift_link>r_wrist_roll_link:7
+    torso_lift_link>l_gripper_l_finger_link:8
+quadruped_description/urdf/quadruped.urdf FL_contact:2 FR_contact:2 BL_contact:2 BR_contact:2
+romeo_description/urdf/romeo.urdf l_sole:6 r_sole:6 gaze:5 l_gripper:8 r_gripper:8
+romeo_description/urdf/romeo_laas_small.urdf torso>r_wrist:7
+romeo_description/urdf/romeo_small.urdf l_sole:6 r_sole:6 torso>l_gripper:7
+simple_humanoid_description/urdf/simple_humanoid.urdf r_ankle:6 l_ankle:6 r_wrist:10 l_wrist:10
+simple_humanoid_description/urdf/simple_humanoid_classical.urdf r_ankle:6 l_ankle:6 r_wrist:10 l_wrist:10
+so_arm_description/urdf/so100.urdf jaw:6
+so_arm_description/urdf/so101.urdf moving_jaw_so101_v1_link:6 gripper_frame_link:5
+solo_description/robots/solo.urdf FL_FOOT:2 FR_FOOT:2 HL_FOOT:2 HR_FOOT:2
+solo_description/robots/solo12.urdf FL_FOOT:3 FR_FOOT:3 HL_FOOT:3 HR_FOOT:3
+talos_data/robots/talos_full_v2.urdf rgbd_optical_frame:4 gripper_left_motor_double_link:10
+    gripper_right_motor_double_link:10 left_sole_link:6 right_sole_link:6
+talos_data/robots/talos_full_v2_box.urdf rgbd_optical_frame:4 gripper_left_motor_double_link:10
+    gripper_right_motor_double_link:10 left_sole_link:6 right_sole_link:6
+talos_data/robots/talos_left_arm.urdf gripper_left_motor_double_link:7 gripper_left_base_link:6
+talos_data/robots/talos_reduced.urdf rgbd_optical_frame:4 gripper_left_motor_double_link:10
+    gripper_right_motor_double_link:10 left_sole_link:6 right_sole_link:6
+talos_data/robots/talos_reduced_box.urdf rgbd_optical_frame:4 gripper_left_motor_double_link:10
+    gripper_right_motor_double_link:10 left_sole_link:6 right_sole_link:6
+talos_data/robots/talos_reduced_corrected.urdf rgbd_optical_frame:4 gripper_left_motor_double_link:10
+    gripper_right_motor_double_link:10 left_sole_link:6 right_sole_link:6
+tiago_description/robots/tiago.urdf xtion_optical_frame:3 hand_thumb_link:9 hand_index_link:9
+    hand_mrl_link:9 torso_lift_link>hand_mrl_link:8 arm_2_link>hand_index_flex_3_link:12
+tiago_description/robots/tiago_dual.urdf wheel_right_link:2 wheel_left_link:2 caster_front_right_2_link:2
+    caster_front_left_2_link:2 caster_back_right_2_link:2 caster_back_left_2_link:2
+tiago_description/robots/tiago_no_hand.urdf xtion_optical_frame:3 wrist_ft_tool_link:8
+tiago_pro_description/robots/tiago_pro.urdf sellion_link:3 gripper_left_outer_finger_left_link:9
+    gripper_right_outer_finger_left_link:9
+ur_description/urdf/ur10_joint_limited_robot.urdf ee_link:6
+ur_description/urdf/ur10_robot.urdf ee_link:6
+ur_description/urdf/ur3_gripper.urdf ee_link:6
+ur_description/urdf/ur3_joint_limited_robot.urdf ee_link:6
+ur_description/urdf/ur3_robot.urdf ee_link:6
+ur_description/urdf/ur5_gripper.urdf ee_link:6
+ur_description/urdf/ur5_joint_limited_robot.urdf ee_link:6
+ur_description/urdf/ur5_robot.urdf ee_link:6 tool0:6
+xarm_description/urdf/xarm7.urdf link_eef:7
+z1_description/urdf/z1.urdf gripperMover:7 gripperStator:6
+"""
+"""File by file its chains as base>end link:joints; without a base, from the root."""
+REFUSED = {
+    "allegro_hand_description/urdf/allegro_left_hand.urdf": ("link_3.0_tip", "'link_3.0'"),
+    "allegro_hand_description/urdf/allegro_right_hand.urdf": ("link_3.0_tip", "'link_3.0'"),
+    "bolt_description/robots/bolt.urdf": ("FL_FOOT", "no mass"),
+    "hector_description/robots/quadrotor_base.urdf": ("", "no joint"),
+    "hyq_description/robots/hyq_no_sensors.urdf": ("lf_foot", "two others together"),
+    "iris_description/robots/iris_simple.urdf": ("", "no joint"),
+    "ur_description/urdf/ur3.urdf": ("", "no links"),
+}
+"""Files without a chain: an end link, and the reason."""
+NO_CHAIN_OF_TWO = {"iris_description/robots/iris.urdf"}
+
+
+def parse_chains() -> list[tuple[str, str, str, int]]:
+    found, file = [], ""
+    for word in CHAINS.split():
+        if word.endswith(".urdf"):
+            file = word
+        else:
+            ends, _, n = word.rpartition(":")
+            base, _, tip = ends.rpartition(">")
+            found.append((file, base, tip, int(n)))
+    return found
+
+
+@functools.cache
+def robot_files() -> dict[str, Path]:
+    """The files of the package by their path in its folder of robots."""
+    files = [str(file) for file in metadata.files("example-robot-data") or () if file.suffix == ".urdf"]
+    places = {
+        name.partition("/robots/")[2]: metadata.distribution("example-robot-data").locate_file(name)
+        for name in files
+    }
+    return {name: Path(str(place)) for name, place in places.items()}
+
+
+def read_robot(file: str) -> str:
+    """The text of a file; a joint with the name of a link is renamed, as Pinocchio has one list of frames."""
+    root = ElementTree.parse(robot_files()[file]).getroot()
+    links = {link.get("name") for link in root.findall("link")}
+    for joint in root.findall("joint"):
+        for element, key in ((joint, "name"), *((mimic, "joint") for mimic in joint.findall("mimic"))):
+            if element.get(key) in links:
+                element.set(key, f"{element.get(key)} joint")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def parsed_model(text: str, chain: UrdfChain) -> pin.Model:
+    """Pinocchio's model of the file, all joints but the chain's held at zero."""
+    whole = pin.buildModelFromXML(text)
+    kept = {joint.name for joint in chain.joints}
+    held = [whole.getJointId(name) for name in whole.names[1:] if name not in kept]
+    return pin.buildReducedModel(whole, held, pin.neutral(whole))
+
+
+def test_every_file_is_in_the_list() -> None:
+    listed = {file for file, *_ in parse_chains()} | REFUSED.keys() | NO_CHAIN_OF_TWO
+    assert listed == robot_files().keys()
+
+
+@pytest.mark.parametrize(("file", "tip", "reason"), [(file, *why) for file, why in REFUSED.items()])
+def test_a_file_without_a_chain_is_refused_with_the_reason(file: str, tip: str, reason: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        read_urdf(robot_files()[file].read_text(), tip=tip)
+    assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize(("file", "base", "tip", "n"), parse_chains())
+def test_a_chain_is_what_pinocchio_reads(file: str, base: str, tip: str, n: int) -> None:
+    """Bodies, frames, limits; then M, torque, pose and Jacobian of the model rebuilt from the chain."""
+    text = read_robot(file)
+    chain = read_urdf(text, base, tip)
+    model = parsed_model(text, chain)
+    assert [joint.name for joint in chain.joints] == list(model.names)[1:]
+    assert len(chain.joints) == model.nv == n
+    check_joints(chain, model)
+    rebuilt = build_model(chain)
+    data = model.createData()
+    frame, foot = model.getFrameId(chain.tip), model.getFrameId(chain.base)
+    random = np.random.default_rng(n)
+    for first in (True, False):
+        state = random_state(random, n, first)
+        q = pin.integrate(model, pin.neutral(model), state["q"])
+        pin.framesForwardKinematics(model, data, q)
+        base_pose, tip_pose = data.oMf[foot].copy(), data.oMf[frame].copy()
+        R = base_pose.rotation
+        ours = answer(rebuilt, chain, state | {"v": state["qd"]})
+        relative = base_pose.inverse() * tip_pose
+        assert near(ours["tip_position"], relative.translation, 1e-12)
+        assert near(ours["tip_rotation"], relative.rotation, 1e-12)
+        jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, n)
+        assert near(ours["jacobian"], np.vstack([R.T @ jacobian[:3], R.T @ jacobian[3:]]), 1e-12)
+        model.gravity.linear = R @ state["gravity"]
+        torque = pin.rnea(model, data, q, state["qd"], state["a"])
+        assert near(ours["inverse_dynamics"], torque, 1e-12)
+        inertia = np.triu(pin.crba(model, data, q).reshape(n, n))
+        inertia += np.triu(inertia, 1).T
+        assert near(ours["inertia"], inertia, 1e-12)
+        acceleration = pin.aba(model, data, q, state["qd"], state["tau"])
+        bound = 100 * np.finfo(float).eps * np.linalg.cond(inertia)
+        assert near(ours["forward_dynamics"], acceleration, max(bound, 1e-12))
+
+
+def check_joints(chain: UrdfChain, model: pin.Model) -> None:
+    for i, joint in enumerate(chain.joints):
+        body = model.inertias[i + 1].toDynamicParameters()
+        assert near(joint.inertia, body, 1e-12), joint.name
+        if "RUB" not in model.joints[i + 1].shortname():  # a continuous one has no limits
+            at = model.joints[i + 1].idx_q
+            limits = model.lowerPositionLimit[at], model.upperPositionLimit[at]
+            if any(limits) and abs(limits[0]) < 1e9:
+                assert (joint.lower, joint.upper) == limits
+        stated = model.upperEffortLimit[i], model.upperVelocityLimit[i]
+        for ours, theirs in zip((joint.effort_limit, joint.velocity_limit), stated, strict=True):
+            assert ours == (theirs or np.inf)
+        assert (joint.viscous, joint.coulomb) == (model.damping[i], model.upperDryFrictionLimit[i])
+
+
+def near(a: object, b: object, tolerance: float) -> bool:
+    """Relative to the largest entry."""
+    a, b = np.asarray(a), np.asarray(b)
+    return bool(np.abs(a - b).max() <= tolerance * max(np.abs(b).max(), 1e-3))
+
+
+def test_pinocchio_says_of_the_stored_references_what_is_stored() -> None:
+    """The file of references is that of its script."""
+    from tests.core.chain_references import chain_references
+
+    for chain, states in chain_references().values():
+        model = build_model(chain)
+        for state in states:
+            for key, value in answer(model, chain, state._asdict()).items():
+                assert near(value, getattr(state, key), 1e-12), key
+
+
+def test_the_torque_of_two_velocities_is_the_christoffel_one() -> None:
+    """Linear in v, equal to Pinocchio's where v is qd, and dM/dt = C + C'."""
+    from tests.core.chain_references import chain_references
+
+    for chain, (state, *_) in chain_references().values():
+        model, n = build_model(chain), len(chain.joints)
+        asked = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
+
+        def C(v, model=model, chain=chain, asked=asked):
+            return answer(model, chain, asked | {"v": v})["inverse_dynamics"]
+
+        matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
+        assert near(matrix @ state.v, C(state.v), 1e-12)
+        h = 1e-6
+        ends = [answer(model, chain, asked | {"q": state.q + s * h * state.qd})["inertia"] for s in (1, -1)]
+        assert near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)
