@@ -13,6 +13,9 @@ import pytest
 from tests.log.test_session_check import split
 from tests.log_editing import edited, recorded
 from tests.log_surgery import repacked, taken_apart
+from trilat_net.log.log_reader import open_log
+from trilat_net.reporting import page
+from trilat_net.reporting.conclude import conclude
 
 from .running import trilat
 
@@ -107,3 +110,15 @@ def test_the_table_says_what_is_said(state: str, command: str, tmp_path: Path) -
 
 def test_the_table_has_every_state() -> None:
     assert {state for state, _ in ROWS} == {*MADE, "part"}
+
+
+def test_a_report_asks_for_the_coverage_that_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine tenths of the records of m1 are there: enough where half is asked for."""
+    monkeypatch.setattr(page, "write_report", lambda *_, verdicts, **__: [*verdicts][:0])
+    file = tmp_path / "run.mcap"
+    file.write_bytes(MADE["sparse"]())
+    found = conclude(open_log(file), tmp_path, min_coverage=0.5)
+    assert {line.label: line.passed for line in found.lines}["records"]
+    assert not any("less than 99.9 %" in note for note in found.notes)

@@ -28,7 +28,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""
     shipped = load_scenario(name)
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
-    assert measured(name, {"control.d": d, "duration_s": 40.0}).trend is EnvelopeTrend.GROWS
+    assert measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend is EnvelopeTrend.GROWS
 
 
 def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
@@ -37,8 +37,8 @@ def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -
     alpha = np.array([[row[i].get(j, 0.0) for j in row] for i in row])
     assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
     changes = {"dominance": row, "duration_s": 40.0}
-    assert measured("p_d_margin", {**changes, "control.d": 1.4}).trend is EnvelopeTrend.GROWS
-    assert measured("p_d_margin", {**changes, "control.d": 1.8}).trend is EnvelopeTrend.DECAYS
+    assert measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend is EnvelopeTrend.GROWS
+    assert measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend is EnvelopeTrend.DECAYS
 
 
 def test_half_of_the_margin_grows_to_10_rad() -> None:
@@ -54,7 +54,7 @@ def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
 def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
-    assert (jitter.trend, constant.trend) == (EnvelopeTrend.DECAYS, EnvelopeTrend.GROWS)
+    assert (jitter.end.error.trend, constant.end.error.trend) == (EnvelopeTrend.DECAYS, EnvelopeTrend.GROWS)
     assert peak(jitter) == printed(0.022, 0.001)
     assert peak(constant) == printed(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]

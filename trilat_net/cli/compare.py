@@ -168,7 +168,8 @@ def _print_tuned(found: "TuningResult") -> None:
             )
     if not any(law.front for law in found.found):
         terminal.out.print(
-            "\nno candidate of any law settled: a longer --duration or a larger --budget may show more"
+            "\nno candidate of any law is stable and at the pose: a longer --duration or a larger --budget "
+            "may show more"
         )
         return
     terminal.out.print("\nthe last of each front, to run; front.md has the others:")

@@ -14,6 +14,7 @@ def report_command(
     folder: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Default: FILE without .mcap.")
     ] = None,
+    min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
 ) -> None:
     """Writes the figures, the page and the summary of a log."""
@@ -24,7 +25,7 @@ def report_command(
     terminal.warn_user_laws(log, needed=False)
     results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
     with terminal.progress_bar("drawing") as progress:
-        conclusion = conclude(log, results, progress)
+        conclusion = conclude(log, results, progress, min_coverage=min_coverage)
     terminal.print_conclusion(conclusion)
     if not conclusion.passed:
         raise typer.Exit(1)

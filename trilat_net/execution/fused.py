@@ -27,6 +27,7 @@ from ..errors import ScenarioError
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
 from ..scenario.operators import Wall
+from ..scenario.validate import refuse_external_arms
 
 
 def check_fusable(scenario: Scenario) -> None:
@@ -36,14 +37,8 @@ def check_fusable(scenario: Scenario) -> None:
         ScenarioError: an arm is external, a law is written in Python, or a site is so much slower than
             another that too many samples would arrive in one of its ticks.
     """
+    refuse_external_arms(scenario)
     for name, spec in scenario.sites.items():
-        if spec.plant == "external":
-            raise ScenarioError(
-                "is external: that arm is outside of the program, and such a scenario runs live only; "
-                "plant = 'simulated' runs it in virtual time",
-                path=f"sites.{name}.plant",
-                source=scenario.name,
-            )
         if isinstance(spec.control, ImportedLaw):
             raise ScenarioError(
                 f"{spec.control.code} is a law in Python, which the compiled loop cannot call",

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from .. import process
 from ..core.site_step import Site
 from ..core.ticks import NS_PER_S, Arrival, CoreChange, Mode, PlantState, TickInput, TickRecord
-from ..errors import LawFailed, ScenarioError
+from ..errors import LawFailed
 from ..log.log_file import LogFile
 from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
@@ -25,6 +25,7 @@ from ..net.loop_stats import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
+from ..scenario.validate import refuse_external_arms
 from .site_channels import SiteChannels, SiteEntry, describe_accounts
 from .virtual_network import Network, PromptNetwork
 
@@ -51,22 +52,12 @@ def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
     Raises:
         ScenarioError: an arm is external, or a user law cannot be made, or its file has another hash.
     """
-    _refuse_external(scenario, {})
+    refuse_external_arms(scenario)
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
             if as_named:
                 spec.control.check_unchanged(name)
             Site(scenario.setup(name))
-
-
-def _refuse_external(scenario: Scenario, measured: PlantSchedule) -> None:
-    for name in scenario.external:
-        if name not in measured:
-            raise ScenarioError(
-                "is external: that arm is outside of the program, and virtual time has none; run it live, or "
-                "simulate it with plant = 'simulated'",
-                path=f"sites.{name}.plant",
-            )
 
 
 def execute_virtual(
@@ -86,7 +77,7 @@ def execute_virtual(
         ScenarioError: an arm is external and `measured` lacks it.
         LawFailed: a user law failed.
     """
-    _refuse_external(scenario, measured)
+    refuse_external_arms(scenario, measured)
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     sites = [Site(scenario.setup(name)) for name in scenario.names]
     ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]

@@ -14,6 +14,7 @@ from ..errors import LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import CheckLine, check_log_files
 from ..execution.verify import find_last_ticks
 from ..execution.virtual_comparison import simulate_without_operators
+from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
@@ -40,7 +41,9 @@ class Conclusion(NamedTuple):
         return all(line.passed for line in self.lines)
 
 
-def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclusion:
+def conclude(
+    log: Log, folder: Path, progress: Progress | None = None, *, min_coverage: float = MIN_COVERAGE
+) -> Conclusion:
     """Verifies a log from a file, and writes figures, page and summary into a folder that exists.
 
     Raises:
@@ -52,9 +55,9 @@ def conclude(log: Log, folder: Path, progress: Progress | None = None) -> Conclu
 
     lines: list[CheckLine] = []
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
-        checking = pool.submit(check_log_files, log.sources)
+        checking = pool.submit(check_log_files, log.sources, min_coverage)
         twin = _run_without_operators(log)
-        certificate = certify_with_roots(log)
+        certificate = certify_with_roots(log, min_coverage=min_coverage)
         judgement = f"certificate: {describe_judgement(certificate)}; {certificate.verdict.text}"
         notes = [*format_run_lines(log), judgement]
 

@@ -7,7 +7,7 @@ refused before anything runs, with the reason.
 import functools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import get_args
 
@@ -33,6 +33,39 @@ from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 FORCE_REFLECTION_SITES = 2
 """Sites of direct force reflection: one master, one slave."""
+
+
+def refuse_external_arms(scenario: Scenario, given: Collection[str] = ()) -> None:
+    """Refuses arms outside of the program, but for those of sites whose motion is given.
+
+    Raises:
+        ScenarioError: an arm is external.
+    """
+    for name in scenario.external:
+        if name not in given:
+            raise ScenarioError(
+                "is external: that arm is outside of the program, and such a scenario runs live only; "
+                "plant = 'simulated' runs it in virtual time",
+                path=f"sites.{name}.plant",
+                source=scenario.name,
+            )
+
+
+def refuse_live_only(scenario: Scenario) -> None:
+    """Refuses what a live session alone has: arms outside of the program, and delays of a real network.
+
+    Raises:
+        ScenarioError: an arm is external, or a link is measured, which in virtual time would be one tick.
+    """
+    refuse_external_arms(scenario)
+    if scenario.measured:
+        links = (f"links.{name}.model" for name, link in scenario.links.items() if link.measured)
+        raise ScenarioError(
+            "is measured: that is the delay of a real network, and such a scenario runs live only; give it a "
+            "model, as in link.model=constant and link.delay_ms=50",
+            path=next(links, "timeline"),
+            source=scenario.name,
+        )
 
 
 def check_law(name: str, site: SiteSpec, sites: int) -> None:

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import process
+from ..analysis.run_end import NO_BUCKETS, reduce_to_buckets
 from ..core.site_step import Site
-from ..core.ticks import NS_PER_S, Mode, TickRecord
+from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..execution import virtual
@@ -51,6 +52,11 @@ class RecordBatch(NamedTuple):
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
         """Returns the records from one time to another, which is no longer of them."""
         return self._part(*np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist())
+
+    def reduce(self, into: Array = NO_BUCKETS) -> Array:
+        """Returns the buckets of a judgement with these records added, see `reduce_to_buckets`."""
+        bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
+        return reduce_to_buckets(bucket, self.q - self.q_des, self.qd, self.q, into)
 
     def _part(self, first: int, last: int | None) -> "RecordBatch":
         return RecordBatch._make(column[first:last] for column in self)

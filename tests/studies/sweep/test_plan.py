@@ -131,7 +131,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
     assert "paper: sites.s.plant: is external" in outside
     assert "live only" in outside
     measured = refused("paper", "link.model=measured", over=["control.Kd=1,2"])
-    assert "paper: link.model: a measured link has the delay of a real network" in measured
+    assert "model: is measured: that is the delay of a real network" in measured
     assert "link.model=constant" in measured
 
 

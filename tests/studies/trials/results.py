@@ -4,7 +4,7 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.analysis.run_end import EndBehaviour, EnvelopeTrend, Stability
+from trilat_net.analysis.run_end import EndBehaviour, EnvelopeFit, EnvelopeTrend, RunEnd
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.studies.trials.expectations import ExpectationResult
 from trilat_net.studies.trials.measure_run import LinkAge, RunMetrics
@@ -35,14 +35,10 @@ mean_age_max_ms = 100.0
 TOO_MUCH = {"expect.mean_age_max_ms": 1.0}
 """An override that nothing meets."""
 
+FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
 CALM = RunMetrics(
     simulated_s=20.0,
-    diverged_at_s=None,
-    stability=Stability.STABLE,
-    behaviour=EndBehaviour.DECAYS,
-    reasons=(),
-    trend=EnvelopeTrend.DECAYS,
-    rate_per_s=-0.2,
+    end=RunEnd(EndBehaviour.DECAYS, FIT, FIT, 0.003, 0.02),
     synchronised_at_s=11.0,
     peak_error_rad=0.9,
     rms_error_rad=0.1,

@@ -79,7 +79,7 @@ def test_the_figures_are_what_their_definitions_say() -> None:
     assert 0.0 < max(apart) < 2.4
     assert found.synchronised_at_s == max(apart)
     assert found.ages["m1->s"].mean_ms == found.ages["m1->s"].max_ms == 20.0
-    assert (found.late_samples, found.missing, found.diverged_at_s) == (0, 0, None)
+    assert (found.late_samples, found.missing, found.end.diverged_at_s) == (0, 0, None)
 
 
 def test_what_never_came_together_has_no_time_of_it() -> None:
@@ -94,8 +94,8 @@ def test_a_link_without_samples_has_no_age() -> None:
 
 def test_a_run_that_diverged_says_when() -> None:
     found = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
-    assert found.diverged_at_s is not None
-    assert found.simulated_s == pytest.approx(found.diverged_at_s, abs=0.01)
+    assert found.end.diverged_at_s is not None
+    assert found.simulated_s == pytest.approx(found.end.diverged_at_s, abs=0.01)
     assert found.missing == 0
 
 
@@ -140,7 +140,8 @@ def test_the_cut_into_blocks_changes_no_statistics_of_a_site(seed: int, cuts: li
     assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
     assert cut.buckets.tolist() == whole.buckets.tolist()
     assert cut.rms_error_rad == pytest.approx(whole.rms_error_rad)
-    assert cut.mean_age_ms == pytest.approx(whole.mean_age_ms)
+    for one, other in zip(cut.link_ages, whole.link_ages, strict=True):
+        assert one.mean_ms == pytest.approx(other.mean_ms)
     end, end_of_whole = cut.end(cut.last_ns), whole.end(whole.last_ns)
     assert all(np.array_equal(a, b) for a, b in zip(end, end_of_whole, strict=True))
 
@@ -158,7 +159,7 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     assert tally.apart_ns == (apart[-1] if apart else -1)
     assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
-    assert tally.mean_age_ms[1] == pytest.approx(np.mean(ages))
+    assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
     assert tally.age_max_ms[1] == pytest.approx(max(ages))
     for bucket, row in enumerate(tally.buckets):
         inside = rows.t_ns // BUCKET_NS == bucket
@@ -178,7 +179,7 @@ def test_a_link_that_never_had_a_sample_has_no_age() -> None:
     rows = records(1)
     rows.used[:, 1] = -1
     assert tallied(rows, [])._age_records[1] == 0
-    assert tallied(rows, []).mean_age_ms[1] is None
+    assert tallied(rows, []).link_ages[1].mean_ms is None
 
 
 def test_a_bucket_without_records_says_so() -> None:

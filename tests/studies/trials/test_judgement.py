@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.analysis.run_end import Stability
+from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.expect import ExpectWindow
 from trilat_net.studies.trials.expectations import ExpectationResult, evaluate_expectations
@@ -86,17 +86,31 @@ def test_a_link_without_samples_meets_no_limit_of_age() -> None:
 
 
 @pytest.mark.parametrize("stable", [True, False])
-@pytest.mark.parametrize("stability", list(Stability))
-def test_stable_asks_for_the_judgement_and_open_is_neither(stability: Stability, stable: bool) -> None:
-    outcome = only(Expect(stable=stable), stability=stability, reasons=("a reason",))
+@pytest.mark.parametrize(
+    ("behaviour", "stability"),
+    [
+        (EndBehaviour.DECAYS, Stability.STABLE),
+        (EndBehaviour.HARDLY, Stability.OPEN),
+        (EndBehaviour.BOUNDED, Stability.NOT_STABLE),
+    ],
+)
+def test_stable_asks_for_the_judgement_and_open_is_neither(
+    behaviour: EndBehaviour, stability: Stability, stable: bool
+) -> None:
+    end = CALM.end._replace(behaviour=behaviour)
+    outcome = only(Expect(stable=stable), end=end)
     wanted = Stability.STABLE if stable else Stability.NOT_STABLE
     assert outcome.held is (stability is wanted)
-    assert outcome.measured == f"{stability}: decaying, |e| -0.2/s; a reason"
+    assert outcome.measured == f"{stability}: {end.text}"
+    assert only(Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))).measured.startswith(
+        "open: "
+    )
 
 
 @pytest.mark.parametrize("stable", [None, True, False])
 def test_a_run_that_diverged_fails_unless_that_was_expected(stable: bool | None) -> None:
-    outcome = only(Expect(stable=stable), stability=Stability.NOT_STABLE, diverged_at_s=3.25)
+    end = CALM.end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=3.25)
+    outcome = only(Expect(stable=stable), end=end)
     assert outcome.held == (stable is False)
     assert "3.25 s" in outcome.measured
 

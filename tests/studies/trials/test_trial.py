@@ -69,8 +69,8 @@ def test_a_trial_that_fails_says_what_by_how_much_and_how_to_repeat_it(quick_fil
     assert lines[1].startswith("mean_age_max_ms: ")
     assert lines[1].endswith(" ms, asked ≤ 1 ms")
     assert lines[2:] == [
-        f"trilat test {quick_file} --seeds 7 --set expect.mean_age_max_ms=1.0",
-        f"trilat sim {quick_file} --seed 7 -o quick-seed7.mcap --set expect.mean_age_max_ms=1.0",
+        f"trilat test {quick_file} --seeds 7 --set expect.mean_age_max_ms=1",
+        f"trilat sim {quick_file} --seed 7 -o quick-seed7.mcap --set expect.mean_age_max_ms=1",
     ]
 
 
@@ -92,7 +92,7 @@ def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) ->
 
 def test_a_table_as_an_override_is_told_key_by_key() -> None:
     (trial,) = trilat_net.trials(quick(), set=CONSTANT)
-    assert shlex.split(trial.again)[-4:] == ["--set", 'link.model="constant"', "--set", "link.delay_ms=60.0"]
+    assert shlex.split(trial.again)[-4:] == ["--set", 'link.model="constant"', "--set", "link.delay_ms=60"]
 
 
 def test_a_scenario_in_memory_is_called_by_a_file_that_it_could_be_saved_in() -> None:

@@ -98,8 +98,8 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
 @pytest.mark.parametrize(
     ("setting", "word"),
     [
-        ("link.model=measured", "links.m2->m1: is measured: the network would decide"),
-        ("sites.m2.plant=external", "sites.m2.plant: is an arm outside of the program"),
+        ("link.model=measured", "links.m2->m1.model: is measured: that is the delay of a real network"),
+        ("sites.m2.plant=external", "sites.m2.plant: is external: that arm is outside of the program"),
     ],
 )
 def test_what_only_runs_live_is_refused(setting: str, word: str) -> None:

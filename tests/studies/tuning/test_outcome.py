@@ -5,50 +5,58 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.analysis.run_end import EndBehaviour, EnvelopeFit, EnvelopeTrend, RunEnd, Stability
 from trilat_net.api import simulate
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.tuning.final_posture import (
     CLASS_MEANINGS,
     CandidateClass,
-    CandidateEnd,
     check_final_posture,
     classify_candidate,
 )
 
 from .experiments import trio
 
-CALM = CandidateEnd(0.0, 0.0, 0.0, 0.0)
+FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
+CALM = RunEnd(EndBehaviour.CONVERGED, FIT, FIT, 0.0, 0.0)
+
+
+def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
+    return CALM._replace(behaviour=behaviour, **more)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("ending", "trend", "outcome"),
+    ("end", "fall_rad", "apart_rad", "outcome"),
     [
-        (CALM, EnvelopeTrend.DECAYS, CandidateClass.SETTLED),
-        (CALM, EnvelopeTrend.UNDECIDED, CandidateClass.SETTLED),
-        (CALM, EnvelopeTrend.GROWS, CandidateClass.OSCILLATED),
-        (CALM._replace(swing_rad=0.03), EnvelopeTrend.STEADY, CandidateClass.OSCILLATED),
-        (CALM._replace(swing_rad=0.03), EnvelopeTrend.DECAYS, CandidateClass.SETTLED),
-        (CALM._replace(fall_rad=1.6), EnvelopeTrend.DECAYS, CandidateClass.STRAYED),
-        (CALM._replace(fall_rad=1.6, spread_rad=0.5), EnvelopeTrend.DECAYS, CandidateClass.STRAYED),
-        (CALM._replace(fall_rad=0.1, ahead_rad=0.3), EnvelopeTrend.DECAYS, CandidateClass.STRAYED),
-        (CALM._replace(spread_rad=0.5), EnvelopeTrend.DECAYS, CandidateClass.APART),
+        (CALM, 0.0, 0.0, CandidateClass.SETTLED),
+        (ended(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
+        (ended(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
+        (CALM, 1.6, 0.5, CandidateClass.STRAYED),
+        (ended(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
+        (CALM, 0.1, 0.5, CandidateClass.APART),
     ],
 )
-def test_the_first_that_holds_is_the_outcome(
-    ending: CandidateEnd, trend: EnvelopeTrend, outcome: CandidateClass
+def test_the_class_is_the_judgement_of_the_run_and_the_pose(
+    end: RunEnd, fall_rad: float, apart_rad: float, outcome: CandidateClass
 ) -> None:
-    assert classify_candidate(False, trend, ending, ending) is outcome
-    assert classify_candidate(True, trend, ending, ending) is CandidateClass.DIVERGED
+    assert classify_candidate((end, end), fall_rad, apart_rad) is outcome
+    assert classify_candidate((end, CALM), fall_rad, apart_rad) is outcome
+    assert classify_candidate((CALM, end), fall_rad, apart_rad) is outcome
 
 
-def test_pose_is_judged_on_the_twin_and_swinging_on_both() -> None:
-    pushed = CandidateEnd(spread_rad=0.5, fall_rad=1.0, ahead_rad=1.0, swing_rad=0.0)
-    assert classify_candidate(False, EnvelopeTrend.STEADY, pushed, CALM) is CandidateClass.SETTLED
-    hammering = CALM._replace(swing_rad=0.2)
-    assert classify_candidate(False, EnvelopeTrend.STEADY, hammering, CALM) is CandidateClass.OSCILLATED
-    assert classify_candidate(False, EnvelopeTrend.STEADY, CALM, hammering) is CandidateClass.OSCILLATED
+def test_a_class_that_the_judgement_decides_bears_its_word() -> None:
+    words = {one: one.word for one in CandidateClass}
+    assert words[CandidateClass.SETTLED] == Stability.STABLE
+    assert words[CandidateClass.OSCILLATED] == Stability.NOT_STABLE
+    assert words[CandidateClass.OPEN] == Stability.OPEN
+    assert len(set(words.values())) == len(words)
 
 
 def test_every_outcome_has_a_meaning() -> None:

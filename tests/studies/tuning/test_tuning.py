@@ -194,7 +194,7 @@ def test_the_page_tells_procedure_search_and_commands(found: TuningResult, writt
 
 def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
     table = tabulate_laws(found)
-    places = [table.headers.index(outcome.value) for outcome in CandidateClass]
+    places = [table.headers.index(outcome.word) for outcome in CandidateClass]
     for row in table.rows:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 6
 

@@ -9,7 +9,7 @@ from operator import attrgetter
 
 import msgspec
 
-from ...analysis.run_end import EnvelopeTrend, Stability
+from ...analysis.run_end import Stability
 from ...scenario import Expect
 from .measure_run import RunMetrics
 
@@ -54,16 +54,10 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    wanted = expect.stable is not False
-    diverged = metrics.diverged_at_s is not None
-    if expect.stable is None and not diverged:
-        return
-    found = f"diverged at {metrics.diverged_at_s:.4g} s" if diverged else metrics.behaviour.value
-    rate = metrics.rate_per_s if metrics.trend in (EnvelopeTrend.GROWS, EnvelopeTrend.DECAYS) else None
-    text = f"{metrics.stability}: {found}" + ("" if rate is None or diverged else f", |e| {rate:+.3g}/s")
-    asked = Stability.STABLE if wanted else Stability.NOT_STABLE
-    held = metrics.stability is asked
-    yield ExpectationResult("stable", held, "; ".join([text, *metrics.reasons]), str(wanted).lower())
+    wanted, end = expect.stable is not False, metrics.end
+    if expect.stable is not None or end.diverged_at_s is not None:
+        held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
+        yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
 
 
 _UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N"}

@@ -16,13 +16,9 @@ import numpy as np
 from ...analysis.arm_rows import compute_end_effector
 from ...analysis.run_end import (
     NO_BUCKETS,
-    EndBehaviour,
-    EnvelopeTrend,
     RunEnd,
     RunTrace,
-    Stability,
     classify_run_end,
-    reduce_to_buckets,
 )
 from ...analysis.torque_sources import wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
@@ -154,8 +150,7 @@ class SiteStats:
         if len(apart):
             self.apart_ns = int(rows.t_ns[apart[-1]])
         self._add_ages(rows)
-        bucket = rows.t_ns // _BUCKET_NS
-        self._buckets = reduce_to_buckets(bucket, rows.q - rows.q_des, rows.qd, rows.q, self._buckets)
+        self._buckets = rows.reduce(self._buckets)
         for stretch in filter(None, self.stretches):
             stretch.add(rows)
         self._tail.append(rows)
@@ -181,11 +176,14 @@ class SiteStats:
         return float(np.sqrt(self._squares.max() / max(1, self.records)))
 
     @property
-    def mean_age_ms(self) -> list[float | None]:
-        """Per peer the mean age of the sample in use, ms; None where there never was one."""
+    def link_ages(self) -> list["LinkAge"]:
+        """Per peer the age of the sample in use; None where there never was one."""
+        rows = zip(
+            self._age_sum_ms.tolist(), self._age_records.tolist(), self.age_max_ms.tolist(), strict=True
+        )
         return [
-            float(total / records) if records else None
-            for total, records in zip(self._age_sum_ms, self._age_records, strict=True)
+            LinkAge(total / records, most) if records else LinkAge(None, None)
+            for total, records, most in rows
         ]
 
     def end(self, end_ns: int) -> RecordBatch:
@@ -213,20 +211,14 @@ class LinkAge(msgspec.Struct, frozen=True):
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     """One run, measured; the docstring of `Expect` defines every metric.
 
-    `stability`, `behaviour` and `reasons` are the judgement of `analysis.run_end`, `trend` and `rate_per_s`
-    those of |e| of its worst joint. None stands for what the run cannot give: too short, or it did not come
-    to it. `end_...` is of the last second, `ages` has links "j->i", `late_samples` came too late for what
-    their link meant to do with them, `missing` counts ticks without a record, and a window has no quantities
-    where the run ended before it did.
+    `end` is its judgement. None stands for what the run cannot give: too short, or it did not come to it.
+    `end_...` is of the last second, `ages` has links "j->i", `late_samples` came too late for what their link
+    meant to do with them, `missing` counts ticks without a record, and a window has no quantities where the
+    run ended before it did.
     """
 
     simulated_s: float
-    diverged_at_s: float | None
-    stability: Stability
-    behaviour: EndBehaviour
-    reasons: tuple[str, ...]
-    trend: EnvelopeTrend
-    rate_per_s: float | None
+    end: RunEnd
     synchronised_at_s: float | None
     peak_error_rad: float | None
     rms_error_rad: float | None
@@ -253,7 +245,8 @@ def compute_run_metrics(
     ran = {name: tally for name, tally in tallies.items() if tally.records}
     whole = len(ran) == len(tallies)
     end_ns = max((tally.last_ns for tally in ran.values()), default=0)
-    end = _judge(scenario, tallies, diverged_at_s)
+    found = tallies.values()
+    trace = RunTrace([one.buckets for one in found], [one.tau_x for one in found], diverged_at_s)
     span_s = [tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz for name, tally in ran.items()]
     apart_ns = [tally.apart_ns for tally in ran.values()]
     synchronised = whole and not any(tally.apart_ns == tally.last_ns for tally in ran.values())
@@ -264,12 +257,7 @@ def compute_run_metrics(
 
     return RunMetrics(
         simulated_s=max(span_s, default=0.0),  # to the end of the period that follows the last tick
-        diverged_at_s=diverged_at_s,
-        stability=end.stability,
-        behaviour=end.behaviour,
-        reasons=end.reasons,
-        trend=end.error.trend,
-        rate_per_s=None if np.isnan(end.error.rate_per_s) else end.error.rate_per_s,
+        end=classify_run_end(scenario, trace),
         synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
         peak_error_rad=largest("peak_error_rad"),
         rms_error_rad=largest("rms_error_rad"),
@@ -280,24 +268,15 @@ def compute_run_metrics(
         end_pose_rad={name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()},
         peak_torque_nm=largest("peak_torque_nm"),
         peak_speed_rad_s=largest("peak_speed_rad_s"),
-        ages=_link_ages(scenario, tallies),
+        ages={
+            f"{peer}->{name}": age
+            for name, tally in tallies.items()
+            for peer, age in zip(scenario.peers(name), tally.link_ages, strict=True)
+        },
         late_samples=late_samples,
         missing=missing,
-        windows=tuple(
-            _window_ranges([t.stretches[n] for t in tallies.values()])
-            for n in range(len(scenario.expect.windows))
-        ),
+        windows=tuple(map(_window_ranges, zip(*(tally.stretches for tally in found), strict=True))),
     )
-
-
-def _link_ages(scenario: Scenario, tallies: Mapping[str, SiteStats]) -> dict[str, LinkAge]:
-    return {
-        f"{peer}->{name}": LinkAge(mean_ms, None if mean_ms is None else float(max_ms))
-        for name, tally in tallies.items()
-        for peer, mean_ms, max_ms in zip(
-            scenario.peers(name), tally.mean_age_ms, tally.age_max_ms, strict=True
-        )
-    }
 
 
 def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
@@ -310,12 +289,6 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
         for key in ALL_SITES_QUANTITIES
         if all(key in part for part in parts)
     }
-
-
-def _judge(scenario: Scenario, tallies: Mapping[str, SiteStats], diverged_at_s: float | None) -> RunEnd:
-    found = tallies.values()
-    trace = RunTrace([one.buckets for one in found], [one.tau_x for one in found], diverged_at_s)
-    return classify_run_end(scenario, trace)
 
 
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:

@@ -9,8 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tomli_w
-
 from ...errors import LawFailed, LogError, ScenarioError
 from ...execution import virtual
 from ...execution.verify import verify
@@ -19,7 +17,7 @@ from ...net.clock import SystemClock
 from ...scenario import Scenario, load_scenario
 from ...scenario.fields import is_distribution
 from ...scenario.scenario_reader import reseed_scenario
-from ..commands import format_command, set_options
+from ..commands import format_command, format_toml_value, set_options
 from .expectations import ExpectationResult, evaluate_expectations
 from .measure_run import RunMetrics, measure_log, measure_virtual_run
 
@@ -160,16 +158,7 @@ def _assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str
         if isinstance(value, Mapping) and not is_distribution(value):
             yield from _assignments(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}={_one_line(value)}"
-
-
-def _one_line(value: Any) -> str:
-    """Returns a value as TOML on one line."""
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_one_line, value))}]"
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key} = {_one_line(entry)}' for key, entry in value.items())}}}"
-    return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
+            yield f"{prefix}{key}={format_toml_value(value)}"
 
 
 def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float) -> TrialResult:

@@ -4,33 +4,26 @@ Invariant: a candidate's scenario is loaded through the same settings that its c
 score is a function of the scenario alone: None for the errors of a run that does not reach its end.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from ...analysis.run_end import EnvelopeTrend, fit_envelope
+from ...analysis.run_end import RunEnd, RunTrace, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
-from ...log.record_columns import Ints
 from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.scenario_types import SiteSpec
-from ..commands import format_command, set_options
+from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
-from ..record_batches import RecordBatch, run_in_batches
-from .final_posture import (
-    CandidateClass,
-    CandidateEnd,
-    build_twin,
-    classify_candidate,
-    compute_consensus_pose,
-)
+from ..record_batches import RecordBatch, join_batches, run_in_batches
+from .final_posture import CandidateClass, build_twin, classify_candidate, compute_consensus_pose
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 
@@ -38,7 +31,7 @@ class CandidateScore(msgspec.Struct, frozen=True):
     """One candidate, measured; the formulas stand in docs/fair-comparison.md.
 
     Attributes:
-        outcome: what became of the run.
+        outcome: its class.
         error_rad: RMS distance of the arms from where they ought to be; None where the run diverged.
         spread_rad: the part of it that is the arms' distance from each other, at one instant, undelayed.
         pose_rad: the part of it that is the distance of their mean from the pose.
@@ -85,10 +78,10 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
     """Runs a candidate and its twin, and returns its score."""
     run = _run(parse_scenario(text))
     alone = run if twin_text is None else _run(parse_scenario(twin_text))
-    diverged_s = run.diverged_s if run.diverged_s is not None else alone.diverged_s
-    outcome = classify_candidate(diverged_s is not None, run.trend, run.ending, alone.ending)
-    if diverged_s is not None:
-        return CandidateScore(outcome, None, None, None, None, None, run.saturated, diverged_s)
+    outcome = classify_candidate((run.end, alone.end), alone.fall_rad, alone.apart_rad)
+    diverged_s = [end.diverged_at_s for end in (run.end, alone.end) if end.diverged_at_s is not None]
+    if diverged_s:
+        return CandidateScore(outcome, None, None, None, None, None, run.saturated, diverged_s[0])
     error_rad = float(np.hypot(run.spread_rad, alone.pose_rad))
     return CandidateScore(
         outcome, error_rad, run.spread_rad, alone.pose_rad, run.effort_nm, run.settled_s, run.saturated
@@ -96,54 +89,43 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
 
 
 class _Run(NamedTuple):
-    """What is measured of one run."""
+    """What is measured of one run; `fall_rad` and `apart_rad` as `classify_candidate` takes them."""
 
-    trend: EnvelopeTrend
-    ending: CandidateEnd
+    end: RunEnd
+    fall_rad: float
+    apart_rad: float
     spread_rad: float
     pose_rad: float
     effort_nm: float
     settled_s: float | None
     saturated: float
-    diverged_s: float | None
-
-
-class _Record(NamedTuple):
-    """One site's run: time, shape (K,), ns; q, q_des and tau, shape (K, n)."""
-
-    t_ns: Ints
-    q: Array
-    q_des: Array
-    tau: Array
 
 
 def _run(scenario: Scenario) -> _Run:
-    kept: dict[str, list[_Record]] = {name: [] for name in scenario.names}
-
-    def keep(name: str) -> Callable[[RecordBatch], None]:
-        return lambda rows: kept[name].append(_Record(rows.t_ns, rows.q, rows.q_des, rows.tau))
-
-    diverged_s = run_in_batches(scenario, {name: keep(name) for name in kept}).diverged_at_s
-    records = [_Record(*map(np.concatenate, zip(*rows, strict=True))) for rows in kept.values()]
+    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+    diverged_s = run_in_batches(scenario, {name: kept[name].append for name in kept}).diverged_at_s
+    records = list(map(join_batches, kept.values()))
+    trace = RunTrace([one.reduce() for one in records], [one.tau_x[-1] for one in records], diverged_s)
     t_s, q, e = _aligned(records)
     mean = q.mean(axis=0)
     apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
+    last = t_s > t_s[-1] - END_WINDOW_S
     largest = np.abs(e).max(axis=(0, 2))
     apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
     efforts, saturated = zip(*map(_effort, records, scenario.sites.values()), strict=True)
     return _Run(
-        trend=fit_envelope(t_s, largest).trend,
-        ending=_ending(t_s, apart, off, e),
+        end=classify_run_end(scenario, trace),
+        fall_rad=float(np.abs(off[last].mean(axis=0)).max()),
+        apart_rad=float(np.abs(apart[:, last]).max()),
         spread_rad=_rms(apart),
         pose_rad=_rms(off),
         effort_nm=float(np.sqrt(np.mean(efforts))),
         settled_s=float(apart_at_s) if largest[-1] < SETTLED_ERROR_RAD else None,
         saturated=float(np.mean(saturated)),
-        diverged_s=diverged_s,
     )
 
 
-def _aligned(records: list[_Record]) -> tuple[Array, Array, Array]:
+def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
     """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape (N, K, n)."""
     end_ns = min(record.t_ns[-1] for record in records)
     slowest = min((record.t_ns for record in records), key=len)
@@ -154,7 +136,7 @@ def _aligned(records: list[_Record]) -> tuple[Array, Array, Array]:
     return at_ns / NS_PER_S, q, q - q_des
 
 
-def _effort(record: _Record, site: SiteSpec) -> tuple[float, float]:
+def _effort(record: RecordBatch, site: SiteSpec) -> tuple[float, float]:
     """Returns the mean square of tau - G(q), (N m)^2, and the share of torques at the clamp."""
     arm = site.arm
     inner, outer = arm.g_m_s2 * arm.theta[3:, np.newaxis] * np.cos(np.cumsum(record.q, axis=1).T)
@@ -165,20 +147,6 @@ def _effort(record: _Record, site: SiteSpec) -> tuple[float, float]:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _ending(t_s: Array, apart: Array, off: Array, e: Array) -> CandidateEnd:
-    """Returns what the last second shows, and how the mean pose came there in the second half."""
-    last = t_s > t_s[-1] - END_WINDOW_S
-    half_s = 0.5 * t_s[-1]
-    middle = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
-    end, before = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
-    return CandidateEnd(
-        spread_rad=float(np.abs(apart[:, last]).max()),
-        fall_rad=float(end.max()),
-        ahead_rad=float((end + 2.0 * np.maximum(end - before, 0.0)).max()),
-        swing_rad=float(np.ptp(e[:, last], axis=1).max()),
-    )
 
 
 class CandidateTask(NamedTuple):
@@ -210,11 +178,11 @@ class TuningScenario(NamedTuple):
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
         """Returns the same with the control of every site replaced, in as few settings as say it."""
-        single = [f"sites.{name}.control={_inline(table)}" for name, table in controls.items()]
+        single = [f"sites.{name}.control={format_toml_value(table)}" for name, table in controls.items()]
         wanted = load_scenario(self.source, [*self.overrides, *single])
         first = next(iter(controls.values()))
         if all(table == first for table in controls.values()):
-            texts = (*self.overrides, f"control={_inline(first)}")
+            texts = (*self.overrides, f"control={format_toml_value(first)}")
             with suppress(ScenarioError):  # a site has gains of its own, which are none of this law
                 scenario = load_scenario(self.source, texts)
                 if scenario.sites == wanted.sites:
@@ -228,16 +196,21 @@ class TuningScenario(NamedTuple):
         return self.with_controls(space.controls(self.scenario, knowledge, gains))
 
     @property
-    def task(self) -> CandidateTask:
-        """What has to be run to measure it."""
+    def texts(self) -> tuple[str, str | None]:
+        """The canonical texts of its scenario and of its twin."""
         alone = build_twin(self.scenario)
-        name = ", ".join(self.overrides) or self.source
-        return CandidateTask(((self.scenario.text, None if alone is None else alone.text),), name)
+        return self.scenario.text, None if alone is None else alone.text
 
     @property
     def command(self) -> str:
         """The command that makes a log of it."""
         return format_command("sim", self.source, *set_options(self.overrides))
+
+
+def build_candidate_task(seeds: Sequence[TuningScenario]) -> CandidateTask:
+    """Returns what has to be run to measure one candidate, given with every seed."""
+    name = ", ".join(seeds[0].overrides) or seeds[0].source
+    return CandidateTask(tuple(one.texts for one in seeds), name)
 
 
 def load_tuning_scenario(source: str | Path, overrides: Sequence[str] = ()) -> TuningScenario:
@@ -247,14 +220,3 @@ def load_tuning_scenario(source: str | Path, overrides: Sequence[str] = ()) -> T
         ScenarioError: there is none.
     """
     return TuningScenario(str(source), tuple(overrides), load_scenario(source, overrides))
-
-
-def _inline(value: Any) -> str:
-    """Returns a value as TOML on one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_inline(entry)}" for key, entry in value.items()) + "}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_inline, value))}]"
-    if isinstance(value, str):
-        return f'"{value}"'
-    return f"{value:g}" if float(f"{value:g}") == value else repr(value)

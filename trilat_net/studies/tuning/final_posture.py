@@ -7,19 +7,20 @@ at site i, since sum_i beta_i tau_i = 0 in statics. After they let go it stays. 
 walls ask for no pose: such a scenario is judged on its twin, the same without them.
 
 Invariant: no gain and no control law enters the pose. A run has exactly one class, and only a settled one may
-stand on a front; arms that hang, however well together, have strayed. An arm hangs if both links point down
+stand on a front: one that is stable by the judgement of every run (`analysis.run_end`), at the pose. Arms
+that hang, however well together, have strayed. An arm hangs if both links point down
 at the end and did not at the start; arms fell if their mean ends more than 0.2 rad from the pose in a log
 without a push that could explain it.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
-from ...analysis.run_end import EnvelopeTrend, points_down
+from ...analysis.run_end import EndBehaviour, RunEnd, Stability, points_down
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...errors import ScenarioError
@@ -27,6 +28,7 @@ from ...log.log_reader import Log
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from ...scenario.operators import JointSpring, Wall
+from ...scenario.validate import refuse_live_only
 
 CONFLICT_RAD = 0.02
 """Operators whose targets are further from the consensus than this hold the arms apart."""
@@ -39,22 +41,7 @@ def check_comparable(scenario: Scenario) -> None:
     Raises:
         ScenarioError: says why, and what would be right.
     """
-    for name, site in scenario.sites.items():
-        if site.plant == "external":
-            raise ScenarioError(
-                "is an arm outside of the program: it is there live only, and tuning runs in virtual time; "
-                'take plant = "simulated"',
-                path=f"sites.{name}.plant",
-                source=scenario.name,
-            )
-    if scenario.measured:
-        links = (f"links.{name}" for name, link in scenario.links.items() if link.measured)
-        raise ScenarioError(
-            "is measured: the network would decide, differently for every law; give it a model, as in "
-            "--set link.model=constant --set link.delay_ms=200",
-            path=next(links, "timeline"),
-            source=scenario.name,
-        )
+    refuse_live_only(scenario)
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
         words = " and ".join(", ".join(scenario.names[site] for site in group) for group in groups)
@@ -132,68 +119,55 @@ STRAYED_RAD = 0.2
 """Arms whose mean is further than this from where they ought to be fell, hang, or were thrown there."""
 TOGETHER_RAD = 0.02
 """Arms no further than this from their mean are together."""
-SWING_RAD = 0.02
-"""An error that goes up and down by more than this within the last second still swings."""
 
 
 class CandidateClass(StrEnum):
-    """What became of a run, in the order in which it is asked; the text is the word for people."""
+    """Class of a candidate, from the worst to the best, in the order in which it is asked; as in JSON."""
 
     DIVERGED = "diverged"
     OSCILLATED = "oscillated"
     STRAYED = "strayed"
     APART = "apart"
+    OPEN = "open"
     SETTLED = "settled"
+
+    @property
+    def word(self) -> str:
+        """The word for people: that of the judgement, where the judgement decides."""
+        words = {CandidateClass.OSCILLATED: Stability.NOT_STABLE, CandidateClass.SETTLED: Stability.STABLE}
+        return words.get(self, self).value
 
 
 CLASS_MEANINGS = {
-    CandidateClass.DIVERGED: "a joint left the speed limit",
-    CandidateClass.OSCILLATED: f"the envelope of |e| grows, or e still swings by more than {SWING_RAD} rad",
+    CandidateClass.DIVERGED: "not stable: a joint left the speed limit",
+    CandidateClass.OSCILLATED: "it swings on, drifts or grows",
     CandidateClass.STRAYED: f"the mean pose ends more than {STRAYED_RAD} rad from where a weightless "
-    "consensus stands, or would after as long again: the arms fell, hang, sink, or were thrown there",
+    "consensus stands: the arms fell, hang, sink, or were thrown there",
     CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all",
-    CandidateClass.SETTLED: "none of these",
+    CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may tell",
+    CandidateClass.SETTLED: "it converged or decays, and none of these holds",
 }
-"""What the outcomes mean; they speak of the last second."""
+"""What the classes mean, as far as the judgement of a run (docs/definitions.md) does not say it."""
 
 
-class CandidateEnd(NamedTuple):
-    """The last second of a run.
-
-    Attributes:
-        spread_rad: largest distance of a joint from the mean of the sites.
-        fall_rad: largest distance, over joints, of the mean pose from where it ought to be.
-        ahead_rad: the same after as long again, at the pace at which it grew in the second half of the run.
-        swing_rad: largest e less the smallest e, of the worst site and joint.
-    """
-
-    spread_rad: float
-    fall_rad: float
-    ahead_rad: float
-    swing_rad: float
-
-
-def classify_candidate(
-    diverged: bool, trend: EnvelopeTrend, ending: CandidateEnd, alone: CandidateEnd
-) -> CandidateClass:
-    """Returns the outcome of a run.
+def classify_candidate(ends: Sequence[RunEnd], fall_rad: float, apart_rad: float) -> CandidateClass:
+    """Returns the class of a candidate.
 
     Args:
-        diverged: whether it, or its twin, left its limits.
-        trend: of the envelope of its largest |e|.
-        ending: how it ended.
-        alone: how its twin ended; where it has none, the same.
+        ends: the judgements of its run and of its twin; where it has none, the same twice.
+        fall_rad: largest distance, over joints, of the twin's mean pose of the last second from q*.
+        apart_rad: largest distance of a joint from the mean of the sites in that second.
     """
-    if diverged:
+    found = {end.stability for end in ends}
+    if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
         return CandidateClass.DIVERGED
-    swings = max(ending.swing_rad, alone.swing_rad) > SWING_RAD and trend is not EnvelopeTrend.DECAYS
-    if trend is EnvelopeTrend.GROWS or swings:
+    if Stability.NOT_STABLE in found:
         return CandidateClass.OSCILLATED
-    if max(alone.fall_rad, alone.ahead_rad) > STRAYED_RAD:
+    if fall_rad > STRAYED_RAD:
         return CandidateClass.STRAYED
-    if alone.spread_rad > TOGETHER_RAD:
+    if apart_rad > TOGETHER_RAD:
         return CandidateClass.APART
-    return CandidateClass.SETTLED
+    return CandidateClass.OPEN if Stability.OPEN in found else CandidateClass.SETTLED
 
 
 _SHORT_S = 0.5

@@ -2,8 +2,8 @@
 
 Invariant: the gains tried are a function of the seed, the search space and the scores of earlier rounds;
 their number is the budget. Half is a Latin hypercube in the logarithm of the gains (McKay, Beckman and
-Conover, Technometrics 21, 1979), half refinement of its front. Both objectives are minimised, only
-settled runs compete, and of equal ones the first stays.
+Conover, Technometrics 21, 1979), half refinement of its front. Both objectives are minimised, only stable
+runs at the pose compete, and of equal ones the first stays.
 """
 
 from collections.abc import Sequence

@@ -18,6 +18,7 @@ from .candidate import (
     CandidateScore,
     CandidateTask,
     TuningScenario,
+    build_candidate_task,
     load_tuning_scenario,
     measure_candidate_task,
 )
@@ -65,7 +66,7 @@ class SearchResult(NamedTuple):
 
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
-        """How many runs came to each outcome, all of them counted."""
+        """How many candidates are of each class, all of them counted."""
         return {outcome: sum(score.outcome is outcome for score in self.scores) for outcome in CandidateClass}
 
 
@@ -104,7 +105,7 @@ class TuningPlan(NamedTuple):
     def task(self, space: SearchSpace, gains: GainValues) -> CandidateTask:
         """Returns a candidate to be run, with every seed."""
         bases = (self.base, *self.others)
-        return _join_tasks([base.with_gains(space, self.knowledge, gains).task for base in bases])
+        return build_candidate_task([base.with_gains(space, self.knowledge, gains) for base in bases])
 
     def estimate_s(self, jobs: int | None = None) -> float:
         """Returns about how long the search will take, s: by a short run of the experiment."""
@@ -150,9 +151,8 @@ class TuningPlan(NamedTuple):
                     for gains in batch
                 ]
                 if number == 0:
-                    tasks += [
-                        _join_tasks([found[name].task for found in (printed, *of_others)]) for name in printed
-                    ]
+                    named = [[found[name] for found in (printed, *of_others)] for name in printed]
+                    tasks += map(build_candidate_task, named)
                 scores = iter(pool.map(measure_candidate_task, tasks, show))
                 done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):
@@ -164,11 +164,6 @@ class TuningPlan(NamedTuple):
             found.append(SearchResult(search.space, search.tried, search.scores, front))
         paper = [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)]
         return TuningResult(self, found, paper)
-
-
-def _join_tasks(tasks: Sequence[CandidateTask]) -> CandidateTask:
-    """Returns one candidate from its tasks of several seeds."""
-    return tasks[0]._replace(runs=tuple(run for task in tasks for run in task.runs))
 
 
 _EDGE = 1.02

@@ -4,7 +4,7 @@ Files: front.json, front.md, front.png, front.pdf.
 
 Invariant: a function of the result alone, without a clock: equal plans give equal bytes; the JSON is the
 result, the others are views of it. Heads carry the unit, and every run is counted in some column. Every
-settled run is drawn, on a front or not; the gains that the paper prints are stars and stand on no front.
+stable run at the pose is drawn, on a front or not; the gains that the paper prints are stars, on no front.
 """
 
 import json
@@ -33,7 +33,7 @@ from .tuning_plan import MAX_BUDGET, SearchResult, TuningPlan, TuningResult
 def tabulate_laws(tuned: TuningResult) -> TextTable:
     """Returns a row per law: what became of its candidates, and the two ends of its front."""
     value = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
-    heads = ("law", "tried", *(outcome.value for outcome in reversed(CandidateClass)), "front", "of all")
+    heads = ("law", "tried", *(one.word for one in reversed(CandidateClass)), "front", "of all")
     return TextTable(
         (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}"),
         [_law_row(tuned, found) for found in tuned.found],
@@ -87,8 +87,8 @@ def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUD
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     """Returns a row for each way to take the gains that the paper prints."""
-    rows = [(one.name, one.score.outcome.value, *_score_cells(one.score)) for one in tuned.printed]
-    return TextTable(("law", "outcome", *_SCORE_HEADS), rows, align="llr")
+    rows = [(one.name, one.score.outcome.word, *_score_cells(one.score)) for one in tuned.printed]
+    return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
 
 _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s", "clamped %")
@@ -124,13 +124,13 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     if plan.objective is Objective.SETTLING:
         lines.append("sought: the time from which the largest |e| stays below 0.01 rad, against effort")
     if plan.twin:
-        lines.append("pose and outcome are judged on the twin without torques that have no target, and walls")
+        lines.append("the pose is judged on the twin without torques that have no target, and walls")
     return lines
 
 
 def list_class_meanings() -> list[str]:
-    """Returns what the outcomes mean, a line each, in the order in which they are asked."""
-    return [f"{outcome.value}: {text}" for outcome, text in CLASS_MEANINGS.items()]
+    """Returns what the classes mean, a line each, in the order in which they are asked."""
+    return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
 
 def build_tuning_page(tuned: TuningResult) -> str:
@@ -140,7 +140,7 @@ def build_tuning_page(tuned: TuningResult) -> str:
         f"# {scenario.name}: laws compared fairly",
         "\n".join(f"- {line}" for line in describe_procedure(tuned.plan)),
         tabulate_laws(tuned).markdown(),
-        "Outcomes, the first that holds:",
+        "Classes, the first that holds:",
         "\n".join(f"- {line}" for line in list_class_meanings()),
         "## Searched",
         tabulate_search(tuned.plan).markdown(),
@@ -150,7 +150,10 @@ def build_tuning_page(tuned: TuningResult) -> str:
     for found in tuned.found:
         commands = [tuned.candidate(found, place).command for place in found.front]
         front = [tabulate_front(tuned, found).markdown(), _block(commands)]
-        parts += [f"### {found.space.law}", *(front if found.front else ["None of its candidates settled."])]
+        parts += [
+            f"### {found.space.law}",
+            *(front if found.front else ["None of its candidates is stable and at the pose."]),
+        ]
     parts += ["## As printed", tabulate_paper_gains(tuned).markdown()]
     parts += [_block([one.candidate.command for one in tuned.printed])]
     return "\n\n".join(parts) + "\n"
@@ -247,7 +250,7 @@ def draw_front(tuned: TuningResult) -> Figure:
         axes.tick_params(labelsize=_SIZE_PT)
         shown = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
         if not shown:
-            style.annotate_empty_panel(axes, "no candidate settled")
+            style.annotate_empty_panel(axes, "no stable candidate at the pose")
         elif min(shown) > 0.0:
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
@@ -261,7 +264,7 @@ def draw_front(tuned: TuningResult) -> Figure:
 
 
 def _draw_law(axes: Axes, tuned: TuningResult, found: SearchResult) -> Line2D:
-    """Draws a law's settled runs faintly and its front on top; returns its entry of the legend."""
+    """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
     place = list(SEARCH_SPACES).index(found.space.law)
     colour, mark = style.SITE_COLOURS[place % len(style.SITE_COLOURS)], _MARKS[place % len(_MARKS)]
     settled = _points(tuned, found, range(len(found.scores)))
@@ -289,7 +292,7 @@ def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
         if point is not None:
             axes.plot([point[1]], [point[0]], **look)
         outcome = one.score.outcome
-        reason = "never" if outcome is CandidateClass.SETTLED else outcome.value
+        reason = "never" if outcome is CandidateClass.SETTLED else outcome.word
         label = one.name if point is not None else f"{one.name} ({reason})"
         entries.append(Line2D([], [], label=label, **look))
     return entries
