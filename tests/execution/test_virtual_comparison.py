@@ -8,7 +8,7 @@ from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, delivered
 from tests.log_editing import edited, opened, recorded
 from trilat_net.execution.virtual_comparison import (
     compare_with_virtual,
-    find_late_samples,
+    find_absent_samples,
     simulate_without_operators,
 )
 from trilat_net.log.log_reader import Log
@@ -44,7 +44,7 @@ def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(delays: dict[Sam
 
 def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
     log = opened_delivered({("m2", 1, 40): 25})
-    (late,) = find_late_samples(log)
+    (late,) = find_absent_samples(log)
     assert late == ("m2", "s", 40, 60, 65)
     assert str(late) == "sample 40 of s was due at tick 60 of m2 and came at tick 65"
     twins = compare_with_virtual(log)

@@ -6,7 +6,7 @@ import pytest
 
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
-from trilat_net.execution.virtual_comparison import find_late_samples
+from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.log.log_reader import open_log
 from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
@@ -84,7 +84,7 @@ def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(st
     session.processes["m2"].signal(signal.SIGCONT)
     log = session.is_reproduced()
     assert max(log["m2"].late_us) > 800_000
-    assert find_late_samples(log) == []
+    assert find_absent_samples(log) == []
 
 
 @pytest.mark.long

@@ -163,7 +163,7 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     assert (result.lossless, result.finished, result.missing) == (True, True, [])
     assert result.output == tmp_path / "run.recovered.mcap"
     assert messages(saved) == messages(data)
-    assert result.sites == {"m1": 120, "m2": 120, "s": 120}
+    assert result.coverage.judged == {"m1": 120, "m2": 120, "s": 120}
     old, new = (make_reader(io.BytesIO(each)) for each in (data, saved))
     assert list(old.iter_attachments()) == list(new.iter_attachments())
     before, after = ({e.name: e.metadata for e in each.iter_metadata()} for each in (old, new))

@@ -108,14 +108,15 @@ def _recovery_json(result: "Recovery") -> dict[str, object]:
         "finished": result.finished,
         "lossless": result.lossless,
         "messages": result.messages,
-        "records": result.sites,
+        "records": result.coverage.judged,
         "duration_s": result.duration_s,
         "salvaged_messages": result.salvaged,
         "lost_bytes": result.lost_bytes,
         "lost": result.lost,
         "missing": result.missing,
         "coverage": {
-            site: {"records": there, "ticks": ticks} for site, (there, ticks) in result.coverage.items()
+            site: {"records": there, "ticks": ticks}
+            for site, (there, ticks) in result.coverage.to_json().items()
         },
         "digest_chain": str(result.chain) or None,
     }
@@ -125,9 +126,9 @@ def _print_recovery(result: "Recovery") -> None:
     how = "was finished" if result.finished else "was not finished"
     terminal.print_text(f"{result.output}: made of {result.path}, which {how}")
     rows = []
-    if result.sites:
-        rows.append(("records", ", ".join(f"{site} {count}" for site, count in result.sites.items())))
-        rows.append(("of the run", "; ".join(result.coverage_texts())))
+    if there := result.coverage.judged:
+        rows.append(("records", ", ".join(f"{site} {count}" for site, count in there.items())))
+        rows.append(("of the run", str(result.coverage)))
         rows.append(("source", f"digest chain {result.chain}"))
     rows.append(("messages", f"{result.messages} in {result.duration_s:.3f} s"))
     for name, lines in (("lost", result.lost), ("missing", result.missing)):

@@ -50,7 +50,7 @@ class LogCheckReport(NamedTuple):
             "unjudged": result.unjudged,
             "coverage": result.coverage.share,
             "min_coverage": result.min_coverage,
-            "judged": {site: [result.judged.get(site, 0), n] for site, n in result.expected.items()},
+            "judged": result.coverage.to_json(),
             "integrity": result.integrity.state.name.lower(),
             "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
             "first_difference": None
@@ -106,25 +106,24 @@ def _checks(
         if why and log.driver != "virtual":
             yield CheckLine("plain virtual time", f"is another run: {why}", True)
             return
-        late = f"{len(twins.late)} late samples" + (f", the first: {twins.late[0]}" if twins.late else "")
-        lost = f"; {len(twins.lost)} lost on the way, the first: {twins.lost[0]}" if twins.lost else ""
-        yield _virtual_line(f"plain virtual time ({late}{lost})", twins.plain, twins.excused_from)
+        late, gone = twins.late, twins.lost
+        came = f"{len(late)} late samples" + (f", the first: {late[0]}" if late else "")
+        lost = f"; {len(gone)} lost on the way, the first: {gone[0]}" if gone else ""
+        yield _virtual_line(f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from)
 
 
 def _records_line(log: Log, result: VerifyResult) -> CheckLine:
-    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    have = sum(len(log[name]) for name in log.sites)
+    have, coverage = sum(len(log[name]) for name in log.sites), result.coverage
+    made = {event.member for event in log.events if event.kind == "end"}
     silent = [name for name in log.sites if name not in made]
-    text = (
-        f"{have}/{sum(result.expected.values())} in the file; {result.coverage.describe(result.min_coverage)}"
-    )
+    text = f"{have}/{sum(coverage.expected.values())} in the file; {coverage.describe(result.min_coverage)}"
     if silent:
         text += f"; {', '.join(silent)} did not report the number of its ticks"
     if log.damaged:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    passed = result.coverage.share >= result.min_coverage and not log.damaged
+    passed = coverage.share >= result.min_coverage and not log.damaged
     return CheckLine("records", text, passed)
 
 

@@ -23,7 +23,7 @@ from ..scenario import Scenario
 from .difference import RecordDifference, equal_bits, equal_record, find_first_difference
 from .rerun_request import RerunRequest
 from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, read_output
-from .verify import PROGRESS_EVERY, find_last_ticks
+from .verify import PROGRESS_EVERY
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
 
@@ -165,7 +165,6 @@ class RerunExecution:
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
         self._log, self._request = log, request
-        self._ends = find_last_ticks(log)
         self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}
         samples: dict[str, Mapping[int, ReceivedMotion]] = {
             name: log[name].by_tick for name in request.recorded
@@ -177,7 +176,7 @@ class RerunExecution:
                 request.scenario,
                 log[name],
                 self.deliveries[name],
-                RecordedInputs(log[name], samples, self._ends, log.commands(name)),
+                RecordedInputs(log[name], samples, log.last_ticks, log.commands(name)),
                 changed=bool(request.changes),
             )
             for name in request.replaced
@@ -189,7 +188,7 @@ class RerunExecution:
             return recorded_deliveries(part)
         before = [original.sites[peer].rate_hz for peer in part.peers]
         after = [scenario.sites[peer].rate_hz for peer in part.peers]
-        found = complete_deliveries(part, before, [self._ends[peer] for peer in part.peers])
+        found = complete_deliveries(part, before, [self._log.last_ticks[peer] for peer in part.peers])
         rate_hz = scenario.sites[name].rate_hz
         if (part.rate_hz, before) == (rate_hz, after):
             return found

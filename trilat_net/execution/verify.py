@@ -21,14 +21,9 @@ from ..core.fingerprint import compute_fingerprint
 from ..core.site_step import MAX_CHANGES, Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
-from ..log.integrity import (
-    MIN_COVERAGE,
-    NOT_JUDGED,
-    Coverage,
-    Integrity,
-    count_expected_ticks,
-    judge_integrity,
-)
+from ..log.accounting import Coverage
+from ..log.digest_chain import Integrity
+from ..log.integrity import MIN_COVERAGE, judge_integrity
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
@@ -52,35 +47,29 @@ class VerifyResult:
 
     Attributes:
         whole_run: True if whole runs were executed and bits compared; False if tick by tick, to 1e-9.
-        unjudged: records behind gaps that could not be judged.
-        first: the first difference, by tick and then by site.
-        gaps: missing ticks: (site, first, last).
-        judged, expected: ticks by site: those that were executed and compared, and those of the run.
+        coverage: ticks by site: those that were executed and compared, and those of the run.
         min_coverage: the least share of them that passes.
         integrity: whether the log is as it was made.
+        unjudged: records behind gaps that could not be judged.
+        first: the difference of the earliest tick.
+        gaps: missing ticks: (site, first, last).
     """
 
     whole_run: bool
+    coverage: Coverage
+    min_coverage: float
+    integrity: Integrity
     records: int = 0
     identical: int = 0
     unjudged: int = 0
     differing: int = 0
     first: RecordDifference | None = None
     gaps: list[tuple[str, int, int]] = field(default_factory=list)
-    judged: dict[str, int] = field(default_factory=dict)
-    expected: dict[str, int] = field(default_factory=dict)
-    min_coverage: float = MIN_COVERAGE
-    integrity: Integrity = NOT_JUDGED
 
     @property
     def agreed(self) -> bool:
         """True if no record differs, however few were judged."""
         return self.first is None
-
-    @property
-    def coverage(self) -> Coverage:
-        """How much of the run was judged."""
-        return Coverage(self.judged, self.expected)
 
     @property
     def passed(self) -> bool:
@@ -92,15 +81,18 @@ class VerifyResult:
         for name in ("records", "identical", "unjudged", "differing", "gaps"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.whole_run &= other.whole_run
-        self.judged |= other.judged
-        self.first = self.first or other.first
+        self.coverage.judged.update(other.coverage.judged)
+        self._keep_first(other.first)
         if not other.integrity.passed:
             self.integrity = other.integrity
 
     def add_difference(self, difference: RecordDifference) -> None:
         """Counts a record that differs."""
         self.differing += 1
-        if self.first is None or difference.tick < self.first.tick:
+        self._keep_first(difference)
+
+    def _keep_first(self, difference: RecordDifference | None) -> None:
+        if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
 
@@ -170,16 +162,8 @@ class SiteVerifier:
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
-        result, name = self._result, self._log.name
-        before = result.records - result.unjudged
-        last = self._run(report)
-        result.judged[name] = result.records - result.unjudged - before
-        if last < self._own_end:
-            result.gaps.append((name, last + 1, self._own_end))
-
-    def _run(self, report: Callable[[int], None] | None) -> int:
-        """Executes every record; returns the last tick that has one, or -1."""
         result, states, name = self._result, self._log.states, self._log.name
+        before = result.records - result.unjudged
         expected = 0
         for n, state in enumerate(states):
             if report is not None and n % PROGRESS_EVERY == 0:
@@ -207,7 +191,9 @@ class SiteVerifier:
             except LawFailed as failed:
                 self._law_failed = True
                 result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
-        return expected - 1
+        result.coverage.judged[name] = result.records - result.unjudged - before
+        if expected <= self._own_end:
+            result.gaps.append((name, expected, self._own_end))
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
         """Returns the difference of a record that another start, or another site, made; else None."""
@@ -298,7 +284,7 @@ def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = 
 def _begin(log: Log, min_coverage: float) -> VerifyResult:
     return VerifyResult(
         whole_run=log.session.get("fingerprint") == compute_fingerprint(),
-        expected=count_expected_ticks(log),
+        coverage=Coverage({}, {site: log.expected_ticks(site) for site in log.sites}),
         min_coverage=min_coverage,
         integrity=judge_integrity(log),
     )
@@ -308,9 +294,8 @@ def _execute_sites(
     log: Log, sites: Sequence[str], result: VerifyResult, report: Callable[[int], None] | None = None
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
-    ends = find_last_ticks(log)
     for name in sites:
-        SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, ends, result).run(report)
+        SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
@@ -336,26 +321,3 @@ def open_rerun_source(log: Log) -> Log | None:
                 return None
     source = open_log(*files)
     return source if source.sites == log.sites else None
-
-
-def find_last_ticks(log: Log) -> dict[str, int]:
-    """Returns the last tick that each site is known to have made, -1 if none is known.
-
-    The event at its end tells; without one, its records and those of its peers.
-    """
-    most = {name: log.scenario.ticks(name) for name in log.sites}
-    announced = {
-        event.member: min(max(event.ticks, 0), most[event.member]) - 1
-        for event in log.events
-        if event.kind == "end" and event.member in most
-    }
-    last = {name: max((state.tick for state in log[name].states[-1:]), default=-1) for name in log.sites}
-    for name in log.sites:
-        peers = log[name].peers
-        if announced.keys() >= set(peers):
-            continue
-        for state in log[name].states:
-            for peer, tick, _ in state.rx:
-                if 0 <= peer < len(peers) and tick < most[peers[peer]]:
-                    last[peers[peer]] = max(last[peers[peer]], tick)
-    return {name: announced.get(name, known) for name, known in last.items()}

@@ -17,7 +17,6 @@ from ..core.ticks import NS_PER_S, PlantState, TickRecord
 from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
 from .difference import (
@@ -28,7 +27,6 @@ from .difference import (
     find_first_difference,
 )
 from .resumption import ArrivalEntry
-from .verify import find_last_ticks
 from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 
@@ -86,25 +84,17 @@ def compare_records(
     return RecordComparison(records, identical, first)
 
 
-def find_late_samples(log: Log) -> list[LateSample]:
-    """Returns every sample that arrived after it was due, by the tick at which it was due."""
-    return [sample for sample in _find_absent_samples(log) if sample.arrived_tick is not None]
-
-
-def _find_absent_samples(log: Log) -> list[LateSample]:
+def find_absent_samples(log: Log) -> list[LateSample]:
     """Returns every sample that was not there when it was due, by the tick at which it was due.
 
     One that never came counts as lost if a record at that tick, or after it, still has an older one in use.
     """
-    ends, absent = find_last_ticks(log), []
+    absent = []
     for name in log.sites:
         site = Site(log.scenario.setup(name)._replace(own=None))  # only its links matter: no law runs
         part, ordered = log[name], log.commands(name)
-        came: list[set[int]] = [set() for _ in part.peers]
-        for state in part.states:
-            for peer, tick, _ in state.rx:
-                if 0 <= peer < len(came):
-                    came[peer].add(tick)
+        _, rows = part.arrivals
+        came = [set(rows[rows[:, 0] == j, 1].tolist()) for j in range(len(part.peers))]
         asked = [0] * len(part.peers)
         for state in part.states:
             for command in ordered.get(state.tick, ()):
@@ -114,19 +104,16 @@ def _find_absent_samples(log: Log) -> list[LateSample]:
                 if due is not None and due < state.tick and not site.measures(peer):
                     absent.append(LateSample(name, site.peers[peer], tick, due, state.tick))
             for j, sender in enumerate(part.peers):
-                sent = min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, ends[sender]) + 1
+                sent = min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, log.last_ticks[sender]) + 1
                 for tick in range(asked[j], sent):
                     due = None if tick in came[j] or site.measures(j) else site.release_tick(j, tick)
-                    if due is not None and _is_shown_absent(part, sender, tick, due):
+                    if due is None:
+                        continue
+                    place = int(np.searchsorted(part.tick, due))
+                    if (part.used[sender][place : place + 1] < tick).any():
                         absent.append(LateSample(name, sender, tick, due, None))
                 asked[j] = max(asked[j], sent)
     return sorted(absent, key=lambda sample: sample.due_tick)
-
-
-def _is_shown_absent(part: SiteLog, peer: str, tick: int, due_tick: int) -> bool:
-    """True if the first record from the due tick of a sample on has an older one in use."""
-    place = int(np.searchsorted(part.tick, due_tick))
-    return place < len(part) and int(part.used[peer][place]) < tick
 
 
 class VirtualComparison(NamedTuple):
@@ -137,13 +124,22 @@ class VirtualComparison(NamedTuple):
 
     fed: RecordComparison
     plain: RecordComparison
-    late: list[LateSample]
-    lost: list[LateSample]
+    absent: list[LateSample]
+
+    @property
+    def late(self) -> list[LateSample]:
+        """The samples that came late."""
+        return [sample for sample in self.absent if sample.arrived_tick is not None]
+
+    @property
+    def lost(self) -> list[LateSample]:
+        """The samples that never came."""
+        return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
         """The tick from which plain virtual time may differ; None if every sample was there in time."""
-        return min((sample.due_tick for sample in (*self.late[:1], *self.lost[:1])), default=None)
+        return self.absent[0].due_tick if self.absent else None
 
 
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
@@ -156,40 +152,37 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     peers = {name: scenario.peers(name) for name in scenario.names}
     states = {name: log[name].states for name in log.sites}
     arms = {name: {s.tick: PlantState(s.q, s.qd) for s in states[name]} for name in log.scenario.external}
-    ends = find_last_ticks(log)
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}
 
         def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
-            ticks = virtual.execute_virtual(scenario, network, ordered, arms, ends)
+            ticks = virtual.execute_virtual(scenario, network, ordered, arms, log.last_ticks)
             for n, (site, _, output) in enumerate(ticks):
                 if progress is not None and n % 256 == 0:
                     progress(before + n, total)
                 yield site.name, output
 
-        recorded = RecordedNetwork({name: _complete_arrivals(log, name, ends) for name in states}, peers)
+        recorded = RecordedNetwork({name: _complete_arrivals(log, name) for name in states}, peers)
         fed = compare_records(log, execute(recorded, 0), arrivals=True)
         if arms:
             plain = RecordComparison(0, 0, None)
         else:
             plain = compare_records(log, execute(None, total // 2), arrivals=False)
-        absent = _find_absent_samples(log)
-        late = [sample for sample in absent if sample.arrived_tick is not None]
-        return VirtualComparison(fed, plain, late, [one for one in absent if one.arrived_tick is None])
+        return VirtualComparison(fed, plain, find_absent_samples(log))
 
 
-def _complete_arrivals(log: Log, name: str, ends: Mapping[str, int]) -> Mapping[int, Sequence[ArrivalEntry]]:
+def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
     """Returns the arrivals of a site by tick; in gaps those that are assumed, if not too much is missing."""
     part = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
     with suppress(LogError):
-        return complete_deliveries(part, rates_hz, [ends[peer] for peer in part.peers]).at
+        return complete_deliveries(part, rates_hz, [log.last_ticks[peer] for peer in part.peers]).at
     return {state.tick: state.rx for state in part.states}
 
 
 def _recorded_scenario(log: Log) -> Scenario:
     """Returns a log's scenario, no longer than its records: a torn log is a short run."""
-    ends_s = [(int(log[name].tick[-1]) + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
+    ends_s = [(log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
     duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
     return msgspec.structs.replace(log.scenario, duration_s=duration_s)
 

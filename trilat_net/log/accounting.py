@@ -6,8 +6,11 @@ counted. Accounts made from a file decode events only, and count a later part of
 message on.
 """
 
+import math
+import re
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError
 from ..net import topics
@@ -191,6 +194,50 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     return -(-ticks // ticks_per_stats(rate_hz)) if channel == topics.LINK else ticks
 
 
+def parse_counts(account: str) -> dict[str, int]:
+    """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
+    return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
+
+
+class Coverage(NamedTuple):
+    """How much of a run there is, or was judged: ticks by site, the judged ones and all."""
+
+    judged: dict[str, int]
+    expected: dict[str, int]
+
+    @property
+    def share(self) -> float:
+        """Share of judged ticks of the site with the least; 0 if there are no ticks at all."""
+        return min(map(self._share, self.expected), default=0.0) if any(self.expected.values()) else 0.0
+
+    def _share(self, site: str) -> float:
+        expected = self.expected[site]
+        return min(1.0, self.judged.get(site, 0) / expected) if expected else 1.0
+
+    def __str__(self) -> str:
+        lacking = {site: n for site in self.expected if (n := self._share(site)) < 1.0}
+        if not lacking:
+            return f"all {sum(self.expected.values())} ticks"
+        return ", ".join(
+            f"{site} {self.judged.get(site, 0)} of {self.expected[site]} ticks ({_percent(share)})"
+            for site, share in lacking.items()
+        )
+
+    def describe(self, least: float) -> str:
+        """Returns the coverage in words, and the share that was asked for if that is more."""
+        short = f", less than {_percent(least)}" if self.share < least else ""
+        return f"judged {self}{short}"
+
+    def to_json(self) -> dict[str, list[int]]:
+        """Returns the judged ticks and all ticks of every site."""
+        return {site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()}
+
+
+def _percent(share: float) -> str:
+    """Returns a share in percent; no less than all is 100 %."""
+    return f"{math.floor(1e5 * share) / 1e3:g} %"
+
+
 EVENTS_NUMBERED_SINCE = 3
 """Events have numbers from this version of the schema on."""
 
@@ -203,7 +250,7 @@ class SessionAccounts:
         rates_hz: tick rate of every site, in scenario order.
         continued: True for a later part of a log, which is counted from its first message on.
         events: True if events have numbers.
-        ticks: ticks of every site in the whole run, for `run_coverage`.
+        ticks: ticks of every site in the whole run, for `coverage`.
     """
 
     def __init__(
@@ -273,15 +320,11 @@ class SessionAccounts:
             if account.expected or topic.split("/")[-2] in self._rates_hz
         }
 
-    def records(self) -> dict[str, int]:
-        """Returns the number of records per site."""
+    def coverage(self) -> Coverage:
+        """Returns the records that are there, of the ticks that each site made, else those of the run."""
         accounts = {site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz}
-        return {site: account.received for site, account in accounts.items() if account is not None}
-
-    def run_coverage(self) -> dict[str, tuple[int, int]]:
-        """Returns per site the records that are there, and the ticks that it made, else those of the run."""
-        there = self.records()
-        return {site: (there[site], ticks) for site, ticks in self._ticks.items() if site in there}
+        there = {site: account.received for site, account in accounts.items() if account is not None}
+        return Coverage(there, self._ticks)
 
     def missing(self) -> Iterator[str]:
         """Yields a text per site that lacks records."""

@@ -8,6 +8,7 @@ against alteration, not against a file that was made anew: that is the task of a
 import hashlib
 from collections.abc import Mapping
 from enum import StrEnum
+from typing import NamedTuple
 
 from .log_layout import SESSION
 
@@ -31,62 +32,72 @@ class ChainState(StrEnum):
     CHANGED = "changed"
 
 
+class Integrity(NamedTuple):
+    """Whether a log is as it was made, and a sentence for it."""
+
+    state: ChainState
+    text: str
+
+    @property
+    def passed(self) -> bool:
+        """False if something was changed, or if records are missing that were there."""
+        return self.state is not ChainState.CHANGED
+
+
 class DigestChain:
-    """The digests of one file while it is written or read; `records` and `about` in hexadecimal."""
+    """The digests of one file while it is written or read.
+
+    Attributes:
+        messages: number of messages added.
+    """
 
     def __init__(self) -> None:
+        self.messages = 0
         self._records = hashlib.sha256()
         self._about: set[bytes] = set()
 
-    def add_records(self, data: bytes | bytearray | memoryview) -> None:
-        """Adds messages, as the records that they are in the file."""
+    def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
+        """Adds messages, as the records that they are in the file, and their number."""
         self._records.update(data)
+        self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
         """Adds a header, metadata, an attachment, a schema or a channel; repeated ones count once."""
         self._about.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
-    def facts(self, messages: int) -> dict[str, str]:
-        """Returns the metadata that close the chain of a file with so many messages."""
+    def facts(self) -> dict[str, str]:
+        """Returns the metadata that close the chain, digests in hexadecimal."""
         about = hashlib.sha256(b"".join(sorted(self._about))).hexdigest()
         digests = {"records": self._records.hexdigest(), "about": about}
-        return {"algorithm": ALGORITHM, "messages": str(messages), **digests}
+        return {"algorithm": ALGORITHM, "messages": str(self.messages), **digests}
 
+    def judge(self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool) -> Integrity:
+        """Returns whether a file agrees with the chain that it states.
 
-def judge_chain(
-    chain: DigestChain,
-    messages: int,
-    metadata: Mapping[str, Mapping[str, str]],
-    *,
-    finished: bool,
-    damaged: bool,
-) -> tuple[ChainState, str]:
-    """Returns whether a file agrees with the chain that it states, and a sentence for it.
-
-    Args:
-        chain: the digests of what was read.
-        messages: how many messages that is.
-        metadata: all metadata of the file, by name.
-        finished: True if it was finished.
-        damaged: True if a part of it cannot be read.
-    """
-    stated, recovered = metadata.get(CHAIN), metadata.get(RECOVERED, {})
-    if recovered.get("chain") == ChainState.CHANGED:
-        return ChainState.CHANGED, "recovered from a file that had been changed"
-    if stated is None:
-        if CHAIN_KEY not in metadata.get(SESSION, {}):
-            return ChainState.ABSENT, "no digest chain: an older program made it"
-        if not finished:
-            return ChainState.OPEN, "its digest chain is not closed: the file was not finished"
-        return ChainState.CHANGED, "its digest chain was removed"
-    found = chain.facts(messages)
-    if found == dict(stated):
-        since = f", since it was recovered from {recovered['from']}" if "from" in recovered else ""
-        return ChainState.INTACT, f"the digest chain agrees over {messages} messages and all metadata{since}"
-    if damaged and stated.get("about") == found["about"] and stated.get("messages") != found["messages"]:
-        return ChainState.OPEN, "its digest chain cannot be compared: the file is damaged"
-    differ = [name for key, name in _COVERED.items() if stated.get(key) != found[key]]
-    return ChainState.CHANGED, f"changed since it was made: {' and '.join(differ)}"
+        Args:
+            metadata: all metadata of the file, by name.
+            finished: True if it was finished.
+            damaged: True if a part of it cannot be read.
+        """
+        stated, recovered = metadata.get(CHAIN), metadata.get(RECOVERED, {})
+        if recovered.get("chain") == ChainState.CHANGED:
+            return Integrity(ChainState.CHANGED, "recovered from a file that had been changed")
+        if stated is None:
+            if CHAIN_KEY not in metadata.get(SESSION, {}):
+                return Integrity(ChainState.ABSENT, "no digest chain: an older program made it")
+            if not finished:
+                why = "its digest chain is not closed: the file was not finished"
+                return Integrity(ChainState.OPEN, why)
+            return Integrity(ChainState.CHANGED, "its digest chain was removed")
+        found = self.facts()
+        if found == dict(stated):
+            since = f", since it was recovered from {recovered['from']}" if "from" in recovered else ""
+            agrees = f"the digest chain agrees over {self.messages} messages and all metadata{since}"
+            return Integrity(ChainState.INTACT, agrees)
+        if damaged and stated.get("about") == found["about"] and stated.get("messages") != found["messages"]:
+            return Integrity(ChainState.OPEN, "its digest chain cannot be compared: the file is damaged")
+        differ = [name for key, name in _COVERED.items() if stated.get(key) != found[key]]
+        return Integrity(ChainState.CHANGED, f"changed since it was made: {' and '.join(differ)}")
 
 
 _COVERED = {

@@ -40,7 +40,7 @@ from .data_tables import (
     build_state_table,
     to_data_frame,
 )
-from .digest_chain import ChainState
+from .digest_chain import Integrity
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
@@ -136,7 +136,7 @@ class Log:
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
-        ticks = self._stated_ticks()
+        ticks = self._stated_ticks
         lacks = any(name not in ticks or self.missing(name) for name in self.sites)
         return self._contents.ended and not lacks
 
@@ -157,8 +157,8 @@ class Log:
         return int(number) if len(self.sources) == 1 and number.isdecimal() and len(number) < 10 else 0
 
     @property
-    def chain(self) -> tuple[ChainState, str]:
-        """Agreement with the digest chain of its files, the worst of several, and a sentence for it."""
+    def chain(self) -> Integrity:
+        """Agreement with the digest chain of its files, the worst of several."""
         return self._contents.chain
 
     @cached_property
@@ -183,7 +183,7 @@ class Log:
             for topic, numbers in sequences.items():
                 for number in numbers:
                     accounts.take(topic, number)
-        for name, ticks in self._stated_ticks().items():
+        for name, ticks in self._stated_ticks.items():
             accounts.expect(name, ticks)
         return {**accounts.texts(), **written}
 
@@ -191,6 +191,7 @@ class Log:
         """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
+    @cached_property
     def _stated_ticks(self) -> dict[str, int]:
         """Returns how many ticks each site made, of those that stated it."""
         most = {name: self.scenario.ticks(name) for name in self.sites}
@@ -203,8 +204,7 @@ class Log:
         Those that it stated at its end; of a site that others lost for good, those up to its last known one;
         else those of the scenario.
         """
-        stated = self._stated_ticks().get(site)
-        there = int(self[site].tick[-1]) + 1 if len(self[site]) else 0
+        stated, there = self._stated_ticks.get(site), self[site].last_tick + 1
         if stated is None:
             told = [event for event in self.events if event.about == site and event.kind in ("lost", "back")]
             gone = bool(told) and max(told, key=lambda event: event.t_ns).kind == "lost"
@@ -214,8 +214,23 @@ class Log:
     def missing(self, site: str) -> int:
         """Returns how many records of a site are missing: of those that it made, else up to its last one."""
         part = self[site]
-        after_last = self._stated_ticks().get(site, 0) - (int(part.tick[-1]) + 1 if len(part) else 0)
-        return part.missing + max(0, after_last)
+        return part.missing + max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
+
+    @cached_property
+    def last_ticks(self) -> dict[str, int]:
+        """The last tick that each site is known to have made, -1 if none is known.
+
+        The event at its end tells; without one, its records and those of its peers.
+        """
+        stated = self._stated_ticks
+        last = {name: stated.get(name, self[name].last_tick + 1) - 1 for name in self.sites}
+        for name in self.sites:
+            unknown = {n: peer for n, peer in enumerate(self[name].peers) if peer not in stated}
+            for state in self[name].states if unknown else ():
+                for n, tick, _ in state.rx:
+                    if n in unknown and tick < self.scenario.ticks(unknown[n]):
+                        last[unknown[n]] = max(last[unknown[n]], tick)
+        return last
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
@@ -224,9 +239,8 @@ class Log:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, MessageTimes(*channel.times())
             part = SiteLog(site, self.scenario.peers(site), rate_hz, channel.payloads, self.source, times)
-            most = self.scenario.ticks(site)
-            if len(part) and part.tick[-1] >= most:  # a tick of others is nothing to count up to
-                last = int(part.tick[-1])
+            most, last = self.scenario.ticks(site), part.last_tick
+            if last >= most:  # a tick of others is nothing to count up to
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")
             self._sites[site] = part
         return self._sites[site]

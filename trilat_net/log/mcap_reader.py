@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import LogError
 from ..net import topics
-from .digest_chain import CHAIN, ChainState, DigestChain, judge_chain
+from .digest_chain import CHAIN, DigestChain, Integrity
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .mcap_records import (
     DEFINITIONS,
@@ -122,7 +122,7 @@ class McapReader:
         self.packed_bytes = self.unpacked_bytes = 0
         self.offset = 0
         self.complete = False
-        self._chain, self._messages = DigestChain(), 0
+        self._chain = DigestChain()
         self._scanner = RecordScanner(stream)
         self.size = self._scanner.size
         self._source = name
@@ -195,12 +195,12 @@ class McapReader:
         find_topic, ours = self._topics.get, self._ours
         parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
         new = tuple.__new__  # what the class does with its arguments, in half the time
-        memory = chained = 0
+        memory = chained = messages = 0
         view = memoryview(data)
         for opcode, begin, end in iterate_records(data):
             if opcode == OP_MESSAGE:
                 length = end - begin
-                self._messages += 1
+                messages += 1
                 if length < head_bytes:
                     raise UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
@@ -214,22 +214,16 @@ class McapReader:
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in DEFINITIONS:
-                self._chain.add_records(view[chained : begin - RECORD_HEAD_BYTES])
+                self._chain.add_records(view[chained : begin - RECORD_HEAD_BYTES], 0)
                 chained = end
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
-        self._chain.add_records(view[chained:])
+        self._chain.add_records(view[chained:], messages)
         self._take_memory(memory, frame)
 
-    def judge_chain(self) -> tuple[ChainState, str]:
-        """Returns whether the file agrees with its digest chain, once it was read, and a sentence for it."""
-        return judge_chain(
-            self._chain,
-            self._messages,
-            self.metadata,
-            finished=self.complete,
-            damaged=bool(self.damaged),
-        )
+    def judge_chain(self) -> Integrity:
+        """Returns whether the file, once it was read, agrees with its digest chain."""
+        return self._chain.judge(self.metadata, finished=self.complete, damaged=bool(self.damaged))
 
     def _define(self, opcode: int, content: bytes) -> None:
         self._chain.add_entry(opcode, content)
@@ -299,7 +293,7 @@ class LogContents:
         complete: True if all of it is there, finished and readable throughout; a later part alone is not.
         ended: True if the last one was finished.
         damaged: what cannot be read, a sentence each.
-        chain: agreement with the digest chain, of several files the worst, and a sentence for it.
+        chain: agreement with the digest chain, of several files the worst.
     """
 
     sources: tuple[str, ...]
@@ -310,7 +304,7 @@ class LogContents:
     complete: bool
     ended: bool
     damaged: list[str]
-    chain: tuple[ChainState, str] = (ChainState.ABSENT, "")
+    chain: Integrity
 
     @property
     def source(self) -> str:

@@ -92,7 +92,6 @@ class McapWriter:
         self._compressor = zstandard.ZstdCompressor()
         self._open = bytearray()
         self._entries: dict[int, list[int]] = {}  # of the open chunk: per channel log time, offset, ...
-        self._closed = 0  # messages in chunks that are closed
         self._counts: dict[int, int] = {}
         self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
@@ -126,7 +125,7 @@ class McapWriter:
         """Most bytes that the open chunk will take."""
         if not self._open:
             return 0
-        index = 16 * (self.messages - self._closed) + 25 * len(self._entries) + 200
+        index = 16 * (self.messages - self._chain.messages) + 25 * len(self._entries) + 200
         return len(self._open) + len(self._open) // 128 + index
 
     @property
@@ -205,12 +204,12 @@ class McapWriter:
         """Writes the digests of all that was added, and returns them; only `finish` may follow."""
         if self._open:
             self._close_chunk()
-        facts = self._chain.facts(self.messages)
+        facts = self._chain.facts()
         self.add_metadata(CHAIN, facts)
         return facts
 
     def _close_chunk(self) -> None:
-        self._chain.add_records(self._open)
+        self._chain.add_records(self._open, self.messages - self._chain.messages)
         data = self._compressor.compress(self._open)
         used = {channel: entries for channel, entries in self._entries.items() if entries}
         start_ns = min(min(entries[::2]) for entries in used.values())
@@ -232,7 +231,6 @@ class McapWriter:
         self._add_to_summary(Opcode.CHUNK_INDEX, index)
         first_ns, last_ns = self._span_ns or (start_ns, end_ns)
         self._span_ns = min(first_ns, start_ns), max(last_ns, end_ns)
-        self._closed = self.messages
         self._open.clear()
 
     def finish(self) -> None:

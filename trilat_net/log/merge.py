@@ -53,7 +53,7 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
         whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
         last.ended,
         [damage for part in ordered for damage in part.damaged],
-        max((part.chain for part in parts), key=lambda chain: list(ChainState).index(chain[0])),
+        max((part.chain for part in parts), key=lambda chain: list(ChainState).index(chain.state)),
     )
 
 

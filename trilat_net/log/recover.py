@@ -6,9 +6,8 @@ modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebui
 a number, the one covered by a valid checksum wins, else the first.
 """
 
-import re
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -21,7 +20,7 @@ from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
 from ..net import topics
-from .accounting import open_session_accounts
+from .accounting import Coverage, open_session_accounts, parse_counts
 from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
 from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
@@ -68,12 +67,11 @@ class Recovery:
         path, output: the source file, and the file that was made.
         finished: True if the source had been finished.
         messages: number of messages.
-        sites: per site the number of records; empty if it is no trilat-net log.
         duration_s: from the first message to the last, by the times at which they were logged, s.
         salvaged: messages out of a last chunk that was cut off.
         lost, lost_bytes: what was lost, a sentence each, and how many bytes could not be read.
         missing: per site which records are not in the file, be they lost here or never recorded.
-        coverage: per site the records in the file and the ticks of the run; empty if it is no trilat-net log.
+        coverage: the records in the file and the ticks of the run; of no site if it is no trilat-net log.
         chain: agreement of the source with its digest chain; "" if it is no trilat-net log.
     """
 
@@ -81,26 +79,18 @@ class Recovery:
     output: Path
     finished: bool = False
     messages: int = 0
-    sites: dict[str, int] = field(default_factory=dict)
     duration_s: float = 0.0
     salvaged: int = 0
     lost: list[str] = field(default_factory=list)
     lost_bytes: int = 0
     missing: list[str] = field(default_factory=list)
-    coverage: dict[str, tuple[int, int]] = field(default_factory=dict)
+    coverage: Coverage = field(default_factory=lambda: Coverage({}, {}))
     chain: ChainState | str = ""
 
     @property
     def lossless(self) -> bool:
         """True if all that was in the file is in the new one."""
         return not self.lost
-
-    def coverage_texts(self) -> list[str]:
-        """Returns how much of the run is in the new file, a text per site."""
-        return [
-            f"{site} {there} of {ticks} ticks ({100.0 * there / max(ticks, 1):.4g} %)"
-            for site, (there, ticks) in self.coverage.items()
-        ]
 
     def lose(self, what: str, size: int = 0) -> None:
         """Adds a loss of so many bytes."""
@@ -118,7 +108,7 @@ class Recovery:
             "lost_bytes": str(self.lost_bytes),
             "salvaged_messages": str(self.salvaged),
             "missing": "; ".join(self.missing) or "nothing",
-            "coverage": "; ".join(self.coverage_texts()) or "unknown",
+            "coverage": str(self.coverage) if self.coverage.expected else "unknown",
             "chain": str(self.chain),
         }
 
@@ -164,7 +154,12 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
-    result.chain = _judge_source(stream, survey)
+    if SESSION in survey.metadata:
+        stream.seek(0)
+        reader, result.chain = McapReader(stream, str(result.path), kept=False), ChainState.OPEN
+        with suppress(LogError):
+            deque(reader.messages(), maxlen=0)
+            result.chain = reader.judge_chain().state
     file = LogFile(result.output, force=force, working=working)
     try:
         _FileCopy(scanner, file, survey, result).run(progress)
@@ -175,18 +170,6 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
             raise file.refused(file.trouble) from None
         raise
     return result
-
-
-def _judge_source(stream: BinaryIO, survey: "_Survey") -> ChainState | str:
-    """Returns the agreement of a log of ours with its digest chain; "" for other files."""
-    stream.seek(0)
-    reader = McapReader(stream, "source", kept=False)
-    if SESSION not in survey.metadata:
-        return ""
-    with suppress(LogError):
-        deque(reader.messages(), maxlen=0)
-        return reader.judge_chain()[0]
-    return ChainState.OPEN
 
 
 class _Survey:
@@ -409,11 +392,14 @@ class _FileCopy:
         result.messages, result.duration_s = self._out.messages, self._out.duration_s
         if accounts is not None:
             result.missing = list(accounts.missing())
-            result.sites = accounts.records()
-            result.coverage = accounts.run_coverage()
+            result.coverage = accounts.coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
             alone = self._scanner.finished and result.lossless and PART not in self._survey.metadata
-            if alone and _contradicts(before, accounts.texts()):
+            if alone and any(
+                parse_counts(before.get(topic, "")) not in ({}, parse_counts(text))
+                for topic, text in accounts.texts().items()
+                if topic.endswith(f"/{topics.STATE}")
+            ):
                 result.chain = ChainState.CHANGED
             counts = {name: text for name, text in before.items() if not name.startswith("/")}
             self._out.add_metadata(ACCOUNTS, {**accounts.texts(), **counts})
@@ -421,16 +407,6 @@ class _FileCopy:
         if accounts is not None:
             self._out.close_chain()
         self._out.finish()
-
-
-def _contradicts(stated: Mapping[str, str], found: Mapping[str, str]) -> bool:
-    """True if the accounts of a file count other records than it has."""
-    pattern = re.compile(r"received \d+, missing \d+")
-    for topic, text in found.items():
-        there, told = pattern.search(text), pattern.search(stated.get(topic, ""))
-        if topic.endswith(f"/{topics.STATE}") and there and told and there[0] != told[0]:
-            return True
-    return False
 
 
 def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:

@@ -19,8 +19,7 @@ from ..net import topics
 from ..net.messages import READABLE, VERSION, Event, LinkStats, RecorderStats, State, json_schema
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
-from .accounting import Account, count_messages, number_message
-from .digest_chain import ChainState
+from .accounting import Account, count_messages, number_message, parse_counts
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -297,8 +296,9 @@ class SessionCheck:
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
-        state, self._chain_text = reader.judge_chain()
-        if state is ChainState.CHANGED:
+        chain = reader.judge_chain()
+        self._chain_text = chain.text
+        if not chain.passed:
             self._problems["chain"].add(file, None, self._chain_text)
 
     def _begin(self, reader: McapReader) -> None:
@@ -417,8 +417,7 @@ class SessionCheck:
         if not self._first_part or len({boot for check in own for boot in check.accounts}) > 1:
             return problems.finding("accounts", "tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
-            account = self._accounts.get(topic, "")
-            stated = {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
+            stated = parse_counts(self._accounts.get(topic, ""))
             there = {"received": check.received, "missing": check.missing}
             for word, count in stated.items():
                 if check.kind != topics.STATS and count != there[word]:

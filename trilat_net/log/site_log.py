@@ -222,9 +222,14 @@ class SiteLog:
         return {state.tick: state for state in self.states}
 
     @property
+    def last_tick(self) -> int:
+        """Tick of the last record, -1 if there is none."""
+        return int(self.tick[-1]) if len(self) else -1
+
+    @property
     def missing(self) -> int:
         """How many ticks before the last record have none."""
-        return int(self.tick[-1] - np.count_nonzero(np.diff(self.tick))) if len(self) else 0
+        return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0
 
     mode = _RecordField(
         record_columns.decode_strings, 'Mode, shape (K,): "run", "hold", "brake", "return" or "diverged".'

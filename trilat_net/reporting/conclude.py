@@ -12,7 +12,6 @@ import numpy as np
 
 from ..errors import LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import CheckLine, check_log_files
-from ..execution.verify import find_last_ticks
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
@@ -94,7 +93,7 @@ def _site_row(log: Log, site: str) -> tuple[str, ...]:
     part = log[site]
     if not len(part):
         return (site, "0", *("",) * (len(_HEADERS) - 2))
-    missing = max(find_last_ticks(log)[site], int(part.tick[-1])) + 1 - len(part)
+    missing = max(log.last_ticks[site], part.last_tick) + 1 - len(part)
     late = np.percentile(part.late_us, (50, 99, 100))
     busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
     numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")

@@ -6,7 +6,11 @@ that a rerun took over as recorded, leave a run open; a log that was changed pas
 
 from typing import Any, NamedTuple
 
-from ...log.integrity import Coverage, Integrity, judge_integrity, measure_record_coverage
+import numpy as np
+
+from ...log.accounting import Coverage
+from ...log.digest_chain import Integrity
+from ...log.integrity import judge_integrity
 from ...log.log_reader import Log
 from .energy_balance import EnergyBalance
 
@@ -47,12 +51,11 @@ class Evidence(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Returns the evidence, ready for JSON."""
-        expected = self.coverage.expected
         return {
             "coverage": self.coverage.share,
             "functional_coverage": self.functional_share,
             "min_coverage": self.min_coverage,
-            "judged": {site: [self.coverage.judged.get(site, 0), n] for site, n in expected.items()},
+            "judged": self.coverage.to_json(),
             "integrity": self.integrity.state.name.lower(),
             "open_loop_sites": list(self.unmet),
         }
@@ -62,4 +65,6 @@ def collect_evidence(log: Log, balance: EnergyBalance | None, min_coverage: floa
     """Returns what a certificate of a log rests on, with the energy balance that it found."""
     share = None if balance is None else float(balance.judged.mean())
     unmet = tuple(site for site in log.sites if site not in log.executed_sites)
-    return Evidence(measure_record_coverage(log), share, min_coverage, judge_integrity(log), unmet)
+    there = {site: len(np.unique(log[site].tick)) for site in log.sites}
+    coverage = Coverage(there, {site: log.expected_ticks(site) for site in log.sites})
+    return Evidence(coverage, share, min_coverage, judge_integrity(log), unmet)

@@ -24,7 +24,7 @@ from ...analysis.torque_sources import wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
-from ...execution.virtual_comparison import find_late_samples
+from ...execution.virtual_comparison import find_absent_samples
 from ...log.log_reader import Log
 from ...scenario import Expect, Scenario, SiteSpec
 from ...scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
@@ -336,7 +336,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         scenario,
         tallies,
         diverged_at_s=min(diverged_ns) / NS_PER_S if diverged_ns else None,
-        late_samples=len(find_late_samples(log)),
+        late_samples=sum(sample.arrived_tick is not None for sample in find_absent_samples(log)),
         missing=missing,
     )
 
