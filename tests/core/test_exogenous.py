@@ -29,7 +29,7 @@ stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
 def torque(
     t_s: float, q: Array, qd: Array, *actors: TorqueSource, sampled: bool = False, lengths: Array = LENGTHS
 ) -> Array:
-    return np.array(torque_on_arm(t_s, q, qd, lengths, *torque_source_rows(actors), int(sampled)))
+    return np.array(torque_on_arm(t_s, q, qd, lengths, *torque_source_rows(actors), int(sampled))[:2])
 
 
 def tip(q: Array) -> Array:

@@ -133,7 +133,7 @@ def test_a_wall_that_is_passive_at_its_contact_gives_energy_to_v() -> None:
     rows, table = torque_source_rows((wall,))
 
     def push(q: Any) -> Any:
-        return np.array(torque_on_arm(0.0, q, np.zeros(2), np.ones(2), rows, table, 0))
+        return np.array(torque_on_arm(0.0, q, np.zeros(2), np.ones(2), rows, table, 0)[:2])
 
     turns = np.linspace(0.0, 2 * np.pi, 4001)
     path = np.array([-0.5, 1.85]) + 0.2 * np.stack([np.cos(turns), np.sin(2 * turns)], axis=1)

@@ -49,7 +49,7 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
         estimate = np.zeros(5)
     rows, table = torque_source_rows(one.actors)
     acted, held = (
-        np.array(torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled))
+        np.array(torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2])
         for sampled in (0, 1)
     )
     total = np.array(tau) + acted + held + x[EXTERNAL_TORQUE]

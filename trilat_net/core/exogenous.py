@@ -89,6 +89,8 @@ TORQUE_SOURCE_DTYPE = np.dtype(
 )
 TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
+SourceTorque = tuple[float, float, float]
+"""Torque ON each joint, N m, and the largest force of a wall in it, N."""
 
 _PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
 _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
@@ -197,39 +199,46 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 
 @leaf
-def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> Pair:
-    """Returns J' F of a force at the end effector: an operator's, or a wall's."""
+def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> SourceTorque:
+    """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a wall."""
     _, at = forward_kinematics(lengths, q)
     x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
-    force = (
-        _spring_force(actor, t_s, at, speed) if actor.acts == _TASK_HAND else _wall_force(actor, at, speed)
-    )
-    return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1]
+    wall_n = 0.0
+    if actor.acts == _WALL:
+        force = _wall_force(actor, at, speed)
+        wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
+    else:
+        force = _spring_force(actor, t_s, at, speed)
+    return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1], wall_n
 
 
 @leaf
-def source_torque(t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable) -> Pair:
-    """Returns the torque of one actor ON the arm at time t, N m.
+def source_torque(
+    t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
+) -> SourceTorque:
+    """Returns the torque of one actor ON the arm at time t.
 
     A pulse is peak * sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper,
     whose numbers are not printed.
     """
     if not actor.start_s <= t_s < actor.end_s:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     if actor.acts == _PULSE:
-        return _pulse_torque(actor, t_s)
-    if actor.acts == _HAND:
-        return _spring_force(actor, t_s, q, qd)
-    if actor.acts == _VISCOUS:
-        return -actor.B[0] * qd[0], -actor.B[1] * qd[1]
-    if actor.acts == _RECORDED:
-        return _recorded_torque(actor, t_s, table)
-    if actor.acts == _CHIRP:
-        return _chirp_torque(actor, t_s)
-    if actor.acts == _MULTISINE:
-        return _multisine_torque(actor, t_s, table)
-    return _end_effector_torque(actor, t_s, q, qd, lengths)
+        torque = _pulse_torque(actor, t_s)
+    elif actor.acts == _HAND:
+        torque = _spring_force(actor, t_s, q, qd)
+    elif actor.acts == _VISCOUS:
+        torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
+    elif actor.acts == _RECORDED:
+        torque = _recorded_torque(actor, t_s, table)
+    elif actor.acts == _CHIRP:
+        torque = _chirp_torque(actor, t_s)
+    elif actor.acts == _MULTISINE:
+        torque = _multisine_torque(actor, t_s, table)
+    else:
+        return _end_effector_torque(actor, t_s, q, qd, lengths)
+    return torque[0], torque[1], 0.0
 
 
 @leaf
@@ -241,28 +250,14 @@ def torque_on_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
     sampled: int,
-) -> Pair:
-    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm, N m; -tau_x of Eq. (8)."""
-    total_0 = total_1 = 0.0
+) -> SourceTorque:
+    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm; -tau_x of Eq. (8)."""
+    total_0 = total_1 = largest_n = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
         if actor.sampled == sampled:
             torque = source_torque(t_s, q, qd, lengths, actor, table)
             total_0 += torque[0]
             total_1 += torque[1]
-    return total_0, total_1
-
-
-@leaf
-def largest_wall_force(t_s: float, q: Pair, qd: Pair, lengths: Vector, actors: TorqueSourceRows) -> float:
-    """Returns the largest force of a wall on the end effector, N."""
-    largest_n = 0.0
-    _, at = forward_kinematics(lengths, q)
-    x, y = end_effector_jacobian(lengths, q)
-    speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
-    for n in range(actors.shape[0]):
-        actor: Row = actors[n]
-        if actor.acts == _WALL and actor.start_s <= t_s < actor.end_s:
-            force = _wall_force(actor, at, speed)
-            largest_n = max(largest_n, math.sqrt(force[0] * force[0] + force[1] * force[1]))
-    return largest_n
+            largest_n = max(largest_n, torque[2])
+    return total_0, total_1, largest_n

@@ -6,7 +6,7 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 
 import numpy as np
 
-from .exogenous import TorqueSourceRows, TorqueTable, largest_wall_force, torque_on_arm
+from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .jit import leaf
 from .kernel import act_stages, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
@@ -109,10 +109,10 @@ def _update_sums(
     held = pair(s.held)
     now = (s.on_arm[0] - held[0], s.on_arm[1] - held[1])
     if first > 0:  # beside operators, whose rows come first
-        now = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 0)
-        held = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 1)
-    if now[0] != 0.0 or now[1] != 0.0 or held[0] != 0.0 or held[1] != 0.0:
-        sums.force_peak_n = max(sums.force_peak_n, largest_wall_force(t_s, q, qd, lengths, actors))
+        in_stages = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 0)
+        sampled = torque_on_arm(t_s, q, qd, lengths, actors[first:], table, 1)
+        now, held = (in_stages[0], in_stages[1]), (sampled[0], sampled[1])
+    sums.force_peak_n = max(sums.force_peak_n, s.wall_n)
     if k > 0:
         for i in range(JOINTS):
             mean = 0.5 * (sums.now[i] + now[i]) + sums.held[i]

@@ -142,11 +142,12 @@ def _write_record(site: Row, row: Array) -> None:
 
 @leaf
 def _update_external_torque(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
-    """Writes the torque of operators and environments now, and the part of it that is held over the tick."""
+    """Writes the torque of operators and environments now, the part of it that is held, and a wall's force."""
     t_s, q, qd, lengths = t_ns * 1e-9, pair(site.q), pair(site.qd), pair(site.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
     now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
-    put_pair(site.held, held)
+    put_pair(site.held, (held[0], held[1]))
+    site.wall_n = max(held[2], now[2])
     put_pair(site.on_arm, (now[0] + held[0], now[1] + held[1]))
 
 

@@ -41,6 +41,7 @@ SITE_DTYPE = np.dtype(
             ("return_from_ns", "i8"),
             *((name, "f8", _VECTOR) for name in _COMPUTED),
             ("Y", "f8", (JOINTS, PARAMETERS)),
+            ("wall_n", "f8"),
         ],
     )
 )
