@@ -142,7 +142,7 @@ def _write_record(site: Row, row: Array) -> None:
 
 @leaf
 def _update_external_torque(t_ns: int, site: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
-    """Writes the torque of operators and environments now, the part of it that is held, and a wall's force."""
+    """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
     t_s, q, qd, lengths = t_ns * 1e-9, pair(site.q), pair(site.qd), pair(site.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
     now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)

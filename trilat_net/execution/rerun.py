@@ -25,7 +25,7 @@ from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
 from ..errors import LogError
 from ..log.log_file import LogFile
-from ..log.log_layout import EXECUTED_SITES_KEY, RERUN_DRIVER
+from ..log.log_layout import EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER
 from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
 from ..log.mcap_reader import Progress
@@ -39,7 +39,7 @@ from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
-from .site_channels import LAST_LOG_NS, SiteChannels, SiteEntry, describe_accounts
+from .site_channels import SiteChannels, SiteEntry, describe_accounts
 from .verify import find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
@@ -318,7 +318,7 @@ def rerun(
 
 def _read_epoch_unix_ns(log: Log) -> int:
     written = log.session.get("epoch_unix_ns", "0")
-    if not written.isdecimal() or int(written) > LAST_LOG_NS:
+    if not written.isdecimal() or int(written) > MAX_TIME_NS:
         raise LogError(f"{log.source}: its epoch_unix_ns is no time: {written[:40]!r}")
     return int(written)
 

@@ -13,6 +13,7 @@ import msgspec
 from ..errors import ScenarioError, UsageError
 from ..log.log_reader import Log
 from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
+from ..scenario.describe import describe_law, describe_value, flatten_table
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
 
@@ -141,21 +142,12 @@ def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str
 
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
     """Returns every value in which two scenarios differ."""
-    before, after = (dict(_leaves(msgspec.to_builtins(scenario), "")) for scenario in (original, other))
+    before, after = (dict(flatten_table(msgspec.to_builtins(scenario))) for scenario in (original, other))
     return [
         ChangedValue(key, before.get(key), after.get(key))
         for key in before | after
         if before.get(key) != after.get(key)
     ]
-
-
-def _leaves(value: Any, path: str) -> list[tuple[str, Any]]:
-    if not isinstance(value, dict):
-        return [(path, value)]
-    return [leaf for key, entry in value.items() for leaf in _leaves(entry, f"{path}.{key}" if path else key)]
-
-
-_VALUE_LENGTH = 60
 
 
 def describe_rerun_changes(request: RerunRequest) -> list[str]:
@@ -195,26 +187,14 @@ def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> 
         links = [scenario.links[owner].describe() for scenario in (before, after)]
         return None if links[0] == links[1] else ("link", owner, " -> ".join(links))
     if group == "sites" and key.startswith("control."):
-        laws = [scenario.sites[owner].control for scenario in (before, after)]
-        kinds = [law.__struct_config__.tag for law in laws]
-        return None if kinds[0] == kinds[1] else ("control", owner, " -> ".join(map(_describe_law, laws)))
+        laws = [msgspec.to_builtins(scenario.sites[owner].control) for scenario in (before, after)]
+        same = laws[0]["law"] == laws[1]["law"]
+        return None if same else ("control", owner, " -> ".join(map(describe_law, laws)))
     return None
 
 
-def _describe_law(law: msgspec.Struct) -> str:
-    """Returns a law and its gains in a few words."""
-    gains = [f"{key} {_shorten(value)}" for key, value in msgspec.to_builtins(law).items() if key != "law"]
-    return f"{law.__struct_config__.tag} ({', '.join(gains)})"
-
-
 def _shorten(value: object) -> str:
-    """Returns a value in a few characters; a list of equal numbers as one of them."""
-    if value is None or value == () or value == []:
-        return "none"
-    if isinstance(value, list | tuple) and isinstance(value[0], dict):
+    """Returns a value in a few characters; of a list of tables their number."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
-    if isinstance(value, list | tuple):
-        numbers = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in value]
-        value = numbers[0] if len(set(numbers)) == 1 else f"[{', '.join(numbers)}]"
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= _VALUE_LENGTH else f"{text[: _VALUE_LENGTH - 3]}..."
+    return describe_value(value)

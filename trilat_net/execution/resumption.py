@@ -7,7 +7,7 @@ without a record are unknown; samples that no record lists are assumed to have a
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from ..core.delay import MAX_DELAY_US
 from ..core.site_step import Site
@@ -25,20 +25,8 @@ ArrivalEntry = Sequence[int]
 """As in a record's `rx`: index of the peer, tick of its sample, us."""
 
 
-class ReceivedMotion(Protocol):
-    """The part of a sample that a receiver uses."""
-
-    @property
-    def q(self) -> Sequence[float]:
-        """Joint angles, rad."""
-
-    @property
-    def qd(self) -> Sequence[float]:
-        """Joint velocities, rad/s."""
-
-    @property
-    def tau_x(self) -> Sequence[float]:
-        """Exogenous torque, N m."""
+ReceivedMotion = State | Arrival
+"""A sample of a peer, as it was recorded or as it is computed now."""
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:

@@ -11,18 +11,13 @@ import msgspec
 
 from ..core.ticks import Arrival, Mode, TickRecord, describe_divergence, describe_mode
 from ..log.accounting import Account
-from ..log.log_layout import SITE_CHANNELS
+from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
 from ..log.log_writer import LogWriter
 from ..net import topics
 from ..net.loop_stats import ticks_per_stats
-from ..net.messages import VERSION, Event, LinkStats, State
+from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.wire import encode, encode_state
 from .resumption import read_output
-
-SENT_TIME_SINCE = 2
-"""First schema version whose records hold their sending time."""
-LAST_LOG_NS = (1 << 64) - 1
-"""Last time stamp of a file; a damaged log may hold any time."""
 
 
 class SiteEntry(NamedTuple):
@@ -113,7 +108,7 @@ class SiteChannels:
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
         """Writes an entry into a log."""
         self.accounts[entry.channel].take(entry.number)
-        log_ns = min(max(0, epoch_unix_ns + entry.t_ns), LAST_LOG_NS)
+        log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
         key = self.keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
 

@@ -16,7 +16,16 @@ from typing import Any, BinaryIO, NamedTuple
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
-from ..net.messages import READABLE, VERSION, Event, LinkStats, RecorderStats, State, json_schema
+from ..net.messages import (
+    READABLE,
+    SENT_TIME_SINCE,
+    VERSION,
+    Event,
+    LinkStats,
+    RecorderStats,
+    State,
+    json_schema,
+)
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from .accounting import Account, count_messages, number_message, parse_counts
@@ -30,8 +39,6 @@ MAX_AHEAD_NS = 10 * NS_PER_S
 """No message is sent more than this after it came, whatever the clocks."""
 MAX_BOOTS = 64
 """Starts of a member that are distinguished."""
-_SENT_SINCE = 2
-"""First version whose records state when they were sent."""
 _CDR_HEAD = b"\x00\x01"
 _RATE_TOLERANCE = 0.02
 _RATE_SPAN_NS = 2 * NS_PER_S
@@ -200,7 +207,7 @@ class ChannelCheck:
     def _identify(self, message: State | LinkStats | Event | RecorderStats) -> MessageIdentity:
         match message:
             case State():
-                sent_ns = message.sent_ns if message.v >= _SENT_SINCE else message.t_ns
+                sent_ns = message.sent_ns if message.v >= SENT_TIME_SINCE else message.t_ns
                 return MessageIdentity(message.site, message.boot, message.tick, message.tick, sent_ns)
             case LinkStats():
                 number = number_message(self.kind, message.tick, self.rate_hz)

@@ -16,6 +16,8 @@ VERSION = 3
 """The version sent, and the only one accepted from others."""
 READABLE = (1, 2, 3)
 """The versions read in files: all released ones."""
+SENT_TIME_SINCE = 2
+"""First version whose records hold their sending time."""
 
 U64 = Annotated[int, Meta(ge=0)]
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]

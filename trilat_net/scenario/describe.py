@@ -110,12 +110,12 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
     """Returns the keys whose values differ; a law of another kind as a whole."""
     if len({table.get("control", {}).get("law") for table in tables}) > 1:
-        laws = ScenarioDifference("control", (), tuple(_describe_law(table["control"]) for table in tables))
+        laws = ScenarioDifference("control", (), tuple(describe_law(table["control"]) for table in tables))
         rest = [{key: value for key, value in table.items() if key != "control"} for table in tables]
         return [laws, *_compare_tables(rest)]
-    flat = [dict(_flatten(table)) for table in tables]
+    flat = [dict(flatten_table(table)) for table in tables]
     return [
-        ScenarioDifference(key, (), tuple(_describe_value(one.get(key)) for one in flat))
+        ScenarioDifference(key, (), tuple(describe_value(one.get(key)) for one in flat))
         for key in dict.fromkeys(key for one in flat for key in one)
         if any(one.get(key) != flat[0].get(key) for one in flat)
     ]
@@ -135,32 +135,33 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
     ]
 
 
-def _flatten(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
+def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
     """Returns the values of a table and of those in it, with dotted keys."""
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
         where = f"{path}.{key}" if path else key
-        pairs += _flatten(value, where) if isinstance(value, dict) else [(where, value)]
+        pairs += flatten_table(value, where) if isinstance(value, dict) else [(where, value)]
     return pairs
 
 
-def _describe_law(control: Mapping[str, Any]) -> str:
-    gains = ", ".join(f"{key} {_describe_value(value)}" for key, value in control.items() if key != "law")
+def describe_law(control: Mapping[str, Any]) -> str:
+    """Returns a law and its gains in a few words, from its table."""
+    gains = ", ".join(f"{key} {describe_value(value)}" for key, value in control.items() if key != "law")
     return f"{control['law']} ({gains})"
 
 
-def _describe_value(value: Any) -> str:
+def describe_value(value: Any) -> str:
     """Returns a value in words; a list of equal numbers as one of them."""
     if value is None or value == [] or value == ():
         return "none"
     if isinstance(value, dict):
         words = [
-            _describe_value(entry) if key == "kind" else f"{key} {_describe_value(entry)}"
+            describe_value(entry) if key == "kind" else f"{key} {describe_value(entry)}"
             for key, entry in value.items()
         ]
         return " ".join(words)
     if isinstance(value, list | tuple):
-        entries = [_describe_value(entry) for entry in value]
+        entries = [describe_value(entry) for entry in value]
         alike = isinstance(value[0], int | float) and len(set(entries)) == 1
         text = entries[0] if alike else f"[{', '.join(entries)}]"
     else:

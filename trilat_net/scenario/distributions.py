@@ -31,7 +31,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
     normal: tuple[Real, NotNegative] | None = None
     uniform: tuple[Real, Real] | None = None
-    value: float | Annotated[tuple[float, ...], Meta(max_length=2)]
+    value: float | Annotated[list[float], Meta(max_length=2)]
 
     def draw(self, seed: int, key: str) -> float:
         """Returns the number of a seed under a dotted key."""
@@ -87,15 +87,13 @@ class Draws:
                 entry if isinstance(entry, list) else self._draw_entry(entry, f"{path}[{n}]")
                 for n, entry in enumerate(value)
             ]
-        origin = None
+        key = dotted_key(path)
         if is_distribution(value):
             origin = _read_distribution(value, path)
-        elif is_number(value) and self._known:
-            before = self._known.get(dotted_key(path))
-            origin = before if before is not None and before.value == value else None
-        if origin is None:
+        elif (known := self._known.get(key)) is not None and is_number(value) and known.value == value:
+            origin = known
+        else:
             return value
-        key = dotted_key(path)
         number = origin.draw(self._seed, key)
         self.drawn[key] = msgspec.structs.replace(origin, value=number)
         return number
@@ -104,16 +102,12 @@ class Draws:
         """Writes the start pose under a key that is absent, or that followed an earlier draw of it."""
         place = dotted_key(f"{path}.{key}")
         before = self._known.get(place)
-        if key in table and (before is None or table[key] != list(_as_tuple(before.value))):
+        if key in table and (before is None or table[key] != before.value):
             return
         table[key] = pose
         site = place.partition(".hands.")[0]
         if any(one.startswith((f"{site}.q0_rad", f"{site}.arm.l")) for one in self.drawn):
-            self.drawn[place] = Distribution(value=tuple(pose))
-
-
-def _as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (value,)
+            self.drawn[place] = Distribution(value=list(pose))
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:

@@ -94,8 +94,7 @@ class JointSpring(ActorBase, frozen=True, tag="spring"):
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
-        stiffness, damping = self.stiffness_nm_rad, self.damping_nm_s_rad
-        return _spring_source(TorqueKind.HAND, self, self.from_rad, self.to_rad, stiffness, damping)
+        return _spring_source(TorqueKind.HAND, self)
 
 
 class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
@@ -120,19 +119,12 @@ class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
-        stiffness, damping = self.stiffness_n_m, self.damping_n_s_m
-        return _spring_source(TorqueKind.TASK_HAND, self, self.from_m, self.to_m, stiffness, damping)
+        return _spring_source(TorqueKind.TASK_HAND, self)
 
 
-def _spring_source(
-    kind: TorqueKind,
-    spring: JointSpring | EndEffectorSpring,
-    start: tuple[float, ...],
-    end: tuple[float, ...],
-    stiffness: tuple[float, ...],
-    damping: tuple[float, ...],
-) -> TorqueSource:
-    """Returns a spring as the core has it."""
+def _spring_source(kind: TorqueKind, spring: JointSpring | EndEffectorSpring) -> TorqueSource:
+    """Returns a spring as the core has it; both kinds begin with the same four fields."""
+    end, start, stiffness, damping = msgspec.structs.astuple(spring)[:4]
     held = spring.start_s, spring.end_s, spring.move_start_s, spring.move_end_s
     return TorqueSource(kind, *held, start, end, stiffness, damping, spring.sampled)
 
