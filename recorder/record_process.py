@@ -5,14 +5,12 @@ wait in one bounded queue; one thread writes. The file is flushed every 100 ms a
 end of the process.
 """
 
-import platform
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 
 from trilat_net import process
-from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
@@ -21,8 +19,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import Epoch, EventPublisher, new_boot
-from trilat_net.net.messages import Info
+from trilat_net.net.membership import Epoch, EventPublisher, describe_member, new_boot
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.process import Interrupt
@@ -55,15 +52,7 @@ class Recorder:
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._queue.take)
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        info = Info(
-            member=topics.RECORDER,
-            boot=boot,
-            scenario_sha256="",
-            scenario="",
-            host=platform.node(),
-            clock=clock.identity(),
-            fingerprint=compute_fingerprint(),
-        )
+        info = describe_member(topics.RECORDER, boot, clock)
         keep = partial(self._queue.take, topics.key(session, topics.RECORDER, topics.EVENT))
         self._publisher = EventPublisher(bus, session, info, keep)
         self._joining = SessionJoin(bus, clock, session, self._publisher, ())

@@ -6,12 +6,11 @@ answers in the slack of its ticks.
 
 from array import array
 
-from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
 from trilat_net.net.loop_stats import STATS_PER_SECOND
-from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, Backfill, BackfillRequest
-from trilat_net.net.wire import decode, encode
+from trilat_net.net.pinging import answer_backfill
+from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 
 KEPT_S = 60
 RECORDS_KEPT = 120_000
@@ -86,19 +85,9 @@ class RetransmitBuffer:
         query = self._queries.poll()
         if query is None:
             return False
-        try:
-            wanted = decode(query.payload, BackfillRequest)
-        except WireError:
-            return True  # a stranger's: it gets no answer
-        buffer = self.channels[wanted.channel]
-        first, payloads = buffer.chunk(wanted.first, wanted.last)
-        reply = Backfill(
-            member=self._site,
-            boot=self._boot,
-            channel=wanted.channel,
-            first=first,
-            payloads=payloads,
-            made=buffer.made,
-        )
-        query.answer(encode(reply))
+        answer_backfill(query, self._site, self._boot, self._find)
         return True
+
+    def _find(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
+        buffer = self.channels[wanted.channel]
+        return *buffer.chunk(wanted.first, wanted.last), buffer.made

@@ -5,18 +5,15 @@ Until the epoch its arm is braked; at the end it stays until every recorder has 
 seconds (`shutdown`).
 """
 
-import platform
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
-from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord, describe_mode
 from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
-from trilat_net.net.membership import Epoch, EventPublisher
-from trilat_net.net.messages import Info
+from trilat_net.net.membership import Epoch, EventPublisher, describe_member
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
@@ -77,16 +74,8 @@ class JoiningSite:
 
     def __init__(self, parts: SiteParts) -> None:
         scenario, options = parts.scenario, parts.options
-        info = Info(
-            member=parts.name,
-            boot=parts.boot,
-            scenario_sha256=scenario.sha256,
-            scenario=scenario.text,
-            host=platform.node(),
-            clock=parts.clock.identity(),
-            fingerprint=compute_fingerprint(),
-            needs_recorder=options.needs_recorder,
-        )
+        needs = {"needs_recorder": options.needs_recorder}
+        info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
         self._parts = parts
         keep = parts.buffer.channels[topics.EVENT].keep
         self._publisher = EventPublisher(parts.bus, options.session, info, keep)

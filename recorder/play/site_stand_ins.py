@@ -5,8 +5,6 @@ identities, nothing is published in a site's name that the log does not hold. Ba
 played: a minute of them when the log is read during play (L6), all of them when it is preloaded.
 """
 
-import hashlib
-import platform
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
@@ -18,10 +16,10 @@ from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import liveliness_token, read_events
+from trilat_net.net.membership import describe_member, liveliness_token, read_events
 from trilat_net.net.messages import Info
-from trilat_net.net.pinging import RepeatedQuery, answer_pings
-from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, Backfill, BackfillRequest
+from trilat_net.net.pinging import RepeatedQuery, answer_backfill, answer_pings
+from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 from trilat_net.net.wire import decode, encode
 
 from .batch import Ints, MessageBatch
@@ -116,15 +114,7 @@ class SiteStandIns:
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         self._recorder_query = RepeatedQuery(bus, clock, topics.key(session, topics.RECORDER, topics.INFO))
         self._infos = {
-            site: Info(
-                member=site,
-                boot=boot,
-                scenario_sha256=hashlib.sha256(header.scenario_text.encode()).hexdigest(),
-                scenario=header.scenario_text,
-                host=platform.node(),
-                clock=clock.identity(),
-                fingerprint=header.fingerprint,
-            )
+            site: describe_member(site, boot, clock, header.scenario_text, fingerprint=header.fingerprint)
             for site, boot in header.boots.items()
         }
         self._encoded: dict[str, tuple[int, bytes]] = {}  # per site its identity, and since when
@@ -156,10 +146,8 @@ class SiteStandIns:
         for site, (identity_queries, _) in self._queries.items():
             while (query := identity_queries.poll()) is not None:
                 query.answer(self._identity(site))
-        while (change := self._presence.poll()) is not None:
-            parsed = topics.parse_key(change[0])
-            if parsed is not None:
-                (self.recorders.add if change[1] else self.recorders.discard)(parsed.boot)
+        for parts, alive in topics.read_presence(self._presence):
+            (self.recorders.add if alive else self.recorders.discard)(parts.boot)
         for event in read_events(self._recorder_events):
             if event.kind == "stored":
                 self._stored.setdefault(str(event.boot), set()).add(event.about)
@@ -200,23 +188,9 @@ class SiteStandIns:
         return self._header.topics.index(topic) if topic in self._header.topics else -1
 
     def _answer_backfill(self, site: str, query: Query) -> None:
-        try:
-            wanted = decode(query.payload, BackfillRequest)
-        except WireError:
-            return  # a stranger's: it gets no answer
-        channel = self._find_channel(site, wanted.channel)
-        first, payloads = self._history.chunk(channel, wanted.first, wanted.last)
-        made = self._history.made.get(channel, 0)
-        query.answer(
-            encode(
-                Backfill(
-                    member=site,
-                    boot=self._infos[site].boot,
-                    channel=wanted.channel,
-                    first=first,
-                    payloads=payloads,
-                    made=made,
-                )
-            )
-        )
-        self.refilled += len(payloads)
+        def find(wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
+            channel = self._find_channel(site, wanted.channel)
+            made = self._history.made.get(channel, 0)
+            return *self._history.chunk(channel, wanted.first, wanted.last), made
+
+        self.refilled += answer_backfill(query, site, self._infos[site].boot, find)

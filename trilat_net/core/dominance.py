@@ -35,11 +35,6 @@ def find_row_problem(row: Array, own: int) -> str | None:
     return None
 
 
-def upsilon(alpha: Array) -> Array:
-    """Returns Upsilon = alpha - I of Eq. (20), shape (N, N), for alpha of shape (N, N)."""
-    return alpha - np.eye(len(alpha))
-
-
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
     """Returns which site reaches which along links with a factor above 0, shape (N, N), for alpha so."""
     reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)

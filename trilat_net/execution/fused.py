@@ -152,7 +152,7 @@ class FusedRun:
         return tuple(map(largest_of_joints, self.buckets))
 
     @property
-    def totals(self) -> "RunTotals":
+    def totals(self) -> RunTotals:
         """Errors, effort and contact over the whole run."""
         ticks = self._progress["tick"].astype(np.float64)
         specs = self._scenario.sites.values()
@@ -178,7 +178,7 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Last record of each site, floats in the order of `kernel.EMITTED`, shape (N, 17)."""
+        """Last record of each site, floats as in `core.site_arrays.ROW_FLOATS`, shape (N, 17)."""
         rows = [
             self._sent[n, (int(progress["tick"]) - 1) % self._sent.shape[1]]["row"]
             for n, progress in enumerate(self._progress)

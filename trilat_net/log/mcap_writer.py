@@ -10,8 +10,8 @@ channels, and takes three times as long. The tests read this writer's files with
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import zstandard
 from mcap.opcode import Opcode
@@ -35,21 +35,16 @@ _OWED_ALWAYS = 512  # statistics without its counts, offsets of six groups, data
 
 
 class Sink(Protocol):
-    """A file, or a buffer that keeps bytes until `flush`."""
+    """A file, or a buffer that keeps bytes until `flush`.
+
+    One that has `reserve` is told how many bytes the end of the file will take.
+    """
 
     def write(self, data: bytes, /) -> int:
         """Takes bytes and returns how many."""
 
     def flush(self) -> None:
         """Writes them."""
-
-
-@runtime_checkable
-class ReservingSink(Protocol):
-    """A `Sink` that can reserve space for the end of the file."""
-
-    def reserve(self, size: int) -> None:
-        """Sets how many bytes the end of the file will take."""
 
 
 def pack_text(text: str) -> bytes:
@@ -87,7 +82,7 @@ class McapWriter:
         self.position = 0
         self.messages = 0
         self._stream = stream
-        self._reserve = stream.reserve if isinstance(stream, ReservingSink) else None
+        self._reserve: Callable[[int], None] | None = getattr(stream, "reserve", None)
         self._chunk_bytes = chunk_bytes
         self._compressor = zstandard.ZstdCompressor()
         self._open = bytearray()

@@ -84,8 +84,7 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    found = session.findings() if session.ours else session.find_lost_session()
-    return LogCheckResult([*files.findings(), *found], session.ours)
+    return LogCheckResult([*files.findings(), *session.findings()], session.ours)
 
 
 class MessageIdentity(NamedTuple):
@@ -369,13 +368,12 @@ class SessionCheck:
         epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
         return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, self._problems)
 
-    def find_lost_session(self) -> Iterator[CheckFinding]:
-        """Yields the problem of files with a digest chain and no session: that was taken out."""
-        if self._problems["chain"].wrong:
-            yield self._problems["chain"].finding("chain", "")
-
     def findings(self) -> Iterator[CheckFinding]:
-        """Yields the results, once all files were read."""
+        """Yields the results, once all files were read; without a session only that it was taken out."""
+        if not self.ours:
+            if self._problems["chain"].wrong:
+                yield self._problems["chain"].finding("chain", "")
+            return
         ticks = {check.member: check.ticks for check in self.channels.values() if check.ticks is not None}
         for check in self.channels.values():  # what a member published in the ticks that it stated
             if check.kind in (topics.STATE, topics.LINK) and check.member in ticks:

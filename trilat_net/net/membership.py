@@ -7,12 +7,15 @@ running members, waits for those that are present and can be pinged, and not for
 not join late: their arm would be in the wrong place.
 """
 
+import hashlib
+import platform
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 
+from ..core.fingerprint import compute_fingerprint
 from ..errors import SessionError, WireError
 from . import topics
 from .bus import Bus, Inbox
@@ -25,6 +28,14 @@ from .wire import M, decode, encode
 def new_boot() -> int:
     """Returns a random 64-bit number that names one start of one process."""
     return secrets.randbits(64)
+
+
+def describe_member(member: str, boot: int, clock: Clock, scenario: str = "", **fields: object) -> Info:
+    """Returns the identity of a member on this machine, with the text of its scenario, "" for none."""
+    digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
+    about = {"member": member, "boot": boot, "scenario_sha256": digest, "scenario": scenario}
+    machine = {"host": platform.node(), "clock": clock.identity(), "fingerprint": compute_fingerprint()}
+    return msgspec.convert({**about, **machine, **fields}, Info)
 
 
 def liveliness_token(session: str, member: str, boot: int) -> str:

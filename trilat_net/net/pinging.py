@@ -1,4 +1,4 @@
-"""Repeated queries over a slow network, and pings: round trips to members and the offsets of their clocks.
+"""Queries: repeated over a slow network, for missed messages, and pings, which tell of clocks.
 
 Invariant: a reply counts however many queries later it arrives, as long as its query is one of the last
 QUERIES_KEPT. A member answers a ping at once, in a thread of its bus, with its clock's reading; the asker
@@ -6,17 +6,17 @@ then knows that clock to half the round trip, however far the clocks differ.
 """
 
 from collections import deque
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
 
 from ..core.ticks import NS_PER_S
 from ..errors import WireError
 from . import topics
-from .bus import Bus, Inbox
+from .bus import Bus, Inbox, Query
 from .clock import Clock
 from .messages import Info
 from .offset import OffsetEstimate, OffsetEstimator, OffsetLimit, exact_offset, format_offset
-from .requests import Pong
+from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
@@ -85,6 +85,23 @@ def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
         )
 
     bus.respond(topics.key(session, info.member, topics.PING), answer)
+
+
+def answer_backfill(
+    query: Query, member: str, boot: int, find: Callable[[BackfillRequest], tuple[int, list[bytes], int]]
+) -> int:
+    """Answers a recorder's query for messages that it missed; returns how many it gets.
+
+    `find` returns the number of the first one, the messages, and how many the member has made.
+    """
+    try:
+        wanted = decode(query.payload, BackfillRequest)
+    except WireError:
+        return 0  # a stranger's: it gets no answer
+    first, payloads, made = find(wanted)
+    found: dict[str, Any] = {"channel": wanted.channel, "first": first, "payloads": payloads, "made": made}
+    query.answer(encode(Backfill(member=member, boot=boot, **found)))
+    return len(payloads)
 
 
 class RoundTrips:

@@ -56,16 +56,11 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
         *(f"assumed: {text}" for text in scenario.assumed),
-        *_describe_draws(scenario),
-    ]
-
-
-def _describe_draws(scenario: Scenario) -> list[str]:
-    """Returns the numbers that the seed drew, those alone that have a distribution."""
-    drawn = {key: one for key, one in scenario.drawn.items() if one.normal or one.uniform}
-    return [
-        f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
-        for key, one in drawn.items()
+        *(
+            f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
+            for key, one in scenario.drawn.items()
+            if one.normal or one.uniform
+        ),
     ]
 
 
