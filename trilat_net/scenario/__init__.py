@@ -5,55 +5,29 @@ path of the key and the nearest valid name.
 """
 
 from ..deprecated import lookup_of
-from .delay_models import Link
-from .expect import Expect
-from .laws import Adaptive, ProportionalDamped
-from .operators import Pulse
-from .override import apply_overrides
-from .run_changes import (
-    find_owner,
-    initial_link_tables,
-    parse_core_change,
-    resolve_change,
-    scheduled_link_tables,
-    to_core_change,
-)
-from .scenario_reader import (
-    find_site,
-    list_shipped,
-    load_scenario,
-    parse_embedded,
-    parse_scenario,
-    read_shipped,
-    read_template,
-)
-from .scenario_types import Arm, Limits, OnStale, Scenario, SiteSpec
-
-__all__ = [
-    "Adaptive",
-    "Arm",
-    "Expect",
-    "Limits",
-    "Link",
-    "OnStale",
-    "ProportionalDamped",
-    "Pulse",
-    "Scenario",
-    "SiteSpec",
-    "apply_overrides",
-    "find_owner",
-    "find_site",
-    "initial_link_tables",
-    "list_shipped",
-    "load_scenario",
-    "parse_core_change",
-    "parse_embedded",
-    "parse_scenario",
-    "read_shipped",
-    "read_template",
-    "resolve_change",
-    "scheduled_link_tables",
-    "to_core_change",
-]
+from .delay_models import Link as Link
+from .expect import Expect as Expect
+from .laws import Adaptive as Adaptive
+from .laws import ProportionalDamped as ProportionalDamped
+from .operators import Pulse as Pulse
+from .override import apply_overrides as apply_overrides
+from .run_changes import find_owner as find_owner
+from .run_changes import initial_link_tables as initial_link_tables
+from .run_changes import parse_core_change as parse_core_change
+from .run_changes import resolve_change as resolve_change
+from .run_changes import scheduled_link_tables as scheduled_link_tables
+from .run_changes import to_core_change as to_core_change
+from .scenario_reader import find_site as find_site
+from .scenario_reader import list_shipped as list_shipped
+from .scenario_reader import load_scenario as load_scenario
+from .scenario_reader import parse_embedded as parse_embedded
+from .scenario_reader import parse_scenario as parse_scenario
+from .scenario_reader import read_shipped as read_shipped
+from .scenario_reader import read_template as read_template
+from .scenario_types import Arm as Arm
+from .scenario_types import Limits as Limits
+from .scenario_types import OnStale as OnStale
+from .scenario_types import Scenario as Scenario
+from .scenario_types import SiteSpec as SiteSpec
 
 __getattr__ = lookup_of("scenario")
