@@ -22,8 +22,8 @@ def prepare(cpu: int | None) -> dict[str, str]:
     """Requests every setting that helps a loop, on a processor or any; returns what was obtained, by name."""
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
-        "timer_slack": _set_timer_slack,
-        "memory": _lock_memory,
+        "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
+        "memory": lambda: _call_libc("locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT),
         "scheduling": _set_scheduling,
         "collector": _stop_collector,
     }
@@ -43,23 +43,15 @@ def _set_affinity(cpu: int | None) -> str:
     return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 
-def _libc_call(function: str, *arguments: int) -> None:
+def _call_libc(obtained: str, function: str, *arguments: int) -> str:
+    """Calls a function of the C library; returns what it obtained."""
     if not sys.platform.startswith("linux"):
         raise AttributeError
     libc = ctypes.CDLL(None, use_errno=True)
     if getattr(libc, function)(*arguments) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
-
-
-def _set_timer_slack() -> str:
-    _libc_call("prctl", _PR_SET_TIMERSLACK, 1)
-    return "1 ns"
-
-
-def _lock_memory() -> str:
-    _libc_call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
-    return "locked"
+    return obtained
 
 
 def _set_scheduling() -> str:

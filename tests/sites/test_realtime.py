@@ -41,8 +41,8 @@ def test_every_step_says_what_it_obtained_and_a_process_stays_on_its_processor()
 
 @pytest.mark.parametrize("cpu", [-1, 1023, 2**80])
 def test_a_processor_that_is_not_there_is_a_warning(cpu: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    for step in ("_set_timer_slack", "_lock_memory", "_set_scheduling", "_stop_collector"):
-        monkeypatch.setattr(realtime, step, str)
+    for step in ("_call_libc", "_set_scheduling", "_stop_collector"):
+        monkeypatch.setattr(realtime, step, lambda *_: "")
     assert realtime.prepare(cpu)["affinity"].startswith("not obtained (")
 
 
@@ -50,7 +50,7 @@ REFUSE = "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
 
 
 def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
-    refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._libc_call = refuse"
+    refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._call_libc = refuse"
     obtained, collecting, _ = prepared(before=refuse)
     assert obtained["scheduling"].startswith("normal (")
     assert obtained["memory"] == obtained["timer_slack"] == "not obtained (Operation not permitted)"

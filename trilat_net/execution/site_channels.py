@@ -10,28 +10,23 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..core.ticks import Arrival, Mode, TickRecord, describe_divergence, describe_mode
-from ..log.accounting import Account
+from ..log.accounting import Account, number_message
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
 from ..log.log_writer import LogWriter
 from ..net import topics
-from ..net.loop_stats import ticks_per_stats
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.wire import encode, encode_state
 from .resumption import read_output
 
 
 class SiteEntry(NamedTuple):
-    """One message of the file; entries are written in order of `t_ns`, ns since the epoch.
-
-    `sequence` stands in the file; `number`, that in its channel, is for the account.
-    """
+    """One message of the file; entries are written in order of `t_ns`, ns since the epoch."""
 
     site: str
     t_ns: int
     sent_ns: int
     channel: str
     sequence: int
-    number: int
     payload: bytes
     message: Any
 
@@ -41,8 +36,7 @@ class SiteChannels:
 
     def __init__(self, session: str, site: str, boot: int, peers: tuple[str, ...], rate_hz: int) -> None:
         self.peers = peers
-        self._site, self._boot = site, boot
-        self._every = ticks_per_stats(rate_hz)
+        self._site, self._boot, self._rate_hz = site, boot, rate_hz
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self._mode = Mode.RUN
@@ -56,12 +50,9 @@ class SiteChannels:
         entries = [] if stats is None else [self.stats(stats)]
         if output.mode is not self._mode:
             self._mode = output.mode
-            if output.mode is Mode.DIVERGED:
-                entries.append(
-                    self.new_event("diverged", describe_divergence(self._site, output), output.t_ns)
-                )
-            else:
-                entries.append(self.new_event("mode", describe_mode(self._site, output), output.t_ns))
+            diverged = output.mode is Mode.DIVERGED
+            text = (describe_divergence if diverged else describe_mode)(self._site, output)
+            entries.append(self.new_event("diverged" if diverged else "mode", text, output.t_ns))
         return entries
 
     def end(self, t_ns: int | None = None) -> SiteEntry:
@@ -88,26 +79,23 @@ class SiteChannels:
             payload = encode_state(
                 state.site, state.boot, self.peers, output, arrivals, late_us, busy_us, sent_ns, state.echo
             )
-        return SiteEntry(
-            self._site, state.t_ns, sent_ns, topics.STATE, state.tick, state.tick, payload, state
-        )
+        return SiteEntry(self._site, state.t_ns, sent_ns, topics.STATE, state.tick, payload, state)
 
     def stats(self, stats: LinkStats) -> SiteEntry:
         """Returns the entry of link statistics."""
         payload = encode(stats if stats.v == VERSION else msgspec.structs.replace(stats, v=VERSION))
-        number = stats.tick // self._every
-        return SiteEntry(self._site, stats.t_ns, stats.t_ns, topics.LINK, stats.tick, number, payload, stats)
+        return SiteEntry(self._site, stats.t_ns, stats.t_ns, topics.LINK, stats.tick, payload, stats)
 
     def event(self, event: Event, n: int) -> SiteEntry:
         """Returns the entry of an event; `n` is its number if it has none of its own."""
         numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=n)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)
-        return SiteEntry(self._site, t_ns, t_ns, topics.EVENT, numbered.n, numbered.n, payload, numbered)
+        return SiteEntry(self._site, t_ns, t_ns, topics.EVENT, numbered.n, payload, numbered)
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
         """Writes an entry into a log."""
-        self.accounts[entry.channel].take(entry.number)
+        self.accounts[entry.channel].take(number_message(entry.channel, entry.sequence, self._rate_hz))
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
         key = self.keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)

@@ -26,7 +26,7 @@ from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
 from ..scenario.validate import refuse_external_arms
-from .site_channels import SiteChannels, SiteEntry, describe_accounts
+from .site_channels import SiteChannels, describe_accounts
 from .virtual_network import Network, PromptNetwork
 
 
@@ -106,27 +106,22 @@ def virtual_boot(scenario: Scenario, site: str) -> int:
     return int.from_bytes(hashlib.sha256(f"{scenario.sha256}/{site}".encode()).digest()[:8], "big")
 
 
-class _SiteLogWriter:
-    """Writes one site's channels of a virtual run."""
+class _VirtualChannels(SiteChannels):
+    """The channels of one site of a virtual run, written as it is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
-        self._boot = virtual_boot(scenario, site.name)
-        self._site, self._writer = site, writer
-        self._stats = LoopStats(site, self._boot, [scenario.sites[p].rate_hz for p in site.peers])
-        self._key = topics.key(scenario.name, site.name, topics.STATE)
-        self.channels = SiteChannels(scenario.name, site.name, self._boot, site.peers, site.rate_hz)
+        boot = virtual_boot(scenario, site.name)
+        super().__init__(scenario.name, site.name, boot, site.peers, site.rate_hz)
+        self._writer = writer
+        self._stats = LoopStats(site, boot, [scenario.sites[p].rate_hz for p in site.peers])
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        site, t_ns, k = self._site, output.t_ns, output.tick
-        payload = encode_state(site.name, self._boot, site.peers, output, arrivals, 0, 0)
-        self.channels.accounts[topics.STATE].take(k)
-        self._writer.add(self._key, payload, t_ns, t_ns, k, output)
-        stats = self._stats.take(output) if self._stats.due(k) else None
-        for entry in self.channels.follow(output, stats):
-            self.write(entry)
-
-    def write(self, entry: SiteEntry) -> None:
-        self.channels.write(entry, self._writer)
+        payload = encode_state(self._site, self._boot, self.peers, output, arrivals, 0, 0)
+        self.accounts[topics.STATE].take(output.tick)
+        self._writer.add(self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output)
+        stats = self._stats.take(output) if self._stats.due(output.tick) else None
+        for entry in self.follow(output, stats):
+            self.write(entry, self._writer)
 
 
 def write_virtual_log(
@@ -154,14 +149,14 @@ def write_virtual_log(
     """
     check_virtual(scenario, as_named=as_named)
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
-    members: dict[str, _SiteLogWriter] = {}
+    members: dict[str, _VirtualChannels] = {}
     within = True
     t_ns = 0
     try:
         with process.pause_gc():
             for site, arrivals, output in execute_virtual(scenario, network):
                 if site.name not in members:
-                    members[site.name] = _SiteLogWriter(scenario, site, writer)
+                    members[site.name] = _VirtualChannels(scenario, site, writer)
                 members[site.name].tick(arrivals, output)
                 within &= output.mode is not Mode.DIVERGED
                 t_ns = output.t_ns
@@ -170,17 +165,17 @@ def write_virtual_log(
     except LawFailed as failed:
         if failed.site not in members:
             without_law = Site(scenario.setup(failed.site)._replace(own=None))
-            members[failed.site] = _SiteLogWriter(scenario, without_law, writer)
+            members[failed.site] = _VirtualChannels(scenario, without_law, writer)
         member = members[failed.site]
-        member.write(member.channels.new_event("failed", str(failed), t_ns))
+        member.write(member.new_event("failed", str(failed), t_ns), writer)
         raise
     finally:  # the file is finished however the run ends
         try:
             for member in members.values():
                 if not writer.ended:
-                    member.write(member.channels.end(t_ns))
+                    member.write(member.end(t_ns), writer)
         finally:
-            writer.finish(describe_accounts(member.channels for member in members.values()))
+            writer.finish(describe_accounts(members.values()))
     return within
 
 

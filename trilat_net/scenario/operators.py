@@ -251,7 +251,6 @@ OPERATORS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for on
 ENVIRONMENTS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Environment)}
 """The operators and the environments by the name of their kind."""
 
-_PLANE = ("stiffness_n_m", "damping_n_s_m")
 _TIME = "a time of at least 0 s"
 _ANGLES = "one angle for both joints or two, rad"
 _POINT = "two numbers, x and y, m"
@@ -261,10 +260,9 @@ _WORDS = {
     **dict.fromkeys(("start_s", "end_s", "move_start_s", "move_end_s"), _TIME),
     **dict.fromkeys(("from_rad", "to_rad"), _ANGLES),
     **dict.fromkeys(("from_m", "to_m", "point_m"), _POINT),
-    "peak_nm": "one torque for both joints or two, ON the arm, N m",
+    **dict.fromkeys(("peak_nm", "amplitude_nm"), "one torque for both joints or two, ON the arm, N m"),
     "stiffness_nm_rad": f"{_GAIN}, N m/rad",
     "damping_nm_s_rad": f"{_GAIN}, N m s/rad",
-    "amplitude_nm": "one torque for both joints or two, ON the arm, N m",
     **dict.fromkeys(("from_hz", "to_hz"), "a frequency above 0 and up to 1000 Hz"),
     "sweep_s": "a duration above 0 s",
     "frequencies_hz": "a list of 1 to 64 frequencies above 0 and up to 1000 Hz",
@@ -272,10 +270,10 @@ _WORDS = {
     "normal": "two numbers, x and y: to which side the wall is free",
     "points": f"a list of rows {_ROW}",
     "sampled": "true or false",
-}
-_PLANE_GAINS = {
-    "tip_spring": "one number for both axes or two, at least 0",
-    "wall": "a number of at least 0",
+    "tip_spring.stiffness_n_m": "one number for both axes or two, at least 0, N/m",
+    "tip_spring.damping_n_s_m": "one number for both axes or two, at least 0, N s/m",
+    "wall.stiffness_n_m": "a number of at least 0, N/m",
+    "wall.damping_n_s_m": "a number of at least 0, N s/m",
 }
 """The values that a key takes, for an author who gave it another or none."""
 _SHOWN = 60
@@ -329,9 +327,7 @@ def _check_values(table: TomlTable, kind: StructType, entry: TomlTable, path: st
     """Refuses a wrong or a missing value, with the values that its key takes."""
 
     def describe_values(key: str) -> str:
-        if key not in _PLANE:
-            return _WORDS[key]
-        return f"{_PLANE_GAINS[table['kind']]}, {('N/m', 'N s/m')[_PLANE.index(key)]}"
+        return _WORDS.get(key) or _WORDS[f"{table['kind']}.{key}"]
 
     try:
         msgspec.convert(table, kind)
