@@ -43,6 +43,7 @@ class SiteReception:
         accounts: its messages by channel.
         made: number of its ticks, once its end event has arrived; else None.
         heard_ns: arrival of its last message, on the recorder's clock; None before.
+        period_ns: its tick period.
     """
 
     def __init__(self, scenario: Scenario, name: str, boot: int | None) -> None:
@@ -52,15 +53,11 @@ class SiteReception:
         self.heard_ns: int | None = None
         self._boot = boot
         self._rate_hz = scenario.sites[name].rate_hz
+        self.period_ns = 1_000_000_000 // self._rate_hz
         self._ticks = scenario.ticks(name)
         self._most = {
             channel: count_messages(channel, self._ticks, self._rate_hz) for channel in SITE_CHANNELS
         } | {topics.EVENT: _MANY}
-
-    @property
-    def period_ns(self) -> int:
-        """Its tick period."""
-        return 1_000_000_000 // self._rate_hz
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
         """Decodes a payload.

@@ -4,6 +4,8 @@ Invariant: an error carries its data and one sentence that names the problem, it
 command line prints that sentence and nothing else; `exit_code` is the code that a command ends with.
 """
 
+from functools import partial
+
 
 class TrilatError(Exception):
     """Base of all errors that a user can act on; a command ends with `exit_code`."""
@@ -88,11 +90,7 @@ class LawFailed(RunFailed):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Restores the error of another process."""
-        return _law_failed, (self.problem, self.site, self.law, self.tick)
-
-
-def _law_failed(problem: str, site: str, law: str, tick: int | None) -> LawFailed:
-    return LawFailed(problem, site=site, law=law, tick=tick)
+        return partial(LawFailed, site=self.site, law=self.law, tick=self.tick), (self.problem,)
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md

@@ -20,7 +20,8 @@ def M_of(theta: Array, q: Array) -> Array:
 
 
 def C_of(theta: Array, q: Array, qd: Array) -> Array:
-    return np.array(two_link_arm.coriolis(theta, q, qd))
+    """C(q, qd), column by column: Y(q, qd, v, 0) theta without gravity is C v."""
+    return np.column_stack([Y_of(0.0, q, qd, v, np.zeros(2)) @ theta for v in np.eye(2)])
 
 
 def G_of(theta: Array, g: float, q: Array) -> Array:

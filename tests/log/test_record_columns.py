@@ -127,11 +127,9 @@ def test_a_payload_that_is_too_long_is_refused() -> None:
 
 
 def test_records_that_came_out_of_order_are_put_in_order_with_their_times() -> None:
-    from trilat_net.log.site_log import MessageTimes
-
     payloads = [msgpack.packb({**GOOD, "tick": tick}) for tick in (4, 2, 3)]
     came = np.array([40, 20, 30])
-    part = SiteLog("m1", PEERS, 1000, payloads, "log", MessageTimes(came, came + 1))
+    part = SiteLog("m1", PEERS, 1000, payloads, "log", (came, came + 1))
     assert part.tick.tolist() == [2, 3, 4]
     assert part.log_time_ns.tolist() == [20, 30, 40]
     assert part.publish_time_ns.tolist() == [21, 31, 41]

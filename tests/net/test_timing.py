@@ -227,8 +227,6 @@ def test_figures_are_of_what_came_since_the_last_and_faults_since_the_start() ->
     assert figures(link) == (3, 900, -1, 1)
     assert figures(link) == (-1, -1, -1, 1)
     assert link.worst_ns == 5_000
-    link.reset_faults()
-    assert link.worst_ns == 0
 
 
 def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:

@@ -78,14 +78,6 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 
 @leaf
-def coriolis(theta: Vector, q: Vector, qd: Vector) -> tuple[Pair, Pair]:
-    """Returns C(q, qd), two rows, kg m^2/s, by Christoffel symbols, so that Eq. (4) holds."""
-    s2, _ = sincos(q[1])
-    h = -theta[1] * s2
-    return (h * qd[1], h * (qd[0] + qd[1])), (-h * qd[0], 0.0)
-
-
-@leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
     """Returns G(q), N m."""
     s1, c1 = sincos(q[0])

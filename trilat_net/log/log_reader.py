@@ -44,7 +44,7 @@ from .digest_chain import Integrity
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
-from .site_log import MessageTimes, SiteLog, TimedMessages
+from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
     import polars
@@ -237,7 +237,7 @@ class Log:
             raise KeyError(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
-            rate_hz, times = self.scenario.sites[site].rate_hz, MessageTimes(*channel.times())
+            rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
             part = SiteLog(site, self.scenario.peers(site), rate_hz, channel.payloads, self.source, times)
             most, last = self.scenario.ticks(site), part.last_tick
             if last >= most:  # a tick of others is nothing to count up to

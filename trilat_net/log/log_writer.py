@@ -400,11 +400,6 @@ class LogParts:
         """How many bytes all parts have so far."""
         return self._before_bytes + self._writer.written_bytes
 
-    @property
-    def ended(self) -> bool:
-        """True once nothing more can be added: it is finished, or the disk has refused."""
-        return self._writer.ended
-
     def add(
         self,
         key: str,

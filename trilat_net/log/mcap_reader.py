@@ -178,17 +178,16 @@ class McapReader:
             case Opcode.METADATA:
                 entry = parse_record(frame.opcode, content)
                 self.metadata[entry.name] = entry.metadata
-                if entry.name != CHAIN:
-                    self._chain.add_entry(frame.opcode, content)
+                if entry.name == CHAIN:
+                    return b""
             case Opcode.ATTACHMENT:
                 attachment = parse_record(frame.opcode, content)
                 if not has_right_crc(content):
                     raise UnreadableRecord(f"the attachment {attachment.name[:80]!r}: its CRC differs")
                 self.attachments[attachment.name] = attachment.data
-                self._chain.add_entry(frame.opcode, content)
             case Opcode.HEADER:
-                self._chain.add_entry(frame.opcode, content)
                 self.library = parse_record(frame.opcode, content).library
+        self._chain.add_entry(frame.opcode, content)
         return b""
 
     def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:

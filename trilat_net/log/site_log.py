@@ -109,13 +109,6 @@ class RecordsByTick(Mapping[int, State]):
         return len(set(self._ticks))
 
 
-class MessageTimes(NamedTuple):
-    """Times at which messages came and were sent, Unix ns, shape (K,) each."""
-
-    log_ns: Ints
-    publish_ns: Ints
-
-
 class TimedMessages(NamedTuple, Generic[M]):
     """Messages with the times at which they came and were sent, Unix ns, shape (K,) each."""
 
@@ -145,11 +138,12 @@ class SiteLog:
         rate_hz: its tick rate, Hz.
         payloads: the records as published.
         source: the file's name in errors.
-        times: when they came; by default 0.
+        times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
 
     Attributes:
         payloads: the records as published, in tick order.
         tick: their ticks, shape (K,).
+        log_time_ns, publish_time_ns: when each came, and was sent by its own stamp, shape (K,), Unix ns.
 
     Raises:
         LogError: a record cannot be read; every property raises it too, for the fields that it decodes.
@@ -162,19 +156,19 @@ class SiteLog:
         rate_hz: int,
         payloads: Sequence[bytes],
         source: str,
-        times: MessageTimes | None = None,
+        times: tuple[Ints, Ints] | None = None,
     ) -> None:
         self.name, self.peers, self.rate_hz = name, peers, rate_hz
         self._source = source
         self.payloads = payloads
         self.tick = self._read(record_columns.decode_ticks)
         zeros = np.zeros(len(payloads), dtype=np.int64)
-        self._times = times or MessageTimes(zeros, zeros)
+        self.log_time_ns, self.publish_time_ns = times or (zeros, zeros)
         if (self.tick[1:] < self.tick[:-1]).any():
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = [payloads[n] for n in order.tolist()]
-            self._times = MessageTimes(*(column[order] for column in self._times))
+            self.log_time_ns, self.publish_time_ns = self.log_time_ns[order], self.publish_time_ns[order]
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -259,16 +253,6 @@ class SiteLog:
     def t_s(self) -> Array:
         """Nominal time since the epoch, shape (K,), s."""
         return self.t_ns / NS_PER_S
-
-    @property
-    def log_time_ns(self) -> Ints:
-        """When each record came, shape (K,), Unix ns."""
-        return self._times.log_ns
-
-    @property
-    def publish_time_ns(self) -> Ints:
-        """When each record was sent, by its own stamp, shape (K,), Unix ns."""
-        return self._times.publish_ns
 
     @property
     def e(self) -> Array:

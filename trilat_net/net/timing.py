@@ -101,7 +101,7 @@ class LinkTimingMonitor:
     Attributes:
         newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
         faults: impossible stamps since the start.
-        worst_ns: largest time by which a sample arrived before it was sent, since `reset_faults`.
+        worst_ns: largest time by which a sample arrived before it was sent, since the last report.
         contradicted: whether windows contradicted each other since then.
     """
 
@@ -174,11 +174,6 @@ class LinkTimingMonitor:
         self.offset.slew_to(from_ns, estimate)
         return estimate
 
-    def reset_faults(self) -> None:
-        """Starts a new report of impossible stamps."""
-        self.worst_ns = 0
-        self.contradicted = False
-
     def measured(self, now_ns: int) -> dict[str, int]:
         """Returns the link's timing fields of `LinkStats` since the last call."""
         delays, rtt_ns = sorted(self._delays), self._rtt_ns
@@ -249,7 +244,7 @@ class SiteTiming:
             if faulty and now_ns - self._faults_ns[n] >= FAULT_EVERY_NS:
                 self._faults_ns[n] = now_ns
                 notices.append(_fault_notice(meter))
-                meter.reset_faults()
+                meter.worst_ns, meter.contradicted = 0, False
         if self._leader is not None:
             offset = self._leader.offset
             leader_ns = due_ns + offset.at(due_ns) - self._leader.peer.epoch_ns

@@ -174,11 +174,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-
-
-def _join_lines(numbers: re.Match[str]) -> str:
-    """Returns a list of numbers on one line."""
-    return "[" + ", ".join(line.strip(" ,") for line in numbers[0][1:-1].split()) + "]"
+"""A list of numbers, one a line."""
 
 
 class Scenario(Frozen, frozen=True, dict=True):
@@ -242,7 +238,9 @@ class Scenario(Frozen, frozen=True, dict=True):
             for key, absent in _ABSENT.items():
                 if table.get(key) in absent:
                     del table[key]
-        numbers = _NUMBERS.sub(_join_lines, tomli_w.dumps(tables))
+        numbers = _NUMBERS.sub(
+            lambda one: " ".join(one[0].split()).replace("[ ", "[").replace(", ]", "]"), tomli_w.dumps(tables)
+        )
         return tomli_w.dumps(words, multiline_strings=True) + numbers
 
     @cached_property
