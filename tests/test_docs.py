@@ -1,6 +1,7 @@
 """The documentation: numbers have a test or a command beside them; commands, tests and limits are real."""
 
 import ast
+import math
 import re
 import shlex
 from collections.abc import Iterator
@@ -9,20 +10,31 @@ from pathlib import Path
 
 import pytest
 
-from recorder import backfill
-from sites import change_server, external_arm, retransmit_buffer, shutdown
+from recorder import backfill, record_process, session_recording
+from recorder.play import pace
+from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
 from tests.cli.running import parses
 from trilat_net.analysis import run_end, site_signals
 from trilat_net.analysis.certificate import premises
-from trilat_net.analysis.metrics import impedance, static_windows
-from trilat_net.core import delay, link
-from trilat_net.log import accounting, log_file
-from trilat_net.net import arm_port, requests, session, timing, zenoh_config
-from trilat_net.scenario import resolve
-from trilat_net.studies import executor
-from trilat_net.studies.sweep import cell_result, sweep_plan
+from trilat_net.analysis.certificate import stability_certificate as certificates
+from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
+from trilat_net.core import delay, link, ticks, user_law
+from trilat_net.execution import difference
+from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
+from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
+from trilat_net.scenario import resolve, scenario_reader
+from trilat_net.studies import dask_cluster, executor
+from trilat_net.studies.sweep import cell_result, live_confirmation, margin_search, sweep_plan, sweep_run
 from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
-from trilat_net.theory import characteristic_roots, linear_edge, port_transparency
+from trilat_net.theory import (
+    characteristic_roots,
+    equilibrium,
+    linear_analysis,
+    linear_edge,
+    port_response,
+    port_transparency,
+    tick_map,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -34,6 +46,7 @@ EVIDENCE = re.compile(
     re.MULTILINE,
 )
 
+MOST_RANDOM_ERROR = math.sqrt((impedance.MIN_COHERENCE**-2 - 1.0) / (2.0 * impedance.MIN_SEGMENTS))
 STATED: list[tuple[str, str, float, float]] = [
     ("definitions.md", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
     ("design.md", "at most 200 ppm", 200.0, timing.SLEW_LIMIT / 1e3),
@@ -88,6 +101,61 @@ STATED: list[tuple[str, str, float, float]] = [
     ("sweep.md", "by more than 2 %", 2, 100 * cell_result.FLAT_LOG_CHANGE),
     ("sweep.md", "in batches of about 2 s", 2, executor.CLUSTER_BATCH_S),
     ("sweep.md", "0.4 s on this machine", 0.4, executor.BATCH_S),
+    (
+        "certificate.md",
+        "unexplained than 2e-4 of the largest energy",
+        2e-4,
+        certificates.BROKEN_BALANCE_SHARE,
+    ),
+    ("certificate.md", "less than 1e-3 is unexplained", 1e-3, certificates.CLEAR_BREAK_SHARE),
+    ("certificate.md", "up to 1e-4 of the largest energy", 1e-4, certificates.SAMPLING_RISE_SHARE),
+    ("certificate.md", "more than 1e-2 of the largest energy", 1e-2, certificates.COARSE_TOLERANCE_SHARE),
+    ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
+    ("certificate.md", "`--min-coverage` (0.999)", 0.999, integrity.MIN_COVERAGE),
+    ("definitions.md", "<= 0.01 rad/s and", 0.01, run_end.SETTLED_SPEED_RAD_S),
+    ("definitions.md", "and a tenth of the run", 0.1, run_end.LEAST_JUDGED_SHARE),
+    ("definitions.md", "largest values of 50 ms", 50, 1e3 / ticks.BUCKETS_PER_S),
+    ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * integrity.MIN_COVERAGE),
+    ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
+    ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
+    ("linear.md", "Up to 600 numbers", 600, tick_map.MAX_COMPANION_SIZE),
+    ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),
+    ("linear.md", "to a residual of 1e-10", 1e-10, equilibrium.MAX_EQUILIBRIUM_RESIDUAL),
+    ("linear.md", "1e-12 of the terms' size", 1e-12, characteristic_roots.ROOT_RESIDUAL_TOLERANCE),
+    ("linear.md", "regula falsi to 1e-6", 1e-6, linear_edge.EDGE_TOLERANCE),
+    ("linear.md", "if it differs by more than 1 %", 1, 100 * linear_analysis.SAMPLED_ROOT_DIFFERENCE),
+    ("log-tools.md", "After 100 such places", 100, mcap_records.MAX_DAMAGED_PARTS),
+    ("log-tools.md", "max(32 MiB, 32 x its own size)", 32, mcap_records.MAX_UNPACKED_BYTES / 2**20),
+    ("log-tools.md", "32 x its own size", 32, mcap_records.MAX_UNPACKED_RATIO),
+    ("log-tools.md", "max(64 MiB, 300 x the file's size)", 64, mcap_reader.KEPT_BYTES / 2**20),
+    ("log-tools.md", "300 x the file's size", 300, mcap_reader.KEPT_RATIO),
+    ("log-tools.md", "at most 32 sites", 32, resolve.MAX_SITES),
+    ("log-tools.md", "links of a site up to 64 MiB", 64, scenario_reader.MAX_LINKS_BYTES / 2**20),
+    ("log-tools.md", "of more than 65 536 only", 65_536, site_log.MAX_DECODED_RECORDS),
+    ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, difference.TOLERANCE),
+    ("log-tools.md", "sleep until 150 us before", 150, pace.SPIN_NS / 1e3),
+    ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
+    ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),
+    ("maps/README.md", "took at most 60 s", 60, live_confirmation.MAX_SESSION_S),
+    ("metrics.md", "at least 4 independent stretches", 4, impedance.MIN_SEGMENTS),
+    ("metrics.md", "at most 17.2 %", 17.2, math.ceil(1e3 * MOST_RANDOM_ERROR) / 10),
+    ("metrics.md", "the same of the last 5 s", 5, motion_metrics.LONG_END_S),
+    ("network.md", "Each window of 1 s", 1, timing.WINDOW_NS / 1e9),
+    ("network.md", "over all floors of 60 windows", 60, offset.WINDOWS_KEPT),
+    ("network.md", "less than 500 ppm", 500, offset.DRIFT_LIMIT / 1e3),
+    ("network.md", "follow a line to 1 ppm", 1, offset.WANDER / 1e3),
+    ("own-controller.md", "at most 1024 numbers", 1024, user_law.MAX_LAW_MEMORY),
+    ("own-controller.md", "three quarters of the period", 0.75, law_watchdog.SHARE),
+    ("own-controller.md", "at half a second of overtime", 0.5, law_watchdog.MOST_NS / 1e9),
+    ("own-controller.md", "for 50 ms at most", 50, law_watchdog.HICCUP_NS / 1e6),
+    ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
+    ("recording.md", "it flushes every 80 ms", 80, record_process.FLUSH_NS / 1e6),
+    ("recording.md", "the last 4096 events", 4096, retransmit_buffer.EVENTS_KEPT),
+    ("sweep.md", "more than a million runs", 1e6, sweep_run.MAX_RUNS),
+    ("sweep.md", "or more than a day", 1, sweep_run.MAX_SWEEP_S / 86_400),
+    ("sweep.md", "after 10 s, exit code 2", 10, dask_cluster.CONNECT_S),
+    ("sweep.md", "without a worker for a minute", 60, dask_cluster.NO_WORKER_S),
+    ("sweep.md", "three of them is named", 3, executor.MAX_LOSSES),
 ]
 """Page, words, the number in them, and the program's own."""
 

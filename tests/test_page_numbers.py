@@ -17,9 +17,11 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import uniform
 
+import trilat_net
 from tests.analysis.certificate import runs
 from tests.analysis.test_link_summary import in_order, newest_wins
 from tests.cli.running import trilat
+from tests.theory import test_dde, test_energy
 from tests.theory.figures_of_runs import measured, value
 from tests.theory.loops import RODS
 from tests.virtual_runs import sampled
@@ -215,6 +217,13 @@ def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
+def distances(scheme: str) -> list[float]:
+    """From the exact solution of `paper`, rad, at three rates, and the orders between them."""
+    far = [test_dde.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
+    return [*far, *test_dde.order("paper", scheme)]
+
+
+SHIPPED = sorted(path.stem for path in (ROOT / "trilat_net/scenarios").glob("[a-z0-9]*.toml"))
 DELAYS_MS = (20, 100, 200, 400, 800, 1600)
 SETTLING_MS = (0, 20, 50, 100, 200, 400, 800)
 
@@ -343,8 +352,21 @@ PAGES: dict[str, dict[str, Make]] = {
             fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
         ],
     },
+    "docs/benchmarks.md": {
+        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances("second_order"),
+        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances("digital"),
+        "part of max V | `paper` {}, `asymmetric` {}; orders {} and {}": lambda: [
+            *[test_energy.booked(name).residual for name in ("paper", "asymmetric")],
+            *[test_energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
+        ],
+        "the same with `digital` | {}, order {} and {}": lambda: [
+            test_energy.booked("paper", "digital").residual,
+            *[test_energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
+        ],
+        "{} runs of the": lambda: [sum(len(trilat_net.trials(one, seeds=range(1, 21))) for one in SHIPPED)],
+    },
     "README.md": {
-        "{} scenarios show one": lambda: [len(list((ROOT / "trilat_net/scenarios").glob("[a-z0-9]*.toml")))],
+        "{} scenarios show one": lambda: [len(SHIPPED)],
         "seeded: {} delay models": lambda: [len(DELAY_MODELS)],
     },
 }

@@ -3,7 +3,7 @@
 Invariant: a response without sufficient excitation is undecided, with a reason. It is given at the spectral
 line with the strongest drive, and at all that are driven nearly as much, if at least `MIN_SEGMENTS`
 independent segments excite the line and both signals have a coherence of at least `MIN_COHERENCE` with the
-drive: then its random error is below 17 %.
+drive: then its random error is at most 17.2 %.
 
 In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its own that
 depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources (Welch; Bendat and Piersol;
