@@ -104,20 +104,18 @@ class Recorder:
             log.so_far = partial(recording.account_texts, self._queue)
             report = RecorderReport(self._bus, self._clock, recording, self._queue, lambda: log.written_bytes)
             self._begin(recording, epoch, log.path)
-            discarded = InboundQueue(self._clock)  # on a full disk there is no room for the queue
-            discarded.overflowed = self._queue.overflowed
-            rest = self._queue
+            has_room = True  # on a full disk there is none for the queue
             try:
                 self._run(recording, report)
             except LogRefused:
-                rest = discarded
+                has_room = False
                 raise
             finally:
                 report.publish()
                 try:
-                    recording.finish(rest)
+                    recording.finish(self._queue, rest=has_room)
                 except LogRefused:
-                    recording.finish(discarded)
+                    recording.finish(self._queue, rest=False)
                     raise
         return recording
 

@@ -198,9 +198,10 @@ class Recording:
         """Hands everything so far to the operating system."""
         self._writer.flush()
 
-    def finish(self, queue: InboundQueue) -> None:
-        """Writes the rest of the queue, the accounts and the end mark."""
-        self._drain(queue, None)
+    def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
+        """Writes the rest of the queue, if that is wanted, the accounts and the end mark."""
+        if rest:
+            self._drain(queue, None)
         self._overflowed = sum(queue.overflowed.values())
         self._writer.finish(self.account_texts(queue))
 

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from trilat_net.log.record_columns import Ints
 
 PlayedMessage = tuple[int, int, int, bytes]
 """Time in ns since the epoch, channel, number in it, and payload of a message.

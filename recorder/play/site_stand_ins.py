@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import WireError
+from trilat_net.log.record_columns import Ints
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
@@ -22,7 +23,7 @@ from trilat_net.net.pinging import RepeatedQuery, answer_backfill, answer_pings
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 from trilat_net.net.wire import decode, encode
 
-from .batch import Ints, MessageBatch
+from .batch import MessageBatch
 from .pace import Pace
 from .session_reader import SessionHeader
 

@@ -203,7 +203,7 @@ def test_another_measurement_in_the_record_is_another_torque() -> None:
 
 def test_virtual_time_has_no_arm_outside() -> None:
     scenario = load_scenario("two_sites", {"sites.s.plant": "external"})
-    with pytest.raises(ScenarioError, match="virtual time has none"):
+    with pytest.raises(ScenarioError, match="runs live only"):
         virtual.write_virtual_log(scenario, io.BytesIO())
-    with pytest.raises(ScenarioError, match="virtual time has none"):
+    with pytest.raises(ScenarioError, match="runs live only"):
         next(virtual.execute_virtual(scenario))

@@ -114,19 +114,17 @@ def find_user_laws(scenario: Scenario, source: str = "") -> list[LoggedUserLaw]:
     Raises:
         ScenarioError: the file of a law does not exist.
     """
-    laws: dict[tuple[str, str], tuple[ImportedLaw, list[str]]] = {}
+    found: dict[tuple[str, str], LoggedUserLaw] = {}
     for name, spec in scenario.sites.items():
-        if isinstance(spec.control, ImportedLaw):
-            law = spec.control
-            laws.setdefault((law.code, law.source_sha256), (law, []))[1].append(name)
-    found = []
-    for law, sites in laws.values():
+        if not isinstance(law := spec.control, ImportedLaw):
+            continue
+        known = found.get(key := (law.code, law.source_sha256))
         try:
-            changed = law.changed() or ""
+            changed = known.changed if known else law.changed() or ""
         except ScenarioError as error:
-            raise ScenarioError(error.problem, path=f"sites.{sites[0]}.control", source=source) from None
-        found.append(LoggedUserLaw(law.code, tuple(sites), changed))
-    return found
+            raise ScenarioError(error.problem, path=f"sites.{name}.control", source=source) from None
+        found[key] = LoggedUserLaw(law.code, (*(known.sites if known else ()), name), changed)
+    return list(found.values())
 
 
 PROGRESS_EVERY = 256

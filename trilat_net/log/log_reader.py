@@ -29,6 +29,7 @@ from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
 from ..scenario import Scenario, parse_core_change, parse_embedded
+from ..scenario.delay_traces import TracePoint
 from .accounting import SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
@@ -386,11 +387,7 @@ def _measure(stream: BinaryIO) -> int:
     return size - here
 
 
-DelayRow = tuple[float, float]
-"""A sample's stamp, s since the epoch, and its delay, ms; a delay of infinity is a sample lost."""
-
-
-def read_link_delays(path: Path, link: str) -> list[DelayRow]:
+def read_link_delays(path: Path, link: str) -> list[TracePoint]:
     """Returns the delays of the samples of a link such as "m1->s", by their own stamps.
 
     These are the delays of the network that carried them, as the receiver's records have them in `rx`,
@@ -413,7 +410,7 @@ def read_link_delays(path: Path, link: str) -> list[DelayRow]:
 
 
 @lru_cache(maxsize=1)
-def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[DelayRow]]:  # noqa: ARG001
+def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
     """Returns the rows of every link of a log; a scenario asks for one after the other."""
     try:
         log = open_log(path)
@@ -423,7 +420,7 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Delay
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
 
 
-def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[DelayRow]:
+def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[TracePoint]:
     states = log[site].states
     delays_us: dict[int, int] = {}
     for state in states:

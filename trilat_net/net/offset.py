@@ -22,9 +22,9 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.ticks import NS_PER_S
+from ..core.vectors import Array
 
 WINDOWS_KEPT = 60
 DRIFT_LIMIT = 500_000.0
@@ -34,8 +34,6 @@ WANDER = 1_000.0
 _NOISE_NS = 3_000.0
 _PRIOR = 100_000.0  # of the drift, ns/s: decides only while the windows span less than a second
 _ROUNDS = 3
-
-Array = NDArray[np.float64]
 
 
 class OffsetLimit(NamedTuple):
