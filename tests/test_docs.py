@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -22,7 +23,7 @@ from trilat_net.core import delay, link, ticks, user_law
 from trilat_net.execution import difference
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import resolve, scenario_reader
+from trilat_net.scenario import laws, operators, resolve, scenario_reader
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.sweep import cell_result, live_confirmation, margin_search, sweep_plan, sweep_run
 from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
@@ -225,3 +226,9 @@ def test_a_command_on_a_page_parses_as_it_is_written(words: list[str]) -> None:
 
 def test_most_pages_have_commands() -> None:
     assert len(WRITTEN) > 60
+
+
+def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> None:
+    text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
+    kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
+    assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
