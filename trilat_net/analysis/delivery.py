@@ -19,10 +19,9 @@ from ..core.ticks import NS_PER_S
 from ..core.vectors import Array, Row
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
+from .aligned import Bools
 
 _BLOCK = 8192
-
-Bools = NDArray[np.bool_]
 
 
 class PredictedDelivery(NamedTuple):

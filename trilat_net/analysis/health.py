@@ -4,10 +4,9 @@ Invariant: keys end in their unit; a quantity that the log does not determine is
 estimates are those in force while the session ran, without later improvement.
 """
 
-import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.ticks import NS_PER_S
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
+from .json_values import JsonObject
 from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns
 
 
@@ -60,8 +60,6 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
         faults=stats[-1].clock_faults.get(peer, 0),
     )
 
-
-JsonObject = dict[str, Any]
 
 _PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")
 _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
@@ -147,11 +145,6 @@ def percentiles(
         return None
     found = (np.percentile(array, list(shares.values())) / unit).tolist()
     return dict(zip(shares, found, strict=True))
-
-
-def finite_or_none(value: float) -> float | None:
-    """Returns a number for JSON; None for NaN and infinity, which it has no words for."""
-    return value if math.isfinite(value) else None
 
 
 def made_ticks(log: Log, site: str) -> int | None:

@@ -42,7 +42,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from .site_signals import SETTLED_ERROR_RAD
-from .timeline import diverged_at_s
+from .timeline import first_divergence_s
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
@@ -266,7 +266,7 @@ def trace_log(log: Log) -> RunTrace:
             for part in parts
         ],
         [part.tau_x[-1] if len(part) else np.zeros(JOINTS) for part in parts],
-        min((at_s for part in parts if (at_s := diverged_at_s(part)) is not None), default=None),
+        first_divergence_s(log),
         max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
     )
 

@@ -10,7 +10,7 @@ from ..core.two_link_arm import JOINTS
 from ..log.log_reader import Log
 from ..scenario.expect import END_WINDOW_S
 from . import health
-from .health import JsonObject, finite_or_none
+from .json_values import JsonObject, finite_or_none
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
 from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_s
 from .timeline import diverged_at_s, find_mode_intervals, list_changes

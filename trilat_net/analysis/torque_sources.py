@@ -22,6 +22,11 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 """Relative difference up to which a torque is the scenario's."""
 
 
+def list_walls(spec: SiteSpec) -> list[TorqueSource]:
+    """Returns the walls of a site, in scenario order."""
+    return [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
+
+
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
     """Returns the depth of an end effector in a wall, shape (K,), m; negative outside of it."""
     found: Array = (np.array(wall.a) - end_effector.at) @ np.array(wall.b)

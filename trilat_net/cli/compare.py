@@ -121,6 +121,7 @@ def _run_tuning(
 
 
 def _print_procedure(asked: "TuningPlan", workers: int) -> None:
+    from ..studies.sweep.sweep_run import format_wall_time
     from ..studies.tuning.tuning_report import describe_procedure
 
     laws = ", ".join(space.law for space in asked.spaces)
@@ -128,16 +129,10 @@ def _print_procedure(asked: "TuningPlan", workers: int) -> None:
     for line in describe_procedure(asked):
         terminal.print_text(f"  {line}")
     cores = "1 core" if workers == 1 else f"{workers} cores"
-    duration = _format_duration(asked.estimate_s(workers))
+    duration = format_wall_time(asked.estimate_s(workers))
     terminal.print_text(
         f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
     )
-
-
-def _format_duration(seconds: float) -> str:
-    if seconds < 90.0:
-        return f"{max(1, round(seconds))} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def _print_tuned(found: "TuningResult") -> None:

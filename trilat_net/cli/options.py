@@ -1,9 +1,9 @@
 """Options and arguments that several commands share, and the scenario and connection that they describe."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -54,26 +54,19 @@ def check_session_name(name: str) -> str:
     return name
 
 
-def check_seconds(param: typer.CallbackParam, value: float | None) -> float | None:
-    """Refuses a waiting time out of range."""
-    if value is not None and not 0.0 <= value <= 86_400.0:
-        raise UsageError(f"{param.opts[0]} is a number of seconds from 0 to 86400, not {value:g}")
-    return value
+def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackParam, float | None], Any]:
+    """Returns a check of an option that refuses a number out of a range; `what` names such numbers."""
+
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}")
+        return value
+
+    return check
 
 
-def check_clock_offset(value: float) -> float:
-    """Refuses an offset that no clock can have."""
-    if not -1e6 <= value <= 1e6:
-        raise UsageError(f"--clock-offset-s is a number of seconds from -1e6 to 1e6, not {value:g}")
-    return value
-
-
-def check_clock_drift(value: float) -> float:
-    """Refuses a drift beyond the rate of slewing."""
-    if not -200.0 <= value <= 200.0:
-        raise UsageError(f"--clock-drift-ppm is a number from -200 to 200, not {value:g}")
-    return value
-
+check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
+"""Refuses a waiting time out of range."""
 
 ClockOffsetOption = Annotated[
     float,
@@ -81,7 +74,7 @@ ClockOffsetOption = Annotated[
         "--clock-offset-s",
         metavar="S",
         help="For tests: use a clock this far ahead of the machine's, s.",
-        callback=check_clock_offset,
+        callback=check_range(-1e6, 1e6, "a number of seconds"),
     ),
 ]
 ClockDriftOption = Annotated[
@@ -90,7 +83,7 @@ ClockDriftOption = Annotated[
         "--clock-drift-ppm",
         metavar="PPM",
         help="For tests: use a clock that runs faster than the machine's by this, ppm.",
-        callback=check_clock_drift,
+        callback=check_range(-200.0, 200.0, "a number"),  # slewing takes no more
     ),
 ]
 
@@ -126,20 +119,13 @@ LogsArgument = Annotated[
 NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")]
 
 
-def check_coverage(value: float) -> float:
-    """Refuses a share that is none."""
-    if not 0.0 <= value <= 1.0:
-        raise UsageError(f"--min-coverage is a share from 0 to 1, not {value:g}")
-    return value
-
-
 MinCoverageOption = Annotated[
     float,
     typer.Option(
         "--min-coverage",
         metavar="SHARE",
         help="Least share of every site's ticks that must be judged to pass.",
-        callback=check_coverage,
+        callback=check_range(0.0, 1.0, "a share"),
     ),
 ]
 MIN_COVERAGE = 0.999

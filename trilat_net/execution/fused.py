@@ -119,6 +119,15 @@ class FusedRun:
         run_until(last_ns, self._apart_rad, *rows, self._tables)
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
+    def advance_watching(self, until_s: float, states: int = 100) -> tuple[Array, Array]:
+        """Continues the run; returns q, (K, N, 2), rad, and theta_hat, (K, N, 5), of its last quarter."""
+        found = []
+        for t_s in np.linspace(0.75 * until_s, until_s, states):
+            self.advance(float(t_s))
+            found.append((self.q, self.theta_hat))
+        q, theta_hat = map(np.array, zip(*found, strict=True))
+        return q, theta_hat
+
     @property
     def diverged_s(self) -> float | None:
         """Time at which the first site left its limits, s, or None."""

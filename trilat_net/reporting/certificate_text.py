@@ -3,7 +3,6 @@
 Invariant: both show the same sentences; the verdict comes first, and the listed energies add up.
 """
 
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -23,19 +22,14 @@ _SOURCE_NAMES = {
 }
 
 
-class CertificateMark(StrEnum):
-    """Effect of a line on the exit code."""
-
-    OK = "ok"
-    FAIL = "FAIL"
-    OPEN = "open"
-    NOTE = "note"
-
-
 class CertificateLine(NamedTuple):
-    """One sentence, and what it says: ok supports the run, FAIL speaks against it, open decides nothing."""
+    """One sentence of a certificate.
 
-    mark: CertificateMark
+    Attributes:
+        mark: "ok": it supports the run; "FAIL": it speaks against it; "open": it decides nothing; or "note".
+    """
+
+    mark: str
     text: str
 
 
@@ -53,14 +47,13 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     if found.roots is not None:
         decides = found.roots.exact and found.roots.verdict
         lines.append((_ROOTS.get(decides or "", "note"), found.roots.text))
-    if found.evidence is not None:
-        intact = "ok" if found.evidence.integrity.passed else "FAIL"
-        mark = "open" if intact == "ok" and found.evidence.reasons else intact
-        lines.append((mark, f"log: {found.evidence.text}"))
+    intact = "open" if found.evidence.reasons else "ok"
+    mark = intact if found.evidence.integrity.passed else "FAIL"
+    lines.append((mark, f"log: {found.evidence.text}"))
     if found.ones is not None and found.ones_rise is not None:
         risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
         lines.append(("note", f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"))
-    return [CertificateLine(CertificateMark(mark), text) for mark, text in lines]
+    return [CertificateLine(*line) for line in lines]
 
 
 def describe_judgement(found: Certificate) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..analysis import site_signals
+from ..analysis.json_values import JsonObject
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
 from ..analysis.trace_decimation import decimate
 from ..core.two_link_arm import JOINTS, PARAMETERS
@@ -28,8 +29,6 @@ BUCKET_BUDGET = 48_000
 LIMIT_COLOUR = "limit"
 """Colour of references, true values and limits."""
 
-ChartJson = dict[str, Any]
-
 
 class Charts:
     """The charts of a log; `twin` is the same experiment without operators, or None."""
@@ -38,11 +37,11 @@ class Charts:
         self._log = log
         self._twin = twin
         self._changes = list_changes(log)
-        self._tables: list[ChartJson] = []
+        self._tables: list[JsonObject] = []
         columns_per_site = 9 * JOINTS + PARAMETERS + len(log.sites)
         self._buckets = max(100, min(1200, BUCKET_BUDGET // (columns_per_site * len(log.sites))))
 
-    def data(self) -> ChartJson:
+    def data(self) -> JsonObject:
         """Returns tables and charts, ready for JSON."""
         charts = [*self._motion(), *self._timing()]
         return {
@@ -76,11 +75,11 @@ class Charts:
     def _site_table(self, site: str, values: NDArray[Any]) -> int:
         return self._table(site, self._log[site].tick, self._log[site].t_s, values)
 
-    def _series(self, site: str, table: int, column: int, label: str = "") -> ChartJson:
+    def _series(self, site: str, table: int, column: int, label: str = "") -> JsonObject:
         colour = self._log.sites.index(site)
         return {"label": label or site, "colour": colour, "table": table, "column": column}
 
-    def _motion(self) -> Iterator[ChartJson]:
+    def _motion(self) -> Iterator[JsonObject]:
         log = self._log
         operated = site_signals.sites_with_operator(log)
         if operated:
@@ -102,12 +101,12 @@ class Charts:
     ) -> dict[str, int]:
         return {s: self._site_table(s, signal(self._log[s])) for s in sites or self._log.sites}
 
-    def _per_joint(self, section: str, title: str, unit: str, tables: dict[str, int]) -> Iterator[ChartJson]:
+    def _per_joint(self, section: str, title: str, unit: str, tables: dict[str, int]) -> Iterator[JsonObject]:
         for joint in range(JOINTS):
             series = [self._series(site, table, joint) for site, table in tables.items()]
             yield _chart(section, f"{title}, joint {joint + 1}", unit, series)
 
-    def _positions(self) -> Iterator[ChartJson]:
+    def _positions(self) -> Iterator[JsonObject]:
         for site in self._log.sites:
             part = self._log[site]
             both = np.stack([site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2)
@@ -117,19 +116,19 @@ class Charts:
                 series = [self._series(site, table, 0), desired]
                 yield _chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
 
-    def _estimates(self) -> Iterator[ChartJson]:
+    def _estimates(self) -> Iterator[JsonObject]:
         log = self._log
         tables = self._tables_of(site_signals.parameter_estimates)
         for index in range(PARAMETERS):
             series = [self._series(site, table, index) for site, table in tables.items()]
             truths = [float(site_signals.true_parameters(log, site)[index]) for site in log.sites]
-            lines: list[ChartJson] = [{"value": truth, "colour": n} for n, truth in enumerate(truths)]
+            lines: list[JsonObject] = [{"value": truth, "colour": n} for n, truth in enumerate(truths)]
             if len(set(truths)) == 1:
                 lines = [{"value": truths[0], "colour": LIMIT_COLOUR}]
             title = f"estimate of θ{'₁₂₃₄₅'[index]}"
             yield _chart("estimates", title, THETA_UNITS[index], series, lines=lines)
 
-    def _timing(self) -> Iterator[ChartJson]:
+    def _timing(self) -> Iterator[JsonObject]:
         log = self._log
         yield from self._ages()
         if sample_age.has_varying_delay(log):
@@ -140,7 +139,7 @@ class Charts:
             yield _chart("timing", "wake-up after the deadline", "ms", series, zero=True)
             yield from self._histograms()
 
-    def _ages(self) -> Iterator[ChartJson]:
+    def _ages(self) -> Iterator[JsonObject]:
         log = self._log
         for site in log.sites:
             age_ms, peers = site_signals.sample_ages_ms(log, site), log[site].peers
@@ -152,10 +151,10 @@ class Charts:
             title = f"age of the samples that {site} uses"
             yield _chart("ages", title, "ms", series, lines=lines, sites=[site], links=True, **axis)
 
-    def _stated(self, site: str) -> list[ChartJson]:
+    def _stated(self, site: str) -> list[JsonObject]:
         """Returns the stated mean delays of the links to a site, as lines while they held."""
         log = self._log
-        lines: list[ChartJson] = []
+        lines: list[JsonObject] = []
         for peer in log[site].peers:
             states = list_stated_models(log, f"{peer}->{site}", self._changes)
             t_s, mean_ms = sample_age.stated_delay_line(log, states)
@@ -166,7 +165,7 @@ class Charts:
         same = len({line["value"] for line in lines}) == 1
         return [{"value": lines[0]["value"], "colour": LIMIT_COLOUR}] if same else lines
 
-    def _distributions(self) -> Iterator[ChartJson]:
+    def _distributions(self) -> Iterator[JsonObject]:
         found = sample_age.measure_delay_distributions(self._log)
         x_ms = sample_age.delay_axis_ms(found)
         for site in self._log.sites:
@@ -179,27 +178,27 @@ class Charts:
             title = f"delay and age on the way to {site}"
             yield _chart("delays", title, "ms", series, points=len(x_ms), end=float(x_ms[-1]))
 
-    def _histograms(self) -> Iterator[ChartJson]:
+    def _histograms(self) -> Iterator[JsonObject]:
         log = self._log
         edges = loop_timing.loop_time_bin_edges(log)
         periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
         titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
         for field, title in titles.items():
-            series: list[ChartJson] = []
+            series: list[JsonObject] = []
             for n, site in enumerate(log.sites):
                 counts = loop_timing.bin_loop_times(getattr(log[site], field), edges).tolist()
                 series.append({"label": site, "colour": n, "counts": counts})
             axis = {"edges": edges.tolist(), "periods": periods}
             yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
 
-    def _arm(self, index: int, site: str) -> ChartJson:
+    def _arm(self, index: int, site: str) -> JsonObject:
         part, arm = self._log[site], self._log.scenario.sites[site].arm
         values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
         table = self._site_table(site, values)
         return {"site": site, "colour": index, "links_m": [arm.l1_m, arm.l2_m], "table": table}
 
 
-def _chart(section: str, title: str, unit: str, series: list[ChartJson], **options: Any) -> ChartJson:
+def _chart(section: str, title: str, unit: str, series: list[JsonObject], **options: Any) -> JsonObject:
     return {"section": section, "title": title, "unit": unit, "series": series, **options}
 
 

@@ -5,14 +5,12 @@ Invariant: text from the file passes `sanitize` before it reaches a terminal.
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from rich.markup import escape
 
+from ..analysis.json_values import JsonObject
 from .terminal_output import out, print_table, print_text, sanitize
 from .text_table import TextTable
-
-JsonObject = dict[str, Any]
 
 _MOST_GAPS = 4
 _VIEWS = "/viz/"

@@ -14,7 +14,7 @@ from string import Template
 from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
-from ..analysis.health import JsonObject
+from ..analysis.json_values import JsonObject
 from ..analysis.run_summary import summarise_run
 from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole

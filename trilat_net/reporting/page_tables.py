@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.health import JsonObject
+from ..analysis.json_values import JsonObject
 from ..execution.log_checks import CheckLine
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario

@@ -152,11 +152,15 @@ def typeset(text: str) -> str:
 
 
 def add_legend(figure: Figure, entries: LegendEntries) -> None:
-    """Puts a legend above the panels, where it hides nothing, in as many columns as there is room for."""
-    handles = [Line2D([], [], label=text, **options) for text, options in entries]
+    """Puts a legend of lines above the panels, see `place_legend`."""
+    place_legend(figure, [Line2D([], [], label=text, **options) for text, options in entries])
+
+
+def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
+    """Puts handles above the panels, where they hide nothing, in as many columns as there is room for."""
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for columns in range(min(len(handles), 6), 0, -1):
-        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns, **options)
         if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
             return
         made.remove()

@@ -28,8 +28,6 @@ MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""
 _MAX_RUN_TICKS = 4_000_000
 """Limit of a prolonged run, in ticks of all sites together."""
-_MEAN_STATES = 100
-"""States of the last quarter in its mean."""
 
 MAX_EQUILIBRIUM_RESIDUAL = 1e-10
 """The largest residual of an equilibrium."""
@@ -71,21 +69,14 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
     run = FusedRun(prolong_scenario(scenario, most_s))
     until_s = scenario.duration_s
     while True:
-        states = []
-        for t_s in np.linspace(0.75 * until_s, until_s, _MEAN_STATES):
-            run.advance(float(t_s))
-            states.append((run.q, run.theta_hat))
+        states = run.advance_watching(until_s)
         speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
         if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
             break
         until_s *= 2.0
     diverged = run.diverged_s is not None
     at_rest = not diverged and speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
-    q, theta_hat = (
-        (run.q, run.theta_hat)
-        if at_rest
-        else (np.mean(values, axis=0) for values in zip(*states, strict=True))
-    )
+    q, theta_hat = (run.q, run.theta_hat) if at_rest else (values.mean(axis=0) for values in states)
     return EquilibriumRun(run.ran_s, speed_rad_s, at_rest, diverged, q, theta_hat)
 
 

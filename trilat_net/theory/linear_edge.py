@@ -1,6 +1,6 @@
 """Values of a scenario's key at which the linear loop changes between stable and unstable.
 
-Invariant: a scan brackets each edge, and bisection of the rightmost root's real part closes it: of the
+Invariant: a scan brackets each edge, and Brent's method on the rightmost root's real part closes it: of the
 sampled loop for the scheme `digital` and for sampled actors, of the continuous loop otherwise. The
 equilibrium is found once and followed along the key.
 """
@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ..core.exogenous import TorqueKind
 from ..core.vectors import Array
@@ -28,9 +29,8 @@ _CONTINUOUS_GUESSES = 4
 """Number of continuous roots from which the sampled ones are sought."""
 _LOGARITHMIC = 20.0
 """A range with a larger ratio of its ends is scanned in equal steps of the logarithm."""
-_MAX_STEPS = 80
-_HALVING_PERIOD = 3
-"""Every so many steps a bracket is halved, whatever its ends are."""
+_LEAST_PER_S = -1e3
+"""The real part that stands for that of a loop in which nothing moves, 1/s."""
 _INTEGER_KEYS = ("rate_hz", "seed")
 
 ASSUMED_EQUILIBRIUM_REMARK = (
@@ -168,34 +168,17 @@ class _GrowthRate:
 
     def close_edge(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
         """Returns the edge between two (value, real part) of different signs."""
-        (low, at_low), (high, at_high) = left, right
+        (low, at_low), (high, _) = left, right
         if self.integer:
             while high - low > 1.0:
                 middle = float((low + high) // 2.0)
                 low, high = (middle, high) if (self.at(middle) > 0.0) == (at_low > 0.0) else (low, middle)
         else:
-            low, high = self._narrow(low, high, [at_low, at_high])
+            reach = 0.25 * EDGE_TOLERANCE * max(abs(low), abs(high))
+            low = high = float(brentq(lambda value: max(self.at(value), _LEAST_PER_S), low, high, xtol=reach))
         self.at(high)
         omega = 0.0 if self._root is None else self._root.s.imag
         return LinearEdge(self._key, 0.5 * (low + high), omega, at_low > 0.0)
-
-    def _narrow(self, low: float, high: float, ends: list[float]) -> tuple[float, float]:
-        """Returns a narrow bracket: regula falsi with the weight of a kept end halved, and bisection."""
-        smallest = EDGE_TOLERANCE * max(abs(low), abs(high))
-        sign, weights = ends[0] > 0.0, ends
-        for step in range(_MAX_STEPS):
-            if high - low <= smallest:
-                break
-            middle = 0.5 * (low + high)
-            if step % _HALVING_PERIOD and np.isfinite(weights).all():
-                middle = (low * weights[1] - high * weights[0]) / (weights[1] - weights[0])
-                middle = min(max(middle, low + 0.4 * smallest), high - 0.4 * smallest)
-            value = self.at(middle)
-            if (value > 0.0) == sign:
-                low, weights = middle, [value, 0.5 * weights[1]]
-            else:
-                high, weights = middle, [0.5 * weights[0], value]
-        return low, high
 
 
 def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:

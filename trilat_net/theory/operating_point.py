@@ -27,6 +27,7 @@ from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.laws import ImportedLaw
 from ..scenario.scenario_types import scheduled_links
+from ..scenario.validate import refuse_external_arms
 from .site_dynamics import SiteRates, evaluate_site_rates
 from .textbook_arm import Numbers
 
@@ -136,12 +137,7 @@ def _refuse_unknown_equations(scenario: Scenario) -> None:
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
-    for name in scenario.external:
-        raise ScenarioError(
-            "is external: the equations of that arm are unknown here; simulate it with plant = 'simulated'",
-            path=f"sites.{name}.plant",
-            source=scenario.name,
-        )
+    refuse_external_arms(scenario)
 
 
 def _final_age(scenario: Scenario, peer: str, site: str, notes: list[str]) -> EffectiveDelay:

@@ -5,12 +5,12 @@ that a held pose can be analysed too. An unstable loop has no steady oscillation
 instability counts. Every result holds for the analysed band.
 """
 
-import math
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..analysis.json_values import finite_or_none
 from ..analysis.lyapunov_weights import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law
@@ -263,8 +263,7 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
 
 
 def _passivity_to_json(one: Passivity) -> dict[str, Any]:
-    lacking = one.lacking_nm_s_rad
-    return {**_minima_to_json(one.minima), "lacking_nm_s_rad": lacking if math.isfinite(lacking) else None}
+    return {**_minima_to_json(one.minima), "lacking_nm_s_rad": finite_or_none(one.lacking_nm_s_rad)}
 
 
 def _minima_to_json(one: Minima) -> dict[str, Any]:

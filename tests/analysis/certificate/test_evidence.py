@@ -22,7 +22,6 @@ def found(data: bytes, **options: float) -> Certificate:
 def test_a_whole_log_is_stable_and_says_what_it_rests_on() -> None:
     certificate = found(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
-    assert certificate.evidence is not None
     facts = certificate_to_json(certificate)["evidence"]
     assert facts == {
         "coverage": 1.0,
@@ -55,7 +54,6 @@ def test_of_v_the_periods_count_that_rest_on_records() -> None:
     """Single records of one site: few are missing, and each leaves several periods of V unjudged."""
     data = edited(recorded("free", RUN), record=without("s", set(range(100, 3000, 1000))))
     certificate = found(data)
-    assert certificate.evidence is not None
     assert certificate.evidence.coverage.share == 0.999
     assert certificate.evidence.functional_share is not None
     assert certificate.evidence.functional_share < 0.999

@@ -7,7 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from trilat_net.analysis.run_end import EndBehaviour, classify_log_end
+import trilat_net
+from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import open_log
@@ -19,6 +20,8 @@ from trilat_net.studies.sweep.cell_result import (
     classify_end,
     is_conclusive,
 )
+from trilat_net.studies.trials.measure_run import measure_virtual_run
+from trilat_net.theory.end_pose import certify_with_roots
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),
@@ -115,3 +118,15 @@ def test_a_run_that_diverges_says_when() -> None:
     assert found.diverged_s == found.ran_s
     assert found.extended == 0
     assert found.end_speed_rad_s > 5.0
+
+
+def test_a_cell_and_a_trial_see_no_roots() -> None:
+    """The limit that docs/definitions.md states: arms that start at one pose stay, however unstable it is."""
+    together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
+    scenario = load_scenario("p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0})
+    assert classify_cell(scenario.text, 5.0).verdict is CellClass.CONVERGED
+    assert measure_virtual_run(scenario).end.stability is Stability.STABLE
+    found = certify_with_roots(trilat_net.simulate(scenario))
+    assert found.end.stability is Stability.STABLE
+    assert found.stability is Stability.OPEN
+    assert [reason[:19] for reason in found.reasons] == ["this rest: unstable"]

@@ -8,14 +8,15 @@ their unit, and unknown values are null.
 
 from collections.abc import Collection, Mapping
 from enum import StrEnum
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...core.vectors import Array
 from ...log.integrity import MIN_COVERAGE
 from ...log.log_reader import Log
-from ..health import JsonObject, finite_or_none
+from ..json_values import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from . import energy_terms
@@ -118,23 +119,23 @@ class Certificate(NamedTuple):
 
     Attributes:
         premises, verdict, end: of the theorem, on V, and of the run from e and qd alone.
-        energies: of every site; {} without a functional.
+        evidence: how much of the run the log has, and that nothing was changed.
         balance: of all sites; None without a functional, or if beta is not unique.
         ones: the same with the paper's weights; None if those are right, or without a balance.
         groups: closed groups of sites, if there are several: then beta is not unique.
+        energies: of every site; {} without a functional.
         roots: of the loop where the run ended; None if nobody looked.
-        evidence: how much of the run the log has, and that nothing was changed; None if nobody looked.
     """
 
     premises: list[Premise]
     verdict: StabilityVerdict
     end: RunEnd
-    energies: dict[str, SiteEnergy]
+    evidence: Evidence
     balance: EnergyBalance | None
     ones: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
+    energies: Mapping[str, SiteEnergy] = MappingProxyType({})
     roots: EndPoseRoots | None = None
-    evidence: Evidence | None = None
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
@@ -164,8 +165,7 @@ class Certificate(NamedTuple):
             found += find_growth(self.balance, self.verdict.tolerance)
         if self.roots is not None and self.roots.exact and self.roots.verdict == "unstable":
             found.append(self.roots.text)
-        absent = self.evidence.reasons if self.evidence is not None else ()
-        return (*self.end.reasons, *found, *absent)
+        return (*self.end.reasons, *found, *self.evidence.reasons)
 
     @property
     def stability(self) -> Stability:
@@ -183,8 +183,7 @@ class Certificate(NamedTuple):
 
         Never with a broken balance or a changed log.
         """
-        changed = self.evidence is not None and not self.evidence.integrity.passed
-        if self.verdict.finding is StabilityFinding.BROKEN or changed:
+        if self.verdict.finding is StabilityFinding.BROKEN or not self.evidence.integrity.passed:
             return False
         bounded = "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED
         opened = "open" in accepted and self.stability is Stability.OPEN
@@ -199,34 +198,29 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE) -> Certificate:
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    found = _certify_records(log)
-    return found._replace(evidence=collect_evidence(log, found.balance, min_coverage))
-
-
-def _certify_records(log: Log) -> Certificate:
-    """Returns the certificate of the records that are there."""
     premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
     premises += check_sampled_walls(log)
 
-    def without_functional(why: str) -> Certificate:
-        return Certificate(premises, _undecided(why), end, {}, None)
+    def conclude(verdict: StabilityVerdict, balance: EnergyBalance | None = None, **more: Any) -> Certificate:
+        evidence = collect_evidence(log, balance, min_coverage)
+        return Certificate(premises, verdict, end, evidence, balance, **more)
 
     if not premises[0].holds:
-        return without_functional(premises[0].text)
+        return conclude(_undecided(premises[0].text))
     energies = compute_site_energies(log)
     if not energies:
-        return without_functional(NO_COMMON_TIME)
+        return conclude(_undecided(NO_COMMON_TIME))
     balance = compute_energy_balance(energies)
     if not balance.judged.any():
-        return without_functional(NO_PERIOD)
+        return conclude(_undecided(NO_PERIOD))
     premises += check_run_premises(log, energies, balance)
     groups = _ambiguous_groups(energies)
     if groups:
         verdict = _judge_balance(energies, balance) or _undecided(describe_closed_groups(groups))
-        return Certificate(premises, verdict, end, energies, None, groups=groups)
+        return conclude(verdict, energies=energies, groups=groups)
     verdict = _judge_stability(premises, energies, balance)
     ones = None if np.allclose(balance.beta, 1.0) else compute_energy_balance(energies, ones=True)
-    return Certificate(premises, verdict, end, energies, balance, ones)
+    return conclude(verdict, balance, energies=energies, ones=ones)
 
 
 def _ambiguous_groups(energies: Mapping[str, SiteEnergy]) -> tuple[tuple[str, ...], ...]:
@@ -239,8 +233,8 @@ def _ambiguous_groups(energies: Mapping[str, SiteEnergy]) -> tuple[tuple[str, ..
     return ()
 
 
-def _undecided(why: str) -> StabilityVerdict:
-    return StabilityVerdict(StabilityFinding.NOT_JUDGED, f"{StabilityFinding.NOT_JUDGED}: {why}")
+def _undecided(why: str, finding: StabilityFinding = StabilityFinding.NOT_JUDGED) -> StabilityVerdict:
+    return StabilityVerdict(finding, f"{finding}: {why}")
 
 
 def _judge_stability(
@@ -392,7 +386,7 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
             "end_error_rad": end.end_error_rad,
             "end_speed_rad_s": end.end_speed_rad_s,
         },
-        "evidence": None if certificate.evidence is None else certificate.evidence.to_json(),
+        "evidence": certificate.evidence.to_json(),
         "roots": None if certificate.roots is None else certificate.roots._asdict(),
         "functional": None if balance is None else _functional_to_json(certificate, balance),
     }

@@ -17,7 +17,7 @@ from ...log.log_reader import Log
 from ...scenario import SiteSpec
 from ..aligned import AlignedRecords, align_records
 from ..arm_rows import EndEffectorRows, compute_end_effector
-from ..torque_sources import wall_depth, wall_force
+from ..torque_sources import list_walls, wall_depth, wall_force
 from .premises import Premise, rise_above_minimum
 
 
@@ -72,8 +72,7 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
 
 
 def _list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
-    actors = [one.actor for one in spec.environment]
-    return [actor for actor in actors if actor.acts is TorqueKind.WALL and actor.sampled and any(actor.K)]
+    return [wall for wall in list_walls(spec) if wall.sampled and any(wall.K)]
 
 
 def _find_given_energy(

@@ -18,7 +18,7 @@ from ..aligned import align_records
 from ..dominance_history import trace_dominance
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
-from ..torque_sources import attribute_torque
+from ..torque_sources import attribute_torque, list_walls
 from . import motion_metrics as motion
 from . import static_windows
 from .impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
@@ -155,7 +155,7 @@ def _measure(log: Log) -> LogMetrics:
         {
             f"{site}/{n}": motion.measure_wall_contact(wall, runs.get(site))
             for site in log.sites
-            for n, wall in enumerate(motion.list_walls(specs[site]), 1)
+            for n, wall in enumerate(list_walls(specs[site]), 1)
         },
         {site: motion.read_parameter_estimates(specs[site], run.records) for site, run in runs.items()},
         static_windows.count_static_windows(absent, windows),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.exogenous import TorqueKind, TorqueSource
+from ...core.exogenous import TorqueSource
 from ...core.site_setup import Law
 from ...log.log_reader import Log
 from ...scenario import SiteSpec
@@ -122,11 +122,6 @@ def measure_effort(log: Log, site: str) -> MetricValues:
         "peak_tau_nm": metric(peak(tau)),
         "saturated_share": metric(float(at_limit.mean())),
     }
-
-
-def list_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Returns the walls of a site, in scenario order."""
-    return [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
 
 
 def measure_wall_contact(wall: TorqueSource, run: SiteRun | None) -> MetricValues:

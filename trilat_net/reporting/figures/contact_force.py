@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...analysis.arm_rows import compute_end_effector
-from ...analysis.torque_sources import wall_depth, wall_force
-from ...core.exogenous import TorqueKind
+from ...analysis.torque_sources import list_walls, wall_depth, wall_force
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
@@ -18,8 +17,7 @@ from .time_figure import time_figure
 
 def sites_with_walls(log: Log) -> list[str]:
     """Returns the sites that have a wall in their way, in scenario order."""
-    sites = log.scenario.sites
-    return [s for s in log.sites if any(e.actor.acts is TorqueKind.WALL for e in sites[s].environment)]
+    return [site for site in log.sites if list_walls(log.scenario.sites[site])]
 
 
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
@@ -31,7 +29,7 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             part, spec = log[site], log.scenario.sites[site]
             links_m = (spec.arm.l1_m, spec.arm.l2_m)
             end_effector = compute_end_effector(links_m, part.q.reshape(-1, 2), part.qd.reshape(-1, 2))
-            walls = [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
+            walls = list_walls(spec)
             for wall, dashes in zip(walls, [*style.DASHES] * len(walls), strict=False):
                 depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
                 force = wall_force(wall, part.t_s, end_effector)

@@ -10,8 +10,8 @@ import math
 from enum import StrEnum
 
 import msgspec
-import numpy as np
 
+from ...analysis.json_values import finite_or_none
 from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.site_arrays import RECORD_TAU_X
@@ -80,15 +80,7 @@ class CellResult(msgspec.Struct, frozen=True):
     walls_j: float | None = None
     reasons: str = ""
 
-    @property
-    def stability(self) -> Stability:
-        """The judgement that the class stands for."""
-        known = {True: Stability.STABLE, False: Stability.NOT_STABLE, None: Stability.OPEN}
-        return known[self.verdict.stable]
 
-
-_CONTACT_STATES = 100
-"""States of the last quarter of which the deepest in a sampled wall is linearised."""
 FLAT_LOG_CHANGE = 0.02
 """An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
 
@@ -141,19 +133,17 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
 
     0 if they do not, and without one that is touched in the last quarter, see `find_contact_growth`.
     """
-    states = []
-    if any(one.actor.sampled for spec in scenario.sites.values() for one in spec.environment):
-        for t_s in np.linspace(0.75, 1.0, _CONTACT_STATES) * scenario.duration_s:
-            run.advance(float(t_s))
-            states.append((run.q, run.theta_hat))
-    run.advance(scenario.duration_s)
-    if not states or run.diverged_s is not None:
+    if not any(one.actor.sampled for spec in scenario.sites.values() for one in spec.environment):
+        run.advance(scenario.duration_s)
+        return 0.0
+    states = run.advance_watching(scenario.duration_s)
+    if run.diverged_s is not None:
         return 0.0
     # SciPy takes a worker half a second, which only sampled walls need
     from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
     from ...theory.linear_edge import find_contact_growth
 
-    growth_per_s = find_contact_growth(scenario, *map(np.array, zip(*states, strict=True)))
+    growth_per_s = find_contact_growth(scenario, *states)
     return growth_per_s if growth_per_s > STABILITY_EDGE_PER_S else 0.0
 
 
@@ -187,8 +177,6 @@ def _changes(outcome: CellResult) -> tuple[float, float]:
 def _cell_result(run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int) -> CellResult:
     tau_x = run.records[:, RECORD_TAU_X : RECORD_TAU_X + JOINTS]
     end = classify_run_end(scenario, RunTrace(run.buckets, list(tau_x), run.diverged_s))
-    rates = (end.error.rate_per_s, end.speed.rate_per_s)
-    error_rate, speed_rate = (rate if math.isfinite(rate) else None for rate in rates)
     return CellResult(
         verdict=classify_end(end),
         motion=end.behaviour,
@@ -196,8 +184,8 @@ def _cell_result(run: FusedRun, scenario: Scenario, totals: RunTotals, extended:
         extended=extended,
         end_error_rad=end.end_error_rad,
         end_speed_rad_s=end.end_speed_rad_s,
-        error_rate_per_s=error_rate,
-        speed_rate_per_s=speed_rate,
+        error_rate_per_s=finite_or_none(end.error.rate_per_s),
+        speed_rate_per_s=finite_or_none(end.speed.rate_per_s),
         peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,

@@ -234,17 +234,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[Theor
         Line2D([], [], label=text, **_LINE_STYLES[line.rank % len(_LINE_STYLES)])
         for text, line in named.items()
     ]
-    _above(figure, handles)
-
-
-def _above(figure: Figure, handles: Sequence[Any]) -> None:
-    """Puts handles above the panels, in as many columns as there is room for."""
-    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    for columns in range(min(len(handles), 6), 0, -1):
-        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=1.6)
-        if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
-            return
-        made.remove()
+    style.place_legend(figure, handles, handlelength=1.6)
 
 
 _DPI = 300

@@ -171,8 +171,7 @@ ScenarioAt = Callable[[float, float], Scenario]
 
 _PAIR = ((None, -1), (1, None))
 """All places but the last along an axis, and all but the first."""
-_TOLERANCE = 1e-6
-_MOST = 60
+_MOST_STEPS = 500
 LINEAR_ANALYSIS = "linear analysis"
 _ABOUT = "where the rightmost root of the loop, linearised, crosses the imaginary axis"
 
@@ -240,36 +239,22 @@ def find_criterion_edge(
 ) -> float | None:
     """Returns where between two values a criterion is just met; None if nowhere, or if it may not be asked.
 
-    By regula falsi; the weight of the end that stays is halved, so that it does not stay for ever.
-
-    Args:
-        criterion: of a value; refuses one by ScenarioError, as between whole numbers.
-        low: from.
-        high: to.
+    The criterion of a value may refuse it by ScenarioError, as between whole numbers.
     """
+    from scipy.optimize import brentq  # takes half a second, which most commands can do without
 
     def excess(value: float) -> float:
-        try:
-            found = criterion(value)
-        except ScenarioError:
-            return math.nan
-        return math.nan if found is None else found.excess
+        found = criterion(value)
+        if found is None:
+            raise ScenarioError("no criterion covers it")
+        return found.excess
 
-    a, b = excess(low), excess(high)
-    if math.isnan(a + b) or (a > 0.0) == (b > 0.0):
+    try:
+        if (excess(low) > 0.0) == (excess(high) > 0.0):
+            return None
+        return float(brentq(excess, low, high, xtol=1e-8 * (high - low), maxiter=_MOST_STEPS))
+    except ScenarioError:
         return None
-    small = _TOLERANCE * (abs(a) + abs(b))
-    middle = low
-    for _ in range(_MOST):
-        middle = (low * b - high * a) / (b - a)
-        here = excess(middle)
-        if math.isnan(here) or abs(here) <= small:
-            return None if math.isnan(here) else middle
-        if (here > 0.0) == (a > 0.0):
-            low, a, b = middle, here, 0.5 * b
-        else:
-            high, b, a = middle, here, 0.5 * a
-    return middle
 
 
 LAW_AXIS = "law"

@@ -20,7 +20,8 @@ from ...analysis.run_end import (
     RunTrace,
     classify_run_end,
 )
-from ...analysis.torque_sources import wall_force
+from ...analysis.timeline import first_divergence_s
+from ...analysis.torque_sources import list_walls, wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
@@ -28,7 +29,6 @@ from ...execution.virtual_comparison import find_absent_samples
 from ...log.log_reader import Log
 from ...scenario import Expect, Scenario, SiteSpec
 from ...scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
-from ...scenario.operators import Wall
 from ..record_batches import RecordBatch, join_batches, run_in_batches
 
 
@@ -46,7 +46,7 @@ class WindowStats:
         self._from_ns, self._to_ns = (round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s))
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._spec = spec
-        self._walls = [one.actor for one in spec.environment if isinstance(one, Wall)]
+        self._walls = list_walls(spec)
         self._seen_ns = -1
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
@@ -322,20 +322,19 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     """
     scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    last = [log[name].record(-1) for name in log.sites if len(log[name])]
-    diverged_ns = [state.t_ns for state in last if state.mode == "diverged"]
+    diverged_at_s = first_divergence_s(log)
     tallies = {name: _site_stats(scenario, name) for name in log.sites}
     missing = 0
     for name, tally in tallies.items():
         part = log[name]
         used = np.array([part.used[peer] for peer in part.peers]).T
         tally.add(RecordBatch(part.t_ns, part.q, part.qd, part.q_des, part.tau, part.tau_x, used))
-        wanted = made.get(name, 0) if diverged_ns else scenario.ticks(name)
+        wanted = scenario.ticks(name) if diverged_at_s is None else made.get(name, 0)
         missing += max(0, wanted - len(part))
     return compute_run_metrics(
         scenario,
         tallies,
-        diverged_at_s=min(diverged_ns) / NS_PER_S if diverged_ns else None,
+        diverged_at_s=diverged_at_s,
         late_samples=sum(sample.arrived_tick is not None for sample in find_absent_samples(log)),
         missing=missing,
     )

@@ -109,13 +109,15 @@ def _run(scenario: Scenario) -> _Run:
     t_s, q, e = _aligned(records)
     mean = q.mean(axis=0)
     apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
-    last = t_s > t_s[-1] - END_WINDOW_S
+    last, half_s = t_s > t_s[-1] - END_WINDOW_S, 0.5 * t_s[-1]
+    middle = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
+    end_rad, before_rad = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
     largest = np.abs(e).max(axis=(0, 2))
     apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
     efforts, saturated = zip(*map(_effort, records, scenario.sites.values()), strict=True)
     return _Run(
         end=classify_run_end(scenario, trace),
-        fall_rad=float(np.abs(off[last].mean(axis=0)).max()),
+        fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
         apart_rad=float(np.abs(apart[:, last]).max()),
         spread_rad=_rms(apart),
         pose_rad=_rms(off),

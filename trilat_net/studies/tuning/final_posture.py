@@ -142,7 +142,7 @@ CLASS_MEANINGS = {
     CandidateClass.DIVERGED: "not stable: a joint left the speed limit",
     CandidateClass.OSCILLATED: "it swings on, drifts or grows",
     CandidateClass.STRAYED: f"the mean pose ends more than {STRAYED_RAD} rad from where a weightless "
-    "consensus stands: the arms fell, hang, sink, or were thrown there",
+    "consensus stands, or would after as long again: the arms fell, hang, sink, or were thrown there",
     CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all",
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may tell",
     CandidateClass.SETTLED: "it converged or decays, and none of these holds",
@@ -155,7 +155,8 @@ def classify_candidate(ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
 
     Args:
         ends: the judgements of its run and of its twin; where it has none, the same twice.
-        fall_rad: largest distance, over joints, of the twin's mean pose of the last second from q*.
+        fall_rad: largest distance, over joints, of the twin's mean pose from q*, after as long again at the
+            pace at which it grew in the second half.
         apart_rad: largest distance of a joint from the mean of the sites in that second.
     """
     found = {end.stability for end in ends}

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from ...analysis.json_values import JsonObject
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.text_table import TextTable
@@ -167,10 +168,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-TuningJson = dict[str, Any]
-
-
-def tuning_to_json(tuned: TuningResult) -> TuningJson:
+def tuning_to_json(tuned: TuningResult) -> JsonObject:
     """Returns all that there is to say, as plain values."""
     asked = tuned.plan
     scenario = asked.base.scenario
@@ -207,7 +205,7 @@ def tuning_to_json(tuned: TuningResult) -> TuningJson:
     }
 
 
-def _law(tuned: TuningResult, found: SearchResult) -> TuningJson:
+def _law(tuned: TuningResult, found: SearchResult) -> JsonObject:
     shared = tuned.shared(found)
     return {
         "told": found.space.told,
