@@ -30,6 +30,11 @@ class PeerMonitor:
         self._boots: Mapping[str, int] = {}
         self._ended: set[str] = set()
 
+    @property
+    def all_stored(self) -> bool:
+        """True if there is a recorder that has stored all, and none is present that has not."""
+        return bool(self.stored) and self.recorders <= self.stored
+
     def admit(self, boots: Mapping[str, int]) -> None:
         """Sets the boots that belong to the session."""
         self._boots = boots

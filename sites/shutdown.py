@@ -75,8 +75,9 @@ class LeavingSite:
     def _await_recorders(self) -> None:
         """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""
         parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
+        interrupted = parts.interrupt.requested
         give_up_ns, queried_ns = clock.monotonic_ns() + LINGER_NS, 0
-        while clock.monotonic_ns() < give_up_ns and not (monitor.stored and parts.interrupt.requested()):
+        while clock.monotonic_ns() < give_up_ns and not (monitor.all_stored and interrupted()):
             while parts.buffer.answer_query():
                 queried_ns = clock.monotonic_ns()
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
@@ -85,6 +86,6 @@ class LeavingSite:
             if not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS:
                 patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
-            if monitor.read_stored(self._ticks) and monitor.recorders <= monitor.stored:
+            if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)

@@ -4,10 +4,15 @@ from pathlib import Path
 
 import pytest
 
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.membership import liveliness_token
+from trilat_net.net.messages import Event
+from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import Session
+from .sessions import SESSION, Session
 
 S = 1_000_000_000
 
@@ -47,3 +52,28 @@ def test_a_signal_ends_the_wait_and_spoils_no_run_that_was_complete(tmp_path: Pa
     session.run()
     assert session.ends == {"m": 0, "s": 0}
     assert max(session.left_ns["m"], session.left_ns["s"]) < session.left_ns["recorder"]
+
+
+def test_a_site_that_is_interrupted_waits_for_every_recorder(tmp_path: Path) -> None:
+    """One has all at once; another, which has come late, still asks for what was before."""
+    scenario = load_scenario("two_sites", {"duration_s": 9.0})
+    session = Session.whole(scenario, tmp_path, ends={})
+
+    def come_late(bus: Bus, clock: RelayClock) -> None:
+        bus.announce(liveliness_token(SESSION, topics.RECORDER, 78))
+        clock.sleep_until(clock.monotonic_ns() + S)
+        for interrupt in session.interrupts.values():
+            interrupt.number = 2
+        clock.sleep_until(clock.monotonic_ns() + 3 * S)
+        session.left_ns["late"] = clock.monotonic_ns()
+        say = bus.publisher(topics.key(SESSION, topics.RECORDER, topics.EVENT))
+        for n, name in enumerate(("m", "s")):
+            event = Event(
+                member=topics.RECORDER, boot=78, t_ns=0, n=n, kind="stored", text="", about=name, ticks=9000
+            )
+            say(encode(event))
+
+    session.stranger(come_late, at_ns=2 * S)
+    session.run()
+    assert session.ends == {"m": 130, "s": 130}
+    assert min(session.left_ns["m"], session.left_ns["s"]) >= session.left_ns["late"]
