@@ -43,6 +43,7 @@ DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
 CONSTANT = {"link__model": "constant", "link__delay_ms": 200.0}
 NO_BOX = {"control__law": "adaptive", "control__theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
 KNOWN = {"control__Gamma": 0.0, "control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]}
+SOFT = {"control.K": 2, "sites.m1.q0_rad": [0.25, 0.2], "sites.m2.q0_rad": [-0.05, 0.4]}
 EQUAL_KD = {"sites__m1__control__Kd": 3.0, "sites__s__control__Kd": 3.0}
 SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
 SHEET = {
@@ -357,6 +358,18 @@ PAGES: dict[str, dict[str, Make]] = {
             fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
         ],
     },
+    "docs/maps/p_d.md": {
+        **{
+            f"| {T} | … | {{}} | … | {0.005 * T:g} |": lambda T=T: [edge_of_p_d("p_d_margin", 0.5, T)]
+            for T in (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1200, 1400)
+        },
+        **{
+            f"| {T} | … | {{}} | … | {0.001 * T:g} |": lambda T=T: [
+                edge("p_d_margin", "control.d", 0.02, 0.6, {**SOFT, "link.delay_ms": T})
+            ]
+            for T in (50, 100, 150, 200, 250, 300, 350, 400)
+        },
+    },
     "docs/benchmarks.md": {
         "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances("second_order"),
         "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances("digital"),
@@ -385,6 +398,7 @@ CERTIFIED = (
 )
 LONG = (
     "| roots |",
+    "| … |",
     "prints its edge",
     "ones still fail",
     "rises by",
