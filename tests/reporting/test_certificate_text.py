@@ -73,7 +73,7 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
 def test_lines_give_the_judgement_and_then_verdict_end_and_balance(name: str, marks: str) -> None:
     found = certify(LOGS[name]())
     said = describe_certificate(found)
-    assert [line.mark.value for line in said] == marks.split()
+    assert [line.mark for line in said] == marks.split()
     assert said[0].text.startswith(f"{found.stability}: {found.end.behaviour}")
     assert said[1].text == found.verdict.text
 
