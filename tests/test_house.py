@@ -6,8 +6,9 @@ from pathlib import Path
 
 from . import house
 
-PLUG_INS = {"main"}
-"""Names that an interface asks of several modules: the entry point of a program."""
+ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
+PLUG_INS = {"main", *set.intersection(*(house.definitions(house.ROOT / path) for path in ARM_STAGES))}
+"""Names that an interface asks of several modules: the entry point of a program, the stages of an arm."""
 DESIGN = (house.ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
 
@@ -32,7 +33,7 @@ def test_a_module_name_is_used_once() -> None:
 def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
     assert len(lines) <= 260
-    assert sum(lines) <= 44_800
+    assert sum(lines) <= 47_600
 
 
 def test_no_body_is_longer_than_forty_lines() -> None:

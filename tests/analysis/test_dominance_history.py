@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import trilat_net
 from trilat_net.analysis.dominance_history import evaluate_ramps, trace_dominance
 from trilat_net.core.dominance import apply_ramps
-from trilat_net.core.link import LINK_DTYPE
+from trilat_net.core.link import link_dtype
 from trilat_net.core.ticks import DominanceRamp
 
 RATE_HZ = 50
@@ -22,7 +22,7 @@ def test_they_are_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     changes = [DominanceRamp(a * tick_ns, (a + n) * tick_ns, (x, 1.0 - x)) for a, n, x in drawn]
     found = evaluate_ramps(np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ)
     rows = [[0.0, 0.0, 0.5, 0.5], *([r.start_ns, r.end_ns, *r.alpha] for r in sorted(changes))]
-    links = np.zeros(2, LINK_DTYPE)
+    links = np.zeros(2, link_dtype(2))
     for k in range(100):
         apply_ramps(k * tick_ns, len(rows), np.array(rows, dtype=float), links)
         assert found.alpha[k] == pytest.approx(links["alpha"], abs=1e-9)

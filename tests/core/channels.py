@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trilat_net.core.channel import schedule_deliveries
 from trilat_net.core.delay import LINK_MODEL_DTYPE, LinkModel
-from trilat_net.core.link import LINK_DTYPE, SAMPLE_DTYPE
+from trilat_net.core.link import link_dtype, sample_dtype
 from trilat_net.core.philox import link_key
 from trilat_net.core.vectors import Points
 from trilat_net.scenario.delay_models import LinkBase
@@ -40,14 +40,14 @@ def channel(
 ) -> Channel:
     """A channel at its beginning; of the points the last `outages` are such."""
     table = np.empty((0, 2), dtype=np.int64) if points is None else points
-    row: Any = np.zeros(1, LINK_DTYPE)[0]
+    row: Any = np.zeros(1, link_dtype(2))[0]
     row.rate_hz, row.key, row.models = rate_hz, link_key(seed, name), len(models)
     row.used = row.foreseen = -1
     row.outage_first, row.outage_count = len(table) - outages, outages
     return Channel(
         row,
         np.array([tuple(model) for model in models], LINK_MODEL_DTYPE),
-        np.zeros(pages, SAMPLE_DTYPE),
+        np.zeros(pages, sample_dtype(2)),
         table,
     )
 

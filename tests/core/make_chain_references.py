@@ -121,8 +121,9 @@ def shipped_chain(name: str) -> dict:
 def random_state(random: np.random.Generator, n: int, weight: bool) -> dict[str, Array]:
     """A state; its gravity points down, or anywhere."""
     gravity = np.array([0.0, 0.0, -9.81]) if weight else random.normal(0.0, 6.0, 3)
-    spread = {"q": 1.5, "qd": 2.0, "v": 1.0, "a": 3.0, "r": 1.0, "tau": 5.0}
-    return {"gravity": gravity} | {key: random.normal(0.0, size, n) for key, size in spread.items()}
+    spread = {"q": 1.5, "qd": 2.0, "v": 1.0, "a": 3.0, "tau": 5.0}
+    drawn = {key: random.normal(0.0, size, n) for key, size in spread.items()}
+    return {"gravity": gravity, "r": drawn["qd"] - drawn["v"]} | drawn
 
 
 def main() -> None:

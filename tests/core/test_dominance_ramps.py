@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
 from trilat_net.core.dominance import apply_ramps
-from trilat_net.core.link import LINK_DTYPE
+from trilat_net.core.link import link_dtype
 from trilat_net.core.site_setup import LinkSetup
 from trilat_net.core.site_step import MAX_CHANGES, Site
 from trilat_net.core.ticks import Arrival, CoreChange, DominanceRamp, TickInput, TickRecord
@@ -44,7 +44,7 @@ def table(first: Row, ramps: Ramps) -> np.ndarray:
 
 def shares(t_ns: int, first: Row, ramps: Ramps) -> tuple[list[float], list[float]]:
     """(alpha, its derivative) per peer."""
-    links = np.zeros(PEERS, LINK_DTYPE)
+    links = np.zeros(PEERS, link_dtype(2))
     apply_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
     return links["alpha"].tolist(), links["alpha_rate"].tolist()
 

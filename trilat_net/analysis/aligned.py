@@ -82,7 +82,7 @@ class AlignedRecords(NamedTuple):
         """True if both ends of a period are recorded, shape (K - 1,)."""
         return self.known[:-1] & self.known[1:]
 
-    def held_torque(self, limit_nm: float, *, digital: bool) -> Array:
+    def held_torque(self, limit_nm: Array | float, *, digital: bool) -> Array:
         """Returns the torque that the controller holds over every period, shape (K - 1, 2), N m.
 
         tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.channel import LOST, schedule_deliveries
 from ..core.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
-from ..core.link import AHEAD_LIMIT_NS, LINK_DTYPE, SAMPLE_DTYPE
+from ..core.link import AHEAD_LIMIT_NS, link_dtype, sample_dtype
 from ..core.site_setup import LinkSetup
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array, Row
@@ -85,12 +85,12 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
 
 def _schedule(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
     """Returns when each sample is due, and the number of copies; by a row of the core's link."""
-    row: Row = np.zeros(1, LINK_DTYPE)[0]
+    row: Row = np.zeros(1, link_dtype(0))[0]
     row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(models)
     row.used, row.foreseen = -1, -1
     row.outage_first, row.outage_count = len(points) - len(setup.outages), len(setup.outages)
     due_ns = np.empty(count, dtype=np.int64)
-    pages = np.zeros(_BLOCK, SAMPLE_DTYPE)
+    pages = np.zeros(_BLOCK, sample_dtype(0))
     for start in range(0, count, _BLOCK):
         end = min(start + _BLOCK, count)
         schedule_deliveries(end - 1, row, models, pages, points)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from .jit import leaf
 from .site_setup import StaleAction
 from .ticks import Mode, tick_ns
-from .two_link_arm import JOINTS
-from .vectors import Array, Row, RowArray, pair, put_pair
+from .vectors import Array, Row, RowArray, put
 
 ROW_SUM_TOLERANCE = 1e-9
 
@@ -156,7 +155,7 @@ def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
     stale = any_peer_stale(t_ns, site.stale_ns, links)
     if stale and (site.mode == _RUN or site.mode == _RETURN):
         braking = site.on_stale == _ACT_BRAKE
-        for i in range(site.q.shape[0]):
+        for i in range(site.q_held.shape[0]):
             site.q_held[i] = site.q[i] if braking else site.q_followed[i]
         site.mode = _BRAKE if braking else _HOLD
         site.return_from_ns = 0
@@ -170,7 +169,7 @@ def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
     x = (t_ns - site.return_from_ns) / site.return_ns if site.mode == _RETURN else 0.0
     share = x * x * (3.0 - 2.0 * x)
     share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
-    for i in range(site.q.shape[0]):
+    for i in range(site.q_held.shape[0]):
         way = site.q_des[i] - site.q_held[i]
         site.q_des[i] = site.q_held[i] + share * way
         site.qd_des[i] = share * site.qd_des[i] + share_rate * way
@@ -184,8 +183,8 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
     """
     if site.ramps > 1:
         apply_ramps(t_ns, site.ramps, ramps, links)
-    put_pair(site.q_followed, pair(site.q_des))
-    for i in range(JOINTS):
+    put(site.q_followed, site.q_des)
+    for i in range(site.q_des.shape[0]):
         q_des = qd_des = felt = 0.0
         for j in range(links.shape[0]):
             link: Row = links[j]

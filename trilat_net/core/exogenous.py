@@ -8,23 +8,25 @@ Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtract
 
 import math
 from enum import IntEnum
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .chain import Three, dot, place_end_effector, three
 from .jit import leaf
 from .sincos import sincos
-from .two_link_arm import JOINTS, end_effector_jacobian, forward_kinematics
-from .vectors import Array, Pair, Row, Vector
+from .two_link_arm import end_effector_jacobian, forward_kinematics
+from .vectors import Array, Pair, Row, RowArray, Vector
 
 
 class TorqueKind(IntEnum):
     """The kinds of operators and environments.
 
     PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a damper towards a
-    target that moves along a minimum-jerk path, in joint angles or in the plane. RECORDED is torque by a
-    table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-plane, and never
+    target that moves along a minimum-jerk path, of the joints or of the end effector. RECORDED is torque by a
+    table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-space, and never
     pulls. CHIRP is a sine whose frequency rises or falls in straight lines, again and again. MULTISINE is a
     sum of sines of one amplitude.
     """
@@ -59,8 +61,8 @@ class TorqueSource(NamedTuple):
         K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (the first one).
         B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first one).
         sampled: true: evaluated once a tick and held.
-        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (n, 1 + JOINTS). MULTISINE:
-            rows of frequency, Hz, phase at the start in turns, and a column that is not used.
+        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n). MULTISINE:
+            rows of frequency, Hz, phase at the start in turns, and columns that are not used.
     """
 
     acts: TorqueKind
@@ -68,25 +70,28 @@ class TorqueSource(NamedTuple):
     end_s: float = math.inf
     move_start_s: float = 0.0
     move_end_s: float = 0.0
-    a: tuple[float, ...] = (0.0,) * JOINTS
-    b: tuple[float, ...] = (0.0,) * JOINTS
-    K: tuple[float, ...] = (0.0,) * JOINTS
-    B: tuple[float, ...] = (0.0,) * JOINTS
+    a: tuple[float, ...] = ()
+    b: tuple[float, ...] = ()
+    K: tuple[float, ...] = ()
+    B: tuple[float, ...] = ()
     sampled: bool = False
     table: Array | None = None
 
 
-_TIMES, _PAIRS = ("start_s", "end_s", "move_start_s", "move_end_s"), ("a", "b", "K", "B")
-TORQUE_SOURCE_DTYPE = np.dtype(
-    (
-        np.record,
-        [
-            *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count")),
-            *((name, "f8") for name in _TIMES),
-            *((name, "f8", (JOINTS,)) for name in _PAIRS),
-        ],
-    )
-)
+_TIMES, _NUMBERS = ("start_s", "end_s", "move_start_s", "move_end_s"), ("a", "b", "K", "B")
+
+
+@cache
+def torque_source_dtype(width: int) -> np.dtype[np.void]:
+    """Returns the layout of operators and environments whose vectors have up to so many numbers."""
+    fields = [
+        *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count")),
+        *((name, "f8") for name in _TIMES),
+        *((name, "f8", (width,)) for name in _NUMBERS),
+    ]
+    return np.dtype((np.record, fields))
+
+
 TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
 SourceTorque = tuple[float, float, float]
@@ -97,18 +102,24 @@ _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), 
 _CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
 
 
-def torque_source_rows(actors: tuple[TorqueSource, ...]) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns the actors as the core has them: a row each, and all their tables in one."""
-    rows = np.zeros(len(actors), TORQUE_SOURCE_DTYPE)
-    tables = [np.zeros((0, 1 + JOINTS))]
+def torque_source_rows(
+    actors: tuple[TorqueSource, ...], joints: int = 2
+) -> tuple[TorqueSourceRows, TorqueTable]:
+    """Returns the actors of an arm of so many joints: a row each, and all their tables in one."""
+    rows = np.zeros(len(actors), torque_source_dtype(2 if joints == 2 else max(joints, 3)))
+    tables = [np.zeros((0, 1 + joints))]
     first = 0
     row: Row
     for row, actor in zip(rows, actors, strict=True):
-        for name in (*_TIMES, *_PAIRS):
+        for name in _TIMES:
             row[name] = getattr(actor, name)
+        for name in _NUMBERS:
+            row[name][: len(getattr(actor, name))] = getattr(actor, name)
         row.acts, row.sampled = int(actor.acts), int(actor.sampled)
         if actor.table is not None:
-            tables.append(np.asarray(actor.table, dtype=np.float64))
+            table = np.zeros((len(actor.table), 1 + joints))
+            table[:, : np.shape(actor.table)[1]] = actor.table
+            tables.append(table)
             row.table_first, row.table_count = first, len(actor.table)
             first += len(actor.table)
     return rows, np.ascontiguousarray(np.concatenate(tables))
@@ -130,33 +141,42 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 
 
 @leaf
-def _pulse_torque(actor: Row, t_s: float) -> Pair:
-    s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
-    return actor.a[0] * (s * s), actor.a[1] * (s * s)
+def _spring_along(actor: Row, i: int, progress: float, rate: float, at: float, speed: float) -> float:
+    """Returns K (target - at) + B (its velocity - speed) along one coordinate."""
+    way: float = actor.b[i] - actor.a[i]
+    pull: float = actor.K[i] * (actor.a[i] + progress * way - at) + actor.B[i] * (rate * way - speed)
+    return pull
 
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    """Returns K (target - at) + B (its velocity - speed), per axis."""
     progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
-    way_0, way_1 = actor.b[0] - actor.a[0], actor.b[1] - actor.a[1]
     return (
-        actor.K[0] * (actor.a[0] + progress * way_0 - at[0]) + actor.B[0] * (rate * way_0 - speed[0]),
-        actor.K[1] * (actor.a[1] + progress * way_1 - at[1]) + actor.B[1] * (rate * way_1 - speed[1]),
+        _spring_along(actor, 0, progress, rate, at[0], speed[0]),
+        _spring_along(actor, 1, progress, rate, at[1], speed[1]),
     )
 
 
 @leaf
-def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Interpolates a table linearly; 0 before its first row and after its last."""
+def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
+    """Returns the two rows of a table around a time and the part of the way between; -1 outside of it."""
     first, count = actor.table_first, actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
-        return 0.0, 0.0
+        return -1, -1, 0.0
     before = int(np.searchsorted(table[first : first + count, 0], t_s, side="right")) - 1
     low = first + max(min(before, count - 2), 0)
     high = min(low + 1, first + count - 1)
     span = table[high, 0] - table[low, 0]
     x = (t_s - table[low, 0]) / span if span > 0.0 else 0.0
+    return low, high, x
+
+
+@leaf
+def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
+    """Interpolates a table linearly; 0 before its first row and after its last."""
+    low, high, x = _table_place(actor, t_s, table)
+    if low < 0:
+        return 0.0, 0.0
     return (
         table[low, 1] + x * (table[high, 1] - table[low, 1]),
         table[low, 2] + x * (table[high, 2] - table[low, 2]),
@@ -170,21 +190,33 @@ def _sine_of_turns(turns: float) -> float:
 
 
 @leaf
-def _chirp_torque(actor: Row, t_s: float) -> Pair:
-    """Returns peak * sin(2 pi x (f0 + (f1 - f0) x / (2 span))), x the time within the present sweep."""
+def _chirp_size(actor: Row, t_s: float) -> float:
+    """Returns sin(2 pi x (f0 + (f1 - f0) x / (2 span))), x the time within the present sweep."""
     span_s = actor.move_end_s - actor.move_start_s
     x = t_s - actor.start_s
     x -= span_s * math.floor(x / span_s)
-    s = _sine_of_turns(x * (actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x))
-    return actor.a[0] * s, actor.a[1] * s
+    return _sine_of_turns(x * (actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x))
 
 
 @leaf
-def _multisine_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
+def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     total = 0.0
     for n in range(actor.table_first, actor.table_first + actor.table_count):
         total += _sine_of_turns(table[n, 0] * (t_s - actor.start_s) + table[n, 1])
-    return actor.a[0] * total, actor.a[1] * total
+    return total
+
+
+@leaf
+def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
+    """Returns the torque of a pulse, chirp or multisine in parts of `a`.
+
+    A pulse is sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper, whose
+    numbers are not printed.
+    """
+    if actor.acts == _PULSE:
+        s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
+        return s * s
+    return _chirp_size(actor, t_s) if actor.acts == _CHIRP else _multisine_size(actor, t_s, table)
 
 
 @leaf
@@ -217,27 +249,20 @@ def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths:
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the torque of one actor ON the arm at time t.
-
-    A pulse is peak * sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper,
-    whose numbers are not printed.
-    """
+    """Returns the torque of one actor ON the planar arm at time t."""
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
-    if actor.acts == _PULSE:
-        torque = _pulse_torque(actor, t_s)
-    elif actor.acts == _HAND:
+    if actor.acts == _HAND:
         torque = _spring_force(actor, t_s, q, qd)
     elif actor.acts == _VISCOUS:
         torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
     elif actor.acts == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
-    elif actor.acts == _CHIRP:
-        torque = _chirp_torque(actor, t_s)
-    elif actor.acts == _MULTISINE:
-        torque = _multisine_torque(actor, t_s, table)
-    else:
+    elif actor.acts == _TASK_HAND or actor.acts == _WALL:
         return _end_effector_torque(actor, t_s, q, qd, lengths)
+    else:
+        size = _scripted_size(actor, t_s, table)
+        torque = actor.a[0] * size, actor.a[1] * size
     return torque[0], torque[1], 0.0
 
 
@@ -261,3 +286,94 @@ def torque_on_arm(
             total_1 += torque[1]
             largest_n = max(largest_n, torque[2])
     return total_0, total_1, largest_n
+
+
+@leaf
+def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three) -> Three:
+    """Returns the force of a spring or a wall on an end effector in three dimensions, N."""
+    if actor.acts == _TASK_HAND:
+        progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+        return (
+            _spring_along(actor, 0, progress, rate, at[0], speed[0]),
+            _spring_along(actor, 1, progress, rate, at[1], speed[1]),
+            _spring_along(actor, 2, progress, rate, at[2], speed[2]),
+        )
+    normal, point = three(actor.b), three(actor.a)
+    depth = dot(point, normal) - dot(at, normal)
+    if not depth > 0.0:
+        return 0.0, 0.0, 0.0
+    push = max(actor.K[0] * depth - actor.B[0] * dot(speed, normal), 0.0)
+    return push * normal[0], push * normal[1], push * normal[2]
+
+
+@leaf
+def _add_joint_torque(
+    actor: Row, t_s: float, q: Vector, qd: Vector, joints: int, table: TorqueTable, torque: Array
+) -> None:
+    """Adds the torque of an actor that acts on the joints themselves."""
+    if actor.acts == _HAND:
+        progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+        for i in range(joints):
+            torque[i] += _spring_along(actor, i, progress, rate, q[i], qd[i])
+    elif actor.acts == _VISCOUS:
+        for i in range(joints):
+            torque[i] -= actor.B[i] * qd[i]
+    elif actor.acts == _RECORDED:
+        low, high, x = _table_place(actor, t_s, table)
+        if low >= 0:
+            for i in range(joints):
+                torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
+    else:
+        size = _scripted_size(actor, t_s, table)
+        for i in range(joints):
+            torque[i] += actor.a[i] * size
+
+
+@leaf
+def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]:
+    """Returns place and velocity of a chain's end effector, and leaves its Jacobian in the chain's rows."""
+    at = place_end_effector(chain, tip)
+    v_0 = v_1 = v_2 = 0.0
+    for i in range(chain.shape[0]):
+        J = chain[i].J_lin
+        v_0, v_1, v_2 = v_0 + J[0] * qd[i], v_1 + J[1] * qd[i], v_2 + J[2] * qd[i]
+    return at, (v_0, v_1, v_2)
+
+
+@leaf
+def put_torque_on_chain(
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    tip: Vector,
+    chain: RowArray,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> float:
+    """Writes the torque of all actors with this `sampled` ON a chain whose joints are placed, shape (n,).
+
+    Returns the largest force of a wall in it, N.
+    """
+    n = chain.shape[0]
+    for i in range(n):
+        torque[i] = 0.0
+    at = speed = (0.0, 0.0, 0.0)
+    placed, largest_n = False, 0.0
+    for m in range(actors.shape[0]):
+        actor: Row = actors[m]
+        if actor.sampled != sampled or not actor.start_s <= t_s < actor.end_s:
+            continue
+        if actor.acts != _TASK_HAND and actor.acts != _WALL:
+            _add_joint_torque(actor, t_s, q, qd, n, table, torque)
+            continue
+        if not placed:
+            at, speed = _tip_motion(qd, tip, chain)
+            placed = True
+        force = _force_in_space(actor, t_s, at, speed)
+        for i in range(n):
+            torque[i] += dot(three(chain[i].J_lin), force)
+        if actor.acts == _WALL:
+            largest_n = max(largest_n, math.sqrt(dot(force, force)))
+    return largest_n

@@ -10,6 +10,7 @@ of the tick that releases it, if none newer is there; `recall_sample` reads the 
 Both cost the same at any delay. Newest wins: an older sample never replaces a newer one.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,41 +19,53 @@ from .channel import LOST, schedule_deliveries
 from .delay import MAX_DELAY_US, DelayKind
 from .jit import leaf
 from .ticks import NS_PER_S, LinkCounts, first_tick_at, tick_ns
-from .two_link_arm import JOINTS
-from .vectors import Array, IntArray, Points, Row, RowArray, pair, put_pair
+from .vectors import Array, IntArray, Points, Row, RowArray, put
 
-_VECTORS = (("q", "f8", (JOINTS,)), ("qd", "f8", (JOINTS,)), ("tau_x", "f8", (JOINTS,)))
 _CHANNEL = ("models", "model", "outage_first", "outage_count", "foreseen", "bad", "due_before")
-LINK_DTYPE = np.dtype(
-    (
-        np.record,
-        [
-            ("alpha", "f8"),
-            ("alpha_rate", "f8"),
-            ("rate_hz", "i8"),
-            ("used", "i8"),
-            *_VECTORS,
-            ("key", "u8"),
-            *((name, "i8") for name in _CHANNEL),
-            ("memory", "f8"),
-            *((name, "i8") for name in LinkCounts._fields),
-        ],
-    )
-)
-"""One row per peer, in scenario order. `used` is -1 until the first sample is released; until then q and qd
-are the peer's start pose, at rest (L7)."""
-SAMPLE_DTYPE = np.dtype((np.record, [("due_ns", "i8"), ("tick", "i8"), *_VECTORS]))
-"""One page per sample, a power of two of them: when the sample of that index is due, and the sample that
-waits there with its own tick (-1: none) and the peer's joint state."""
+
+
+def _sample_vectors(shared: int) -> list[tuple[str, str, tuple[int]]]:
+    return [(name, "f8", (shared,)) for name in ("q", "qd", "tau_x")]
+
+
+@cache
+def link_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the layout of a link on which samples of so many coordinates come: one row per peer.
+
+    They stand in scenario order. `used` is -1 until the first sample is released; until then q and qd are the
+    peer's start pose, at rest (L7).
+    """
+    fields = [
+        ("alpha", "f8"),
+        ("alpha_rate", "f8"),
+        ("rate_hz", "i8"),
+        ("used", "i8"),
+        *_sample_vectors(shared),
+        ("key", "u8"),
+        *((name, "i8") for name in _CHANNEL),
+        ("memory", "f8"),
+        *((name, "i8") for name in LinkCounts._fields),
+    ]
+    return np.dtype((np.record, fields))
+
+
+@cache
+def sample_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the layout of the pages where samples wait: one per sample, a power of two of them.
+
+    A page says when the sample of its index is due, and holds the sample that waits there with its own tick
+    (-1: none).
+    """
+    return np.dtype((np.record, [("due_ns", "i8"), ("tick", "i8"), *_sample_vectors(shared)]))
 
 
 class LinkArrays(NamedTuple):
     """The arrays of one link.
 
     Attributes:
-        state: shape (1,), LINK_DTYPE.
+        state: shape (1,), see `link_dtype`.
         models: what its channel does, shape (M,), LINK_MODEL_DTYPE.
-        samples: where samples wait, shape (pages,), SAMPLE_DTYPE.
+        samples: where samples wait, shape (pages,), see `sample_dtype`.
         calendar: the newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
         points: the site's traces and outages, shape (n, 2).
     """
@@ -129,9 +142,9 @@ def accept_sample(
         row.superseded += 1
         return
     slot.tick = tick
-    put_pair(slot.q, pair(q))
-    put_pair(slot.qd, pair(qd))
-    put_pair(slot.tau_x, pair(tau_x))
+    put(slot.q, q)
+    put(slot.qd, qd)
+    put(slot.tau_x, tau_x)
     if tick <= row.used:  # filed all the same: a duplicate of it is recognised
         row.superseded += 1
         return
@@ -160,8 +173,8 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     slot: Row = link.samples[newest & (link.samples.shape[0] - 1)]
     if newest > row.used and slot.tick == newest:
         row.used = newest
-        put_pair(row.q, pair(slot.q))
-        put_pair(row.qd, pair(slot.qd))
-        put_pair(row.tau_x, pair(slot.tau_x))
+        put(row.q, slot.q)
+        put(row.qd, slot.qd)
+        put(row.tau_x, slot.tau_x)
     else:
         row.superseded += 1

@@ -6,69 +6,74 @@ fields with the paper's names.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .chain import build_chain
 from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
-from .link import LINK_DTYPE, SAMPLE_DTYPE, calendar_pages
-from .site_setup import Gains, Law, LinkSetup, SiteSetup
-from .ticks import DominanceRamp, Mode, first_tick_at
+from .link import calendar_pages, link_dtype, sample_dtype
+from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
+from .ticks import MAX_ARRIVALS, DominanceRamp, Mode, first_tick_at
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
-_VECTOR, _ESTIMATE = (JOINTS,), (PARAMETERS,)
-_GAINS = {name: len(value) for name, value in Gains._field_defaults.items() if name != "theta_hat0"}
-"""Constant gains, and how many numbers each has; the first estimate becomes `theta_hat`."""
 _SETTINGS = ("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns")
-_STATE = ("q", "qd", "tau", "tau_before", "q_held")
-_COMPUTED = ("q_des", "qd_des", "q_followed", "felt", "on_arm", "held", "e", "ed", "r")
-SITE_DTYPE = np.dtype(
-    (
-        np.record,
-        [
-            *((name, "i8") for name in _SETTINGS),
-            *((name, "f8") for name in ("g", "tau_limit", "qd_limit")),
-            ("lengths", "f8", (2,)),
-            ("theta", "f8", _ESTIMATE),
-            *((name, "f8", (count,)) for name, count in _GAINS.items()),
-            ("mode", "i8"),
-            *((name, "f8", _VECTOR) for name in _STATE),
-            *((name, "f8", _ESTIMATE) for name in ("theta_hat", "Yr", "Yr_before")),
-            ("return_from_ns", "i8"),
-            *((name, "f8", _VECTOR) for name in _COMPUTED),
-            ("Y", "f8", (JOINTS, PARAMETERS)),
-            ("wall_n", "f8"),
-        ],
-    )
+_COUNTS = ("joints", "shared", "parameters")
+_GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
+"""Constant gains; the first estimate becomes `theta_hat`."""
+_PER_JOINT = ("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "r", "u")
+_PER_COORDINATE = (
+    *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),
 )
-"""A site's settings and gains, its state (from `mode` on), and the intermediate results of a tick."""
-ARRIVAL_DTYPE = np.dtype(
-    (np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", _VECTOR), ("qd", "f8", _VECTOR)])
-)
+_PER_PARAMETER = ("theta", "known", "Gamma", "low", "high", "theta_hat", "Yr", "Yr_before")
+_OF_CHAIN = ("v", "a", "zeros", "stage_q", "stage_qd", "stage_qdd", "stage_torque", "sum_qd", "sum_qdd")
 
-ROW_FLOATS = 6 * JOINTS + PARAMETERS
-"""The floats of a record, one after the other: q, qd, q_des, qd_des, tau, tau_x, theta_hat."""
-RECORD_Q_DES, RECORD_TAU, RECORD_TAU_X = 2 * JOINTS, 4 * JOINTS, 5 * JOINTS
-"""Where three of them begin."""
+
+@cache
+def site_dtype(layout: Layout) -> np.dtype[np.void]:
+    """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
+    fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns")]
+    fields += [("g", "f8"), ("wall_n", "f8"), ("lengths", "f8", (2,))]
+    for names, count in (
+        (_PER_JOINT, layout.joints),
+        (_PER_COORDINATE, layout.shared),
+        (_PER_PARAMETER, layout.parameters),
+    ):
+        fields += [(name, "f8", (count,)) for name in names]
+    if layout.chain:
+        fields += [(name, "f8", (layout.joints,)) for name in _OF_CHAIN]
+        fields += [("gravity", "f8", (3,)), ("tip", "f8", (3,))]
+    fields.append(("Y", "f8", (JOINTS, PARAMETERS)))  # the leaves of the planar arm are compiled for any
+    return np.dtype((np.record, fields))
+
+
+@cache
+def arrival_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the layout of an arrival whose vectors have so many numbers."""
+    return np.dtype(
+        (np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", (shared,)), ("qd", "f8", (shared,))])
+    )
 
 
 class SiteArrays(NamedTuple):
     """The arrays of one site, or of several that are stacked: then each has one axis more, in front.
 
     Attributes:
-        site: state and constants, shape (1,), SITE_DTYPE.
-        links: one row per peer, shape (P,), LINK_DTYPE.
+        site: state and constants, shape (1,), see `site_dtype`.
+        links: one row per peer, shape (P,), see `link_dtype`.
         models: what the links' channels do, shape (P, M), LINK_MODEL_DTYPE.
-        samples: where samples wait, shape (P, pages), SAMPLE_DTYPE.
+        samples: where samples wait, shape (P, pages), see `sample_dtype`.
         calendars: the links' calendars, shape (P, pages).
         points: traces and outages, shape (n, 2); of stacked sites one for all.
         ramps: how dominance factors change, shape (R, RAMP_COLUMNS + P).
-        actors: operators and environments, shape (A,), TORQUE_SOURCE_DTYPE.
-        table: their recorded torques, shape (n, 3); of stacked sites one for all.
+        actors: operators and environments, shape (A,), see `torque_source_dtype`.
+        table: their recorded torques, shape (rows, 1 + n); of stacked sites one for all.
+        chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link arm.
     """
 
     site: RowArray
@@ -80,15 +85,16 @@ class SiteArrays(NamedTuple):
     ramps: Array
     actors: TorqueSourceRows
     table: TorqueTable
+    chain: RowArray | None
 
 
 class TickBuffers(NamedTuple):
     """Input and output of one tick.
 
     Attributes:
-        arrivals: what came in, shape (MAX_ARRIVALS,), ARRIVAL_DTYPE.
-        forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, JOINTS), N m.
-        record: the record's floats, shape (ROW_FLOATS,); written.
+        arrivals: what came in, shape (MAX_ARRIVALS,), see `arrival_dtype`.
+        forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, m), N m.
+        record: the record's floats, see `Layout.columns`; written.
     """
 
     arrivals: RowArray
@@ -96,25 +102,38 @@ class TickBuffers(NamedTuple):
     record: Array
 
 
-def build_site_arrays(setup: SiteSetup, spare: int = 0, pages: int = 0) -> SiteArrays:
+def build_tick_buffers(layout: Layout) -> TickBuffers:
+    """Returns the buffers of a site of this layout."""
+    m = layout.shared
+    return TickBuffers(
+        np.zeros(MAX_ARRIVALS, arrival_dtype(m)), np.zeros((MAX_ARRIVALS, m)), np.zeros(layout.floats)
+    )
+
+
+def build_site_arrays(
+    setup: SiteSetup, spare: int = 0, pages: int = 0, layout: Layout | None = None
+) -> SiteArrays:
     """Returns the arrays of a site at its first tick.
 
     Args:
         setup: all that the site is built from.
         spare: room for so many more changes of a link, and of the dominance factors.
         pages: pages of a link; 0: as many as any delay may ever need.
+        layout: of the arrays, if they are to be larger than the site needs.
     """
-    links = setup.links
+    links, layout = setup.links, layout or setup.layout
     peers = len(links)
     pages = pages or max(calendar_pages(max(link.rate_hz, setup.rate_hz)) for link in links)
-    samples = np.zeros((peers, pages), SAMPLE_DTYPE)
+    samples = np.zeros((peers, pages), sample_dtype(layout.shared))
     samples["tick"] = -1
-    rows, models, points = _build_links(links, spare)
-    actors, table = torque_source_rows(setup.actors)
+    rows, models, points = _build_links(links, spare, layout.shared)
+    actors, table = torque_source_rows(setup.actors, layout.joints)
     ramps = np.zeros((1 + len(setup.ramps) + spare, RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
     calendars = np.full((peers, pages), -1, dtype=np.int64)
-    arrays = SiteArrays(_build_site(setup), rows, models, samples, calendars, points, ramps, actors, table)
+    chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
+    site = _build_site(setup, layout)
+    arrays = SiteArrays(site, rows, models, samples, calendars, points, ramps, actors, table, chain)
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
     return arrays
@@ -156,7 +175,9 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     longest = max(max_delay_us(link.models, link.traces) for setup in setups for link in setup.links)
     fastest_hz = max(setup.rate_hz for setup in setups)
     pages = 1 << (first_tick_at(longest * 1000, fastest_hz) + _SLACK).bit_length()
-    sites = [build_site_arrays(setup, pages=pages) for setup in setups]
+    layouts = [setup.layout for setup in setups]
+    largest = Layout(*map(max, zip(*layouts, strict=True)))
+    sites = [build_site_arrays(setup, pages=pages, layout=largest) for setup in setups]
     first_point = first_torque = 0
     for site in sites:  # one table of points, and one of torques, for all
         site.models["trace_first"] += first_point
@@ -167,11 +188,13 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     columns: dict[str, list[Any]] = {
         name: [getattr(site, name) for site in sites] for name in SiteArrays._fields
     }
+    if not largest.chain:
+        del columns["chain"]
     joined: dict[str, Any] = {name: np.concatenate(columns.pop(name)) for name in ("points", "table")}
     stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
     for row, site in zip(stacked["actors"], sites, strict=True):
         row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
-    return SiteArrays(**stacked, **joined)
+    return SiteArrays(**{"chain": None, **stacked, **joined})
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -185,25 +208,30 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     )
 
 
-def _build_site(setup: SiteSetup) -> RowArray:
-    site = np.zeros(1, SITE_DTYPE)
+def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
+    site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
-    gains, rule = setup.gains, setup.on_stale
+    gains, rule, own = setup.gains, setup.on_stale, setup.layout
     s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
-    s.g, s.tau_limit, s.qd_limit = setup.g_m_s2, setup.tau_limit_nm, setup.qd_limit_rad_s
+    s.joints, s.shared, s.parameters = own.joints, own.shared, own.parameters
     s.external, s.ramps = int(setup.external), 1
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
-    s.lengths, s.theta = setup.lengths_m, setup.theta
-    for name in _GAINS:
-        s[name] = getattr(gains, name)
-    s.q, s.qd = setup.q0, setup.qd0
-    s.theta_hat = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
+    if setup.chain is None:
+        s.g, s.lengths = setup.g_m_s2, setup.lengths_m
+    else:
+        s.gravity, s.tip = setup.chain.gravity_m_s2, setup.chain.tip_m
+    vectors = {name: getattr(gains, name) for name in _GAINS}
+    vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
+    vectors |= {"q": setup.q0, "qd": setup.qd0}
+    vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
+    for name, value in vectors.items():
+        s[name][: own.parameters if name in _PER_PARAMETER else own.joints] = value
     return site
 
 
-def _build_links(links: Sequence[LinkSetup], spare: int) -> tuple[RowArray, RowArray, Points]:
+def _build_links(links: Sequence[LinkSetup], spare: int, shared: int) -> tuple[RowArray, RowArray, Points]:
     """Returns the links' rows, their models, and the points of their traces and outages."""
-    rows = np.zeros(len(links), LINK_DTYPE)
+    rows = np.zeros(len(links), link_dtype(shared))
     all_models = np.zeros((len(links), max(len(link.models) for link in links) + spare), LINK_MODEL_DTYPE)
     traces = [trace for link in links for trace in link.traces if trace is not None]
     outages = [outage for link in links for outage in link.outages]
@@ -212,7 +240,8 @@ def _build_links(links: Sequence[LinkSetup], spare: int) -> tuple[RowArray, RowA
     row: Row
     for row, models, link in zip(rows, all_models, links, strict=True):
         row.alpha, row.rate_hz, row.key = link.alpha, link.rate_hz, link.key
-        row.used, row.foreseen, row.q = -1, -1, link.q0
+        row.used, row.foreseen = -1, -1
+        row.q[: len(link.q0)] = link.q0
         row.outage_first, row.outage_count = outage_first, len(link.outages)
         outage_first += len(link.outages)
         row.models = len(link.models)

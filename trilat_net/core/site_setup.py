@@ -4,16 +4,17 @@ Invariant: nothing else influences a site's numbers.
 """
 
 import math
-from collections.abc import Sequence
 from enum import IntEnum
+from itertools import accumulate
 from typing import NamedTuple
 
+from .chain import LINK_PARAMETERS, ChainJoint, Three
 from .delay import LinkModel
 from .exogenous import TorqueSource
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
 from .user_law import UserLawFactory
-from .vectors import Array, Points
+from .vectors import Array, Points, Vector
 
 
 class Scheme(IntEnum):
@@ -90,36 +91,90 @@ class LinkSetup(NamedTuple):
     outages: tuple[tuple[int, int], ...] = ()
 
 
+class Layout(NamedTuple):
+    """How many numbers the vectors of a site have.
+
+    Attributes:
+        joints: one per joint of the arm.
+        shared: one per coordinate that sites exchange.
+        parameters: one per dynamic parameter of the arm.
+        chain: true: the arm is a chain of joints, else the planar two-link arm.
+    """
+
+    joints: int = JOINTS
+    shared: int = JOINTS
+    parameters: int = PARAMETERS
+    chain: bool = False
+
+    def columns(self) -> dict[str, slice]:
+        """Returns where the vectors of a record stand in its row of floats, in their order."""
+        n, m = self.joints, self.shared
+        lengths = {
+            "q": n,
+            "qd": n,
+            "q_des": m,
+            "qd_des": m,
+            "tau": n,
+            "tau_x": n,
+            "theta_hat": self.parameters,
+        }
+        ends = list(accumulate(lengths.values()))
+        return {
+            name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
+        }
+
+    @property
+    def floats(self) -> int:
+        """Length of a record's row of floats."""
+        return 4 * self.joints + 2 * self.shared + self.parameters
+
+
+class ChainSetup(NamedTuple):
+    """An arm that is a chain of joints.
+
+    Attributes:
+        joints: its joints, from the base on.
+        gravity_m_s2: gravitational acceleration in the base's frame.
+        tip_m: the end effector in the last link's frame.
+    """
+
+    joints: tuple[ChainJoint, ...]
+    gravity_m_s2: Three = (0.0, 0.0, -9.81)
+    tip_m: Three = (0.0, 0.0, 0.0)
+
+
 class Gains(NamedTuple):
     """A control law and its gains, diagonal ones as vectors; those of other laws have no effect.
+
+    One number stands for a vector whose entries are all that number.
 
     Attributes:
         law: the law.
         Lambda: shape (n,), 1/s.
         Kp: shape (n,), N m s/rad.
         Kd: shape (n,), N m s/rad.
-        Gamma: adaptation gain per parameter, shape (5,).
-        theta_hat0: the first estimate, shape (5,).
-        low: lower bound of each estimate, shape (5,).
-        high: upper bound, shape (5,).
-        known: the parameters that KNOWN takes the arm to have, shape (5,).
+        Gamma: adaptation gain per parameter, shape (P,).
+        theta_hat0: the first estimate, shape (P,).
+        low: lower bound of each estimate, shape (P,).
+        high: upper bound, shape (P,).
+        known: the parameters that KNOWN takes the arm to have, shape (P,).
         K: stiffness of KNOWN, shape (n,), N m/rad.
         d: damping of KNOWN, shape (n,), N m s/rad.
         k_f: gain of the reflected force of KNOWN, shape (n,), dimensionless.
     """
 
     law: Law
-    Lambda: Sequence[float] = (1.0,) * JOINTS
-    Kp: Sequence[float] = (0.0,) * JOINTS
-    Kd: Sequence[float] = (0.0,) * JOINTS
-    Gamma: Sequence[float] = (0.0,) * PARAMETERS
-    theta_hat0: Sequence[float] = (0.0,) * PARAMETERS
-    low: Sequence[float] = (-math.inf,) * PARAMETERS
-    high: Sequence[float] = (math.inf,) * PARAMETERS
-    known: Sequence[float] = (0.0,) * PARAMETERS
-    K: Sequence[float] = (0.0,) * JOINTS
-    d: Sequence[float] = (0.0,) * JOINTS
-    k_f: Sequence[float] = (0.0,) * JOINTS
+    Lambda: Vector = 1.0
+    Kp: Vector = 0.0
+    Kd: Vector = 0.0
+    Gamma: Vector = 0.0
+    theta_hat0: Vector = 0.0
+    low: Vector = -math.inf
+    high: Vector = math.inf
+    known: Vector = 0.0
+    K: Vector = 0.0
+    d: Vector = 0.0
+    k_f: Vector = 0.0
 
 
 class SiteSetup(NamedTuple):
@@ -130,10 +185,10 @@ class SiteSetup(NamedTuple):
         rate_hz: tick rate, Hz.
         scheme: how the law is sampled.
         gains: the law and its gains.
-        theta: true parameters of the arm, shape (5,).
-        g_m_s2: gravitational acceleration, m/s^2.
-        lengths_m: of the two links.
-        tau_limit_nm: largest control torque of a joint, N m.
+        theta: true parameters of the arm, shape (P,).
+        g_m_s2: gravitational acceleration, m/s^2; of a chain its setup says it.
+        lengths_m: of the two links; of a chain without effect.
+        tau_limit_nm: largest control torque of a joint, N m; one number, or one per joint.
         qd_limit_rad_s: joint speed beyond which the run counts as diverged, rad/s.
         q0: start pose, rad.
         qd0: start velocity, rad/s.
@@ -144,6 +199,7 @@ class SiteSetup(NamedTuple):
         external: true: the arm is outside of the program; it is measured, and nothing is integrated.
         own: makes the user's law, if it is one.
         theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
+        chain: the arm, if it is a chain; None: it is the planar two-link arm.
     """
 
     name: str
@@ -153,8 +209,8 @@ class SiteSetup(NamedTuple):
     theta: Array
     g_m_s2: float
     lengths_m: tuple[float, float]
-    tau_limit_nm: float
-    qd_limit_rad_s: float
+    tau_limit_nm: Vector
+    qd_limit_rad_s: Vector
     q0: tuple[float, ...]
     qd0: tuple[float, ...]
     actors: tuple[TorqueSource, ...]
@@ -164,3 +220,12 @@ class SiteSetup(NamedTuple):
     external: bool = False
     own: UserLawFactory | None = None
     theta_known: bool = True
+    chain: ChainSetup | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """How many numbers its vectors have."""
+        if self.chain is None:
+            return Layout()
+        n = len(self.chain.joints)
+        return Layout(n, n, LINK_PARAMETERS * n, True)

@@ -16,15 +16,12 @@ import numpy as np
 from .channel import LOST
 from .delay import DelayKind
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
-from .site_arrays import ARRIVAL_DTYPE, ROW_FLOATS, TickBuffers, add_model, add_ramp, build_site_arrays
+from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
-from .two_link_arm import JOINTS
 from .user_law import LawContext, LawInput, UserLaw, call_law, restore_law
 from .vectors import Row
 
-_ARRIVAL_LAYOUT = struct.Struct(f"<qq{2 * JOINTS}d")
-_PACK_ARRIVAL, _PACK_ARRIVAL_SIZE = _ARRIVAL_LAYOUT.pack_into, _ARRIVAL_LAYOUT.size
 _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
 
@@ -42,6 +39,7 @@ class Site:
         name: the site's name.
         rate_hz: its tick rate, Hz.
         peers: names of its peers, in scenario order.
+        layout: how many numbers its vectors have.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -51,9 +49,11 @@ class Site:
         self._starts = [link.q0 for link in setup.links]
         self._external = setup.external
         self._arrays = build_site_arrays(setup, MAX_CHANGES)
-        self._buffers = TickBuffers(
-            np.zeros(MAX_ARRIVALS, ARRIVAL_DTYPE), np.zeros((MAX_ARRIVALS, JOINTS)), np.zeros(ROW_FLOATS)
-        )
+        self.layout = setup.layout
+        self._columns = tuple(self.layout.columns().values())
+        self._buffers = build_tick_buffers(self.layout)
+        arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
+        self._pack_arrival, self._arrival_size = arrival.pack_into, arrival.size
         self._tick_arrays = (*self._arrays, *self._buffers)
         self._site, self._links = self._arrays.site, self._arrays.links
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
@@ -63,7 +63,7 @@ class Site:
             theta = tuple(map(float, setup.theta)) if setup.theta_known else ()
             g, lengths, limit = setup.g_m_s2, setup.lengths_m, setup.tau_limit_nm
             self._user_law = setup.own(LawContext(setup.name, setup.rate_hz, g, lengths, theta, limit))
-        self._reflects = any(setup.gains.k_f) or self._user_law is not None
+        self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
     def order(self, command: CoreChange) -> None:
         """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
@@ -104,21 +104,21 @@ class Site:
             sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
             memory = self._call_user_law(self._user_law, tick.k)
             a = self._arrays
-            act_stages(tick.k, t_ns, a.site, a.actors, a.table, self._buffers.record)
+            act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
-        n = JOINTS
+        q, qd, q_des, qd_des, tau, tau_x, theta_hat = self._columns
         mode = self._site["mode"].item()
         return TickRecord(
             tick.k,
             t_ns,
             _MODES[mode],
-            row[:n],
-            row[n : 2 * n],
-            row[2 * n : 3 * n],
-            row[3 * n : 4 * n],
-            row[4 * n : 5 * n],
-            row[5 * n : 6 * n],
-            row[6 * n :],
+            row[q],
+            row[qd],
+            row[q_des],
+            row[qd_des],
+            row[tau],
+            row[tau_x],
+            row[theta_hat],
             self._links["used"].tolist(),
             self._crc(packed, count),
             [command.text for command in tick.commands],
@@ -130,16 +130,17 @@ class Site:
         s: Row = self._site[0]
         vectors = (s.q, s.qd, s.q_des, s.qd_des, s.felt)
         now = LawInput(k, k / self.rate_hz, 1.0 / self.rate_hz, *(vector.tolist() for vector in vectors))
-        torque, estimate, memory = call_law(law, self.name, now)
-        limit = float(s.tau_limit)
-        s.tau = [min(max(value, -limit), limit) for value in torque]
+        torque, estimate, memory = call_law(law, self.name, now, self.layout.joints, self.layout.parameters)
+        s.tau = np.clip(torque, -s.tau_limit, s.tau_limit)
         s.theta_hat = estimate
         return memory
 
     def _crc(self, packed: int, arrivals: int) -> int:
         """Returns `TickRecord.rx_crc`."""
         crc = zlib.crc32(self._arrival_bytes[:packed])
-        return zlib.crc32(self._force_bytes[: arrivals * 8 * JOINTS], crc) if self._reflects else crc
+        return (
+            zlib.crc32(self._force_bytes[: arrivals * 8 * self.layout.shared], crc) if self._reflects else crc
+        )
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
@@ -177,13 +178,14 @@ class Site:
             last: the record of the last tick.
         """
         s: Row = self._site[0]
+        held = self.layout.shared
         s.mode = int(last.mode)
         s.q, s.qd, s.theta_hat = last.q, last.qd, last.theta_hat
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
-            s.q_held, s.return_from_ns = last.mem[:JOINTS], int(last.mem[JOINTS])
+            s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
         if self._user_law is not None:
-            restore_law(self._user_law, self.name, last.mem[JOINTS + 1 :])
+            restore_law(self._user_law, self.name, last.mem[held + 1 :])
         resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
@@ -206,7 +208,8 @@ class Site:
             if sample is None:
                 link.used, link.q, link.qd, link.tau_x = -1, start, 0.0, 0.0
             else:
-                link.used, link.q, link.qd, link.tau_x = sample.tick, sample.q, sample.qd, sample.tau_x
+                link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
+                link.tau_x = sample.tau_x or 0.0
         self._pack(waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
@@ -216,9 +219,9 @@ class Site:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
         offset = 0
         for peer, tick, q, qd, _, _ in arrivals:
-            _PACK_ARRIVAL(self._arrival_bytes, offset, peer, tick, *q, *qd)
-            offset += _PACK_ARRIVAL_SIZE
+            self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
+            offset += self._arrival_size
         if self._reflects:
             for n, arrival in enumerate(arrivals):
-                self._buffers.forces[n] = arrival.tau_x
+                self._buffers.forces[n] = arrival.tau_x or 0.0
         return offset

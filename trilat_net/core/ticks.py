@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from .delay import LinkModel
 from .jit import leaf
-from .two_link_arm import JOINTS
 
 NS_PER_S = 1_000_000_000
 BUCKETS_PER_S = 20
@@ -35,9 +34,6 @@ def first_tick_at(due_ns: int, rate_hz: int) -> int:
 
 MAX_ARRIVALS = 4096
 """Most arrivals that one tick takes in; a driver leaves the rest for the next one."""
-
-
-_NOTHING = (0.0,) * JOINTS
 
 
 class Mode(IntEnum):
@@ -72,7 +68,7 @@ class Arrival(NamedTuple):
     q: Sequence[float]
     qd: Sequence[float]
     latency_us: int = 0
-    tau_x: Sequence[float] = _NOTHING
+    tau_x: Sequence[float] = ()
 
 
 class DominanceRamp(NamedTuple):

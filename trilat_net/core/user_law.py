@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from ..errors import LawFailed
-from .two_link_arm import JOINTS, PARAMETERS
+from .vectors import Vector
 
 MAX_LAW_MEMORY = 1024
 """Most numbers of a law's memory, which is in the record of every tick."""
@@ -25,7 +25,7 @@ class LawContext(NamedTuple):
         lengths_m: of the two links.
         theta: the arm's true parameters, shape (5,), for a law that claims to know them; () if they are
             unknown, as of a real arm that was not identified.
-        tau_limit_nm: largest torque of a joint, N m.
+        tau_limit_nm: largest torque of a joint, N m; one number, or one per joint.
     """
 
     site: str
@@ -33,7 +33,7 @@ class LawContext(NamedTuple):
     g_m_s2: float
     lengths_m: tuple[float, float]
     theta: tuple[float, ...]
-    tau_limit_nm: float
+    tau_limit_nm: Vector
 
 
 class LawInput(NamedTuple):
@@ -79,21 +79,23 @@ class UserLaw(Protocol):
 UserLawFactory = Callable[[LawContext], UserLaw]
 
 
-def call_law(law: UserLaw, site: str, now: LawInput) -> tuple[list[float], list[float], list[float]]:
-    """Returns torque, estimate and memory of a law at a tick.
+def call_law(
+    law: UserLaw, site: str, now: LawInput, joints: int, parameters: int
+) -> tuple[list[float], list[float], list[float]]:
+    """Returns torque, estimate and memory of a law at a tick, of an arm with so many joints and parameters.
 
     Raises:
         LawFailed: it raised, or its results are not finite numbers of the right count.
     """
     try:
         torque = [float(value) for value in law.torque(now)]
-        estimate = [float(value) for value in getattr(law, "theta_hat", (0.0,) * PARAMETERS)]
+        estimate = [float(value) for value in getattr(law, "theta_hat", (0.0,) * parameters)]
         memory = [float(value) for value in law.memory()]
     except LawFailed:  # its watchdog has stopped it
         raise
     except (Exception, SystemExit) as error:
         raise _law_error(law, site, now.k, _one_line(error)) from error
-    for name, values, length in (("torque", torque, JOINTS), ("theta_hat", estimate, PARAMETERS)):
+    for name, values, length in (("torque", torque, joints), ("theta_hat", estimate, parameters)):
         if len(values) != length:
             raise _law_error(law, site, now.k, f"{name} has {len(values)} numbers, not {length}")
     if len(memory) > MAX_LAW_MEMORY:

@@ -39,6 +39,13 @@ def put_pair(a: Any, values: Pair) -> None:
 
 
 @leaf
+def put(a: Any, values: Any) -> None:
+    """Writes one row into another of the same length."""
+    for i in range(a.shape[0]):
+        a[i] = values[i]
+
+
+@leaf
 def put_five(a: Any, values: Five) -> None:
     """Writes five numbers into a row."""
     a[0], a[1], a[2], a[3], a[4] = values

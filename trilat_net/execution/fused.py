@@ -11,17 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import (
-    PEAK_COLUMNS,
-    PROGRESS_DTYPE,
-    SENT_DTYPE,
-    SUMS_DTYPE,
-    largest_of_joints,
-    run_until,
-)
+from ..core.fused_run import PROGRESS_DTYPE, largest_of_joints, run_until, sent_dtype, sums_dtype
 from ..core.site_arrays import stack_site_arrays
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, tick_ns
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array, Row, RowArray
 from ..errors import ScenarioError
 from ..scenario import Scenario
@@ -86,16 +78,21 @@ class FusedRun:
         check_fusable(scenario)
         self._scenario = scenario
         self._apart_rad = apart_rad
-        self._tables = stack_site_arrays([scenario.setup(name) for name in scenario.names])
+        setups = [scenario.setup(name) for name in scenario.names]
+        self._tables = stack_site_arrays(setups)
+        self._layouts = [setup.layout for setup in setups]
+        joints = max(layout.joints for layout in self._layouts)
         count = len(scenario.names)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
         self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
         kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
-        self._sent: RowArray = np.zeros((count, kept), SENT_DTYPE)
-        self._peaks = np.full((count, 0, PEAK_COLUMNS), -1.0)
-        self._sums: RowArray = np.zeros(count, SUMS_DTYPE)
+        self._sent: RowArray = np.zeros(
+            (count, kept), sent_dtype(max(layout.floats for layout in self._layouts))
+        )
+        self._peaks = np.full((count, 0, 3 * joints), -1.0)
+        self._sums: RowArray = np.zeros(count, sums_dtype(joints))
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
@@ -111,12 +108,12 @@ class FusedRun:
             if progress.tick < progress.ticks:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
         buckets = math.ceil(until_s * BUCKETS_PER_S) + 1
-        grown = np.full((len(self._progress), buckets, PEAK_COLUMNS), -1.0)
+        grown = np.full((len(self._progress), buckets, self._peaks.shape[2]), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
         rows = (self._progress, self._taken, self._sent, self._peaks, self._sums)
-        run_until(last_ns, self._apart_rad, *rows, self._tables)
+        run_until(last_ns, self._apart_rad, *rows, self._tables, self._tables.chain)
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def advance_watching(self, until_s: float, states: int = 100) -> tuple[Array, Array]:
@@ -146,7 +143,7 @@ class FusedRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """The `PEAK_COLUMNS` of every 50 ms of each site, shape (buckets, 6) each.
+        """The peaks of every 50 ms of each site, see `run_until`, shape (buckets, 3 n) each.
 
         -1 marks a bucket without a record of that site; the last one may be incomplete.
         """
@@ -168,7 +165,9 @@ class FusedRun:
         touched = any(isinstance(one, Wall) for spec in specs for one in spec.environment)
         return RunTotals(
             rms_error_rad=float(np.sqrt(self._sums["errors"] / ticks[:, None]).max()),
-            effort_nm=float(np.sqrt(np.mean(self._sums["effort"] / (JOINTS * ticks)))),
+            effort_nm=float(
+                np.sqrt(np.mean(self._sums["effort"] / (self._tables.site["joints"][:, 0] * ticks)))
+            ),
             force_peak_n=float(self._sums["force_peak_n"].max()) if touched else None,
             walls_j=float(self._sums["environment_j"].sum())
             if (self._sums["first_environment"] >= 0).any()
@@ -177,17 +176,24 @@ class FusedRun:
 
     @property
     def q(self) -> Array:
-        """Joint angles after the last tick, shape (N, 2), rad."""
+        """Joint angles after the last tick, shape (N, n), rad."""
         return np.array(self._tables.site["q"][:, 0])
 
     @property
     def theta_hat(self) -> Array:
-        """Estimates after the last tick, shape (N, 5)."""
+        """Estimates after the last tick, shape (N, P)."""
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
+    def tau_x(self) -> list[Array]:
+        """The exogenous torque of each site's last record, shape (n,) each, N m."""
+        return [
+            row[layout.columns()["tau_x"]] for row, layout in zip(self.records, self._layouts, strict=True)
+        ]
+
+    @property
     def records(self) -> Array:
-        """Last record of each site, floats as in `core.site_arrays.ROW_FLOATS`, shape (N, 17)."""
+        """Last record of each site, floats as in `Layout.columns`, a row per site."""
         rows = [
             self._sent[n, (int(progress["tick"]) - 1) % self._sent.shape[1]]["row"]
             for n, progress in enumerate(self._progress)

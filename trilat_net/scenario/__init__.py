@@ -5,6 +5,7 @@ path of the key and the nearest valid name.
 """
 
 from ..deprecated import lookup_of
+from .arms import Arm as Arm
 from .delay_models import Link as Link
 from .expect import Expect as Expect
 from .laws import Adaptive as Adaptive
@@ -24,7 +25,6 @@ from .scenario_reader import parse_embedded as parse_embedded
 from .scenario_reader import parse_scenario as parse_scenario
 from .scenario_reader import read_shipped as read_shipped
 from .scenario_reader import read_template as read_template
-from .scenario_types import Arm as Arm
 from .scenario_types import Limits as Limits
 from .scenario_types import OnStale as OnStale
 from .scenario_types import Scenario as Scenario

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from .fields import KeyProblem, NotNegative, PlaneVector, Positive, check_keys, field_names, suggest_nearest
+from .fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys, field_names, suggest_nearest
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
-LeastMost = PlaneVector
-JointPose = PlaneVector  # of an expectation: two angles, never one for both
+LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
+JointPose = Joints  # of an expectation: written out, never one number for all
 
 _WHERE = ("from_s", "to_s", "site")
 ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple, TypeGuard, get_type_hints
 import msgspec
 from msgspec import Meta
 
+from ..core.chain import LINK_PARAMETERS, MAX_JOINTS
 from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..errors import ScenarioError
 
@@ -26,19 +27,33 @@ MAX_QUANTITY = 1e9
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
-_EXPANDS = {"expands": True}
-_PER_JOINT = Meta(min_length=JOINTS, max_length=JOINTS, extra=_EXPANDS)
-_PER_PARAMETER = Meta(min_length=PARAMETERS, max_length=PARAMETERS, extra=_EXPANDS)
+_PER_JOINT = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"})
+_PER_PARAMETER = Meta(min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"})
+_PER_AXIS = Meta(min_length=2, max_length=3, extra={"per": "axes"})
 Joints = Annotated[tuple[Real, ...], _PER_JOINT]
 PositiveJoints = Annotated[tuple[Positive, ...], _PER_JOINT]
 NotNegativeJoints = Annotated[tuple[NotNegative, ...], _PER_JOINT]
 Parameters = Annotated[tuple[Real, ...], _PER_PARAMETER]
 NotNegativeParameters = Annotated[tuple[NotNegative, ...], _PER_PARAMETER]
-PlaneVector = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
+NotNegativeAxes = Annotated[tuple[NotNegative, ...], _PER_AXIS]
+Point = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=3, extra={"point": "axes"})]
 RateHz = Annotated[int, Meta(ge=1, le=20_000)]
 
 TomlTable = dict[str, Any]
 StructType = type[msgspec.Struct]
+
+
+class VectorCounts(NamedTuple):
+    """How many numbers the vectors of a site have: one per joint, per parameter, per axis of its space."""
+
+    joints: int = JOINTS
+    parameters: int = PARAMETERS
+    axes: int = 2
+
+    @classmethod
+    def of_chain(cls, joints: int) -> "VectorCounts":
+        """Returns those of a chain of so many joints."""
+        return cls(joints, LINK_PARAMETERS * joints, 3)
 
 
 class KeyProblem(NamedTuple):
@@ -49,25 +64,44 @@ class KeyProblem(NamedTuple):
 
 
 @cache
-def _vector_lengths(kind: StructType) -> Mapping[str, int]:
-    """Returns the keys of a type for which one number may stand for all, and how many these are."""
+def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
+    """Returns the keys of a type whose vectors have a number per joint, parameter or axis, and per which."""
     return {
-        key: int(meta.min_length or 0)
+        key: str(meta.extra[extra])
         for key, hint in get_type_hints(kind, include_extras=True).items()
         for meta in getattr(hint, "__metadata__", ())
-        if isinstance(meta, Meta) and meta.extra == _EXPANDS
+        if isinstance(meta, Meta) and meta.extra is not None and extra in meta.extra
     }
 
 
-def expand_vectors(table: TomlTable, kind: StructType) -> TomlTable:
-    """Returns a table with every single number or distribution written out as the vector of its type."""
-    lengths = _vector_lengths(kind)
-    return {
-        key: [value] * lengths[key]
-        if key in lengths and (is_number(value) or is_distribution(value))
+def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
+    """Returns a table with every single number or distribution written out as the vector of its type.
+
+    A vector that is absent has its type's default, as long as the arm needs it.
+    """
+    per = _vector_keys(kind, "per")
+    defaults = {
+        field.name: [field.default[0]] * getattr(counts, per[field.name])
+        for field in msgspec.structs.fields(kind)
+        if field.name in per and isinstance(field.default, tuple)
+    }
+    written = {
+        key: [value] * getattr(counts, per[key])
+        if key in per and (is_number(value) or is_distribution(value))
         else value
         for key, value in table.items()
     }
+    return {**defaults, **written}
+
+
+def find_count_problem(table: TomlTable, kind: StructType, counts: VectorCounts) -> KeyProblem | None:
+    """Returns the first vector of a table that has too few or too many numbers, or None."""
+    for key, per in {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}.items():
+        wanted, value = getattr(counts, per), table.get(key)
+        if isinstance(value, list) and len(value) != wanted:
+            owner = f"the arm has {wanted} {per}" if per != "axes" else f"its space has {wanted} axes"
+            return KeyProblem(key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}")
+    return None
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -22,7 +22,6 @@ from msgspec import Meta, field
 from msgspec.structs import asdict
 
 from ..core.site_setup import Gains, Law
-from ..core.two_link_arm import PARAMETERS
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
 from ..errors import ScenarioError
@@ -221,11 +220,11 @@ class AdaptiveGains(Frozen, frozen=True):
         theta_hat0: first estimate of theta, Eq. (24).
     """
 
-    Lambda: PositiveJoints = (1.0, 1.0)
-    Kp: PositiveJoints = (1.0, 1.0)
-    Kd: NotNegativeJoints = (3.0, 3.0)
-    Gamma: NotNegativeParameters = (1.0,) * PARAMETERS
-    theta_hat0: Parameters = (0.0,) * PARAMETERS
+    Lambda: PositiveJoints = (1.0,)
+    Kp: PositiveJoints = (1.0,)
+    Kd: NotNegativeJoints = (3.0,)
+    Gamma: NotNegativeParameters = (1.0,)
+    theta_hat0: Parameters = (0.0,)
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core, for an arm of parameters theta."""
@@ -255,8 +254,8 @@ class AdaptiveBox(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive_box
         theta_high: upper bound.
     """
 
-    theta_low: Parameters = (-MAX_QUANTITY,) * PARAMETERS
-    theta_high: Parameters = (MAX_QUANTITY,) * PARAMETERS
+    theta_low: Parameters = (-MAX_QUANTITY,)
+    theta_high: Parameters = (MAX_QUANTITY,)
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the core."""
@@ -297,8 +296,8 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveJoints = (10.0, 10.0)
-    d: NotNegativeJoints = (3.0, 3.0)
+    K: PositiveJoints = (10.0,)
+    d: NotNegativeJoints = (3.0,)
     gravity: NotNegative = 1.0
 
 
@@ -314,9 +313,9 @@ class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", t
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveJoints = (10.0, 10.0)
-    Kd: NotNegativeJoints = (3.0, 3.0)
-    d: NotNegativeJoints = (5.0, 5.0)
+    K: PositiveJoints = (10.0,)
+    Kd: NotNegativeJoints = (3.0,)
+    d: NotNegativeJoints = (5.0,)
     gravity: NotNegative = 1.0
 
 
@@ -335,9 +334,9 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: NotNegativeJoints = (0.0, 0.0)
-    d: NotNegativeJoints = (5.0, 5.0)
-    k_f: NotNegativeJoints = (0.0, 0.0)
+    K: NotNegativeJoints = (0.0,)
+    d: NotNegativeJoints = (5.0,)
+    k_f: NotNegativeJoints = (0.0,)
     gravity: NotNegative = 1.0
 
 

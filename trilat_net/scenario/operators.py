@@ -7,13 +7,14 @@ own key.
 
 import math
 import re
-from collections.abc import Mapping
-from typing import Annotated, Any, get_args
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
+from ..core.chain import MAX_JOINTS
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..errors import ScenarioError
 from .distributions import Draws
@@ -22,21 +23,23 @@ from .fields import (
     Frozen,
     Joints,
     NotNegative,
+    NotNegativeAxes,
     NotNegativeJoints,
-    PlaneVector,
+    Point,
     Positive,
     Real,
     StructType,
     TomlTable,
+    VectorCounts,
     check_choice,
     check_keys,
     expand_vectors,
     field_names,
-    is_number,
+    find_count_problem,
 )
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
-RecordedPoint = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
+RecordedPoint = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
 
 
 class ActorBase(Frozen, frozen=True, tag_field="kind"):
@@ -86,7 +89,7 @@ class JointSpring(ActorBase, frozen=True, tag="spring"):
     to_rad: Joints
     from_rad: Joints
     stiffness_nm_rad: NotNegativeJoints
-    damping_nm_s_rad: NotNegativeJoints = (0.0, 0.0)
+    damping_nm_s_rad: NotNegativeJoints = (0.0,)
     move_start_s: NotNegative = 0.0
     move_end_s: NotNegative = 0.0
     start_s: NotNegative = 0.0
@@ -108,10 +111,10 @@ class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
         move_start_s: as of `JointSpring`, like those that follow.
     """
 
-    to_m: PlaneVector
-    from_m: PlaneVector
-    stiffness_n_m: NotNegativeJoints
-    damping_n_s_m: NotNegativeJoints = (0.0, 0.0)
+    to_m: Point
+    from_m: Point
+    stiffness_n_m: NotNegativeAxes
+    damping_n_s_m: NotNegativeAxes = (0.0,)
     move_start_s: NotNegative = 0.0
     move_end_s: NotNegative = 0.0
     start_s: NotNegative = 0.0
@@ -229,8 +232,8 @@ class Wall(ActorBase, frozen=True, tag="wall"):
         sampled: true: evaluated once a tick and held, as a digital haptic wall is.
     """
 
-    point_m: PlaneVector
-    normal: PlaneVector
+    point_m: Point
+    normal: Point
     stiffness_n_m: NotNegative
     damping_n_s_m: NotNegative = 0.0
     start_s: NotNegative = 0.0
@@ -252,62 +255,86 @@ ENVIRONMENTS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for
 """The operators and the environments by the name of their kind."""
 
 _TIME = "a time of at least 0 s"
-_ANGLES = "one angle for both joints or two, rad"
-_POINT = "two numbers, x and y, m"
-_GAIN = "one number for both joints or two, at least 0"
-_ROW = "[time in s, torque on joint 1, on joint 2 in N m]"
+_ANGLES = "one angle for {joints}, rad"
+_POINT = "{axes}, m"
+_GAIN = "one number for {joints}, at least 0"
+_ROW = "[time in s, torque on {each} in N m]"
 _WORDS = {
     **dict.fromkeys(("start_s", "end_s", "move_start_s", "move_end_s"), _TIME),
     **dict.fromkeys(("from_rad", "to_rad"), _ANGLES),
     **dict.fromkeys(("from_m", "to_m", "point_m"), _POINT),
-    **dict.fromkeys(("peak_nm", "amplitude_nm"), "one torque for both joints or two, ON the arm, N m"),
+    **dict.fromkeys(("peak_nm", "amplitude_nm"), "one torque for {joints}, ON the arm, N m"),
     "stiffness_nm_rad": f"{_GAIN}, N m/rad",
     "damping_nm_s_rad": f"{_GAIN}, N m s/rad",
     **dict.fromkeys(("from_hz", "to_hz"), "a frequency above 0 and up to 1000 Hz"),
     "sweep_s": "a duration above 0 s",
     "frequencies_hz": "a list of 1 to 64 frequencies above 0 and up to 1000 Hz",
     "phases_rad": "a list of angles, rad, one for each frequency",
-    "normal": "two numbers, x and y: to which side the wall is free",
+    "normal": "{axes}: to which side the wall is free",
     "points": f"a list of rows {_ROW}",
     "sampled": "true or false",
-    "tip_spring.stiffness_n_m": "one number for both axes or two, at least 0, N/m",
-    "tip_spring.damping_n_s_m": "one number for both axes or two, at least 0, N s/m",
+    "tip_spring.stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
+    "tip_spring.damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
     "wall.stiffness_n_m": "a number of at least 0, N/m",
     "wall.damping_n_s_m": "a number of at least 0, N s/m",
 }
 """The values that a key takes, for an author who gave it another or none."""
+_IN_WORDS = {
+    "joints": ("both joints or two", "all joints or one for each"),
+    "axes": ("two numbers, x and y", "three numbers, x, y and z"),
+    "all_axes": ("both axes or two", "all axes or three"),
+    "each": ("joint 1, on joint 2", "each joint"),
+}
+"""Those of the planar arm, and of any other."""
 _SHOWN = 60
 """A longer value is not repeated in an error."""
 
 
+class Holding(NamedTuple):
+    """What an operator who takes hold of an arm meets.
+
+    Attributes:
+        counts: how many numbers the vectors of the site have.
+        q0_rad: the arm's start pose, as far as it is one.
+        end_effector_m: returns the end effector's place in that pose.
+    """
+
+    counts: VectorCounts
+    q0_rad: Any
+    end_effector_m: Callable[[], list[float]]
+
+
 def resolve_operators(
-    written: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str, draws: Draws
+    written: Any,
+    kinds: Mapping[str, type[Frozen]],
+    holding: Holding,
+    path: str,
+    draws: Draws,
 ) -> list[TomlTable]:
     """Returns a site's operators or environments, complete, of the kinds that it may hold.
 
-    `site` is the site's own tables, complete but for this; errors call the list `path`; `draws` gives the
-    numbers of distributions.
+    Errors call the list `path`; `draws` gives the numbers of distributions.
     """
     if not isinstance(written, list):
         raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
-    return [_resolve_actor(entry, kinds, site, f"{path}[{n}]", draws) for n, entry in enumerate(written)]
+    return [_resolve_actor(entry, kinds, holding, f"{path}[{n}]", draws) for n, entry in enumerate(written)]
 
 
 def _resolve_actor(
-    entry: Any, kinds: Mapping[str, type[Frozen]], site: TomlTable, path: str, draws: Draws
+    entry: Any, kinds: Mapping[str, type[Frozen]], holding: Holding, path: str, draws: Draws
 ) -> TomlTable:
     if not isinstance(entry, dict):
         raise ScenarioError("must be a table", path=path)
     kind = _check_kind(entry, kinds, path)
     check_keys(entry, ("kind", *field_names(kinds[kind])), path)
-    table = draws.draw_numbers(expand_vectors(entry, kinds[kind]), path)
+    table = draws.draw_numbers(expand_vectors(entry, kinds[kind], holding.counts), path)
     if kind == "spring":
-        draws.follow_start(table, "from_rad", site["q0_rad"], path)
+        draws.follow_start(table, "from_rad", holding.q0_rad, path)
         draws.follow_start(table, "to_rad", table["from_rad"], path)
     if kind == "tip_spring":
-        draws.follow_start(table, "from_m", _end_effector(site), path)
+        draws.follow_start(table, "from_m", holding.end_effector_m(), path)
         draws.follow_start(table, "to_m", table["from_m"], path)
-    _check_values(table, kinds[kind], entry, path)
+    _check_values(table, kinds[kind], entry, path, holding.counts)
     return table
 
 
@@ -323,14 +350,18 @@ def _check_kind(entry: TomlTable, kinds: Mapping[str, StructType], path: str) ->
     return str(kind)
 
 
-def _check_values(table: TomlTable, kind: StructType, entry: TomlTable, path: str) -> None:
+def _check_values(
+    table: TomlTable, kind: StructType, entry: TomlTable, path: str, counts: VectorCounts
+) -> None:
     """Refuses a wrong or a missing value, with the values that its key takes."""
+    words = {name: both[counts != VectorCounts()] for name, both in _IN_WORDS.items()}
 
     def describe_values(key: str) -> str:
-        return _WORDS.get(key) or _WORDS[f"{table['kind']}.{key}"]
+        return (_WORDS.get(key) or _WORDS[f"{table['kind']}.{key}"]).format(**words)
 
     try:
         msgspec.convert(table, kind)
+        _check_lengths(table, kind, counts)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at ")
         if missing := re.search(r"missing required field `(\w+)`", problem):
@@ -341,21 +372,17 @@ def _check_values(table: TomlTable, kind: StructType, entry: TomlTable, path: st
         if key not in entry:  # taken over from the arm, which is refused at its own key
             return
         if key == "points":
-            one = f"a row {_ROW}" if rest else _WORDS[key]
+            one = f"a row {_ROW.format(**words)}" if rest else describe_values(key)
             raise ScenarioError(f"must be {one}", path=f"{path}.{key}{rest}") from None
         value = repr(entry[key])
         is_now = f", is {value}" if len(value) <= _SHOWN else ""
         raise ScenarioError(f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}") from None
 
 
-def _end_effector(site: TomlTable) -> list[float]:
-    """Returns the end effector's start position, m; a value that is no number is refused later."""
-    lengths = [site["arm"].get("l1_m", 1.0), site["arm"].get("l2_m", 1.0)]
-    q0 = site["q0_rad"]
-    if not (isinstance(q0, list) and len(q0) == 2 and all(map(is_number, [*q0, *lengths]))):
-        return [0.0, 0.0]
-    turned = q0[0] + q0[1]
-    return [
-        lengths[0] * math.cos(q0[0]) + lengths[1] * math.cos(turned),
-        lengths[0] * math.sin(q0[0]) + lengths[1] * math.sin(turned),
-    ]
+def _check_lengths(table: TomlTable, kind: StructType, counts: VectorCounts) -> None:
+    """Raises `msgspec.ValidationError` for a vector, or a row of a table, that does not fit the arm."""
+    if found := find_count_problem(table, kind, counts):
+        raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
+    for n, row in enumerate(table.get("points", ())):
+        if len(row) != 1 + counts.joints:
+            raise msgspec.ValidationError(f"of another arm - at `$.points[{n}]`")

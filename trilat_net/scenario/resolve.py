@@ -5,6 +5,7 @@ is one that the person finds in the file. A preset is a table that an author cou
 (`scenarios/_presets.toml` has them, each with its source); a resolved scenario holds its keys, not its name.
 """
 
+import math
 import re
 import tomllib
 from importlib import resources
@@ -15,28 +16,43 @@ import msgspec
 import numpy as np
 
 from ..core import dominance
-from ..core.two_link_arm import JOINTS
+from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
+from .arms import Arm, ArmModel, build_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
 from .expect import Expect, check_window_keys
 from .fields import (
+    Frozen,
     TomlTable,
+    VectorCounts,
     check_choice,
     check_finite,
     check_keys,
     expand_vectors,
     field_names,
+    find_count_problem,
     is_number,
     suggest_nearest,
 )
 from .laws import LAW_PATH_PATTERN, LAWS, hash_law_source
-from .operators import ENVIRONMENTS, OPERATORS, resolve_operators
-from .scenario_types import SITE_GROUPS, Change, SiteSpec
+from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
+from .scenario_types import SITE_GROUPS, Change, Limits, SiteSpec
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
-_TABLES = (*SITE_GROUPS, "control", "link", "sites", "dominance", "links", "timeline", "expect", "drawn")
+_TABLES = (
+    *SITE_GROUPS,
+    "control",
+    "link",
+    "sites",
+    "dominance",
+    "links",
+    "timeline",
+    "expect",
+    "drawn",
+    "urdf",
+)
 _SITE = field_names(SiteSpec)
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
@@ -44,7 +60,8 @@ _DEFAULT_SEED = 1
 MAX_SITES = 32
 """Most sites of an experiment; every pair of them has two links."""
 
-_PRESETS_FILE = resources.files("trilat_net") / "scenarios" / "_presets.toml"
+SHIPPED_FOLDER = resources.files("trilat_net") / "scenarios"
+_PRESETS_FILE = SHIPPED_FOLDER / "_presets.toml"
 
 GRID_ROUND_TRIPS_MS = (8, 68, 136, 272, 544, 1088)
 GRID_LOSSES_PERCENT = (0, 10, 25, 50)
@@ -79,9 +96,10 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         check_keys(tables.get(group, {}), field_names(kind), group)
     check_keys(tables.get("expect", {}), field_names(Expect), "expect")
     check_window_keys(tables.get("expect", {}).get("windows"))
-    _resolve_control(tables.get("control", {}), {}, "control")
+    _resolve_control(tables.get("control", {}), {}, "control", VectorCounts())
     draws = Draws(tables.get("seed", _DEFAULT_SEED), tables.get("drawn", {}))
-    sites = _resolve_sites(tables, draws)
+    urdf = _read_urdf_files(tables, folder)
+    sites = _resolve_sites(tables, draws, urdf)
     written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
     for name in sites:
         if name not in written:
@@ -100,10 +118,40 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "timeline": resolve_timeline(tables.get("timeline", []), links, list(sites)),
         "expect": tables.get("expect", {}),
         "drawn": msgspec.to_builtins(draws.drawn),
+        "urdf": urdf,
     }
 
 
-def _resolve_control(written: Any, default: TomlTable, path: str) -> TomlTable:
+def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
+    """Returns the texts of the files that arms name: of the scenario itself, of `folder`, or shipped."""
+    texts = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
+    if not isinstance(tables["sites"], dict):
+        return texts
+    written = {
+        f"sites.{name}.arm": site.get("arm")
+        for name, site in tables["sites"].items()
+        if isinstance(site, dict)
+    }
+    for path, arm in {"arm": tables.get("arm"), **written}.items():
+        name = arm.get("urdf", "") if isinstance(arm, dict) else ""
+        if not name or name in texts:
+            continue
+        if folder is None or not isinstance(name, str):
+            raise ScenarioError(
+                "no file may be named here" if folder is None else "must be a file's name",
+                path=f"{path}.urdf",
+            )
+        shipped = SHIPPED_FOLDER / name
+        file = shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
+        try:
+            texts = {**texts, name: file.read_text(encoding="utf-8")}
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not UTF-8 text"
+            raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None
+    return texts
+
+
+def _resolve_control(written: Any, default: TomlTable, path: str, counts: VectorCounts) -> TomlTable:
     """Returns a law and its gains: as written, and the rest from a default of the same law."""
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
@@ -113,7 +161,7 @@ def _resolve_control(written: Any, default: TomlTable, path: str) -> TomlTable:
     check_choice(law, [*LAWS, "package.module:Law"], f"{path}.law")
     own = check_keys(written, ("law", *field_names(LAWS[law])), path)
     inherited = default if default.get("law", "adaptive") == law else {}
-    return expand_vectors({**inherited, **own, "law": law}, LAWS[law])
+    return expand_vectors({**inherited, **own, "law": law}, LAWS[law], counts)
 
 
 def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: str) -> TomlTable:
@@ -138,11 +186,11 @@ def _unix_lines(value: Any) -> Any:
     return value.replace("\r\n", "\n").replace("\r", "\n") if isinstance(value, str) else value
 
 
-def _resolve_sites(tables: TomlTable, draws: Draws) -> TomlTable:
-    sites: TomlTable = {}
+def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> TomlTable:
     if not isinstance(tables["sites"], dict):
         raise ScenarioError("must be tables [sites.NAME]", path="sites")
-    for name, written in tables["sites"].items():
+    written, groups = {}, {}
+    for name, table in tables["sites"].items():
         path = f"sites.{name}"
         if not _SITE_NAME.fullmatch(name) or name in _RESERVED:
             raise ScenarioError(
@@ -150,32 +198,107 @@ def _resolve_sites(tables: TomlTable, draws: Draws) -> TomlTable:
                 f"and not {_RESERVED[0]!r}",
                 path=path,
             )
-        site = expand_vectors(check_keys(written, _SITE, path), SiteSpec)
-        site["control"] = _resolve_control(
-            site.get("control", {}), tables.get("control", {}), f"{path}.control"
+        written[name] = check_keys(table, _SITE, path)
+        groups[name] = {
+            group: {
+                **tables.get(group, {}),
+                **check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}"),
+            }
+            for group, kind in SITE_GROUPS.items()
+        }
+    if len(written) > MAX_SITES:
+        raise ScenarioError(f"has {len(written)} sites, at most {MAX_SITES} are taken", path="sites")
+    if len(written) < 2:
+        raise ScenarioError(
+            f"an experiment has at least two sites, this one has {len(written)}", path="sites"
         )
-        for group, kind in SITE_GROUPS.items():
-            own = check_keys(site.get(group, {}), field_names(kind), f"{path}.{group}")
-            site[group] = {**tables.get(group, {}), **own}
-        site.setdefault("role", "master")
-        site.setdefault("rate_hz", tables.get("rate_hz", 1000))
-        site.setdefault("q0_rad", [0.0] * JOINTS)
-        site.setdefault("qd0_rad_s", [0.0] * JOINTS)
-        _draw_site(site, path, draws)
-        for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-            site[group] = resolve_operators(site.get(group, []), kinds, site, f"{path}.{group}", draws)
-        sites[name] = {key: site[key] for key in field_names(SiteSpec) if key in site}
-    if len(sites) > MAX_SITES:
-        raise ScenarioError(f"has {len(sites)} sites, at most {MAX_SITES} are taken", path="sites")
-    if len(sites) < 2:
-        raise ScenarioError(f"an experiment has at least two sites, this one has {len(sites)}", path="sites")
-    return sites
+    chains = any(group["arm"].get("urdf") for group in groups.values())
+    return {
+        name: _resolve_site(name, {**table, **groups[name]}, tables, draws, urdf if chains else {})
+        for name, table in written.items()
+    }
+
+
+def _resolve_site(
+    name: str, site: TomlTable, tables: TomlTable, draws: Draws, urdf: dict[str, str]
+) -> TomlTable:
+    """Returns a site's tables, complete; `urdf` is not empty where the arms are chains."""
+    path = f"sites.{name}"
+    site["arm"] = draws.draw_numbers(site["arm"], f"{path}.arm")
+    model = _model_arm(site["arm"], urdf, f"{path}.arm")
+    counts = model.counts if model is not None else VectorCounts()
+    site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
+    site["control"] = _resolve_control(
+        site.get("control", {}), tables.get("control", {}), f"{path}.control", counts
+    )
+    if model is not None and model.chain is not None:
+        site["limits"] = {**_chain_limits(model), **site["limits"]}
+    site.setdefault("role", "master")
+    site.setdefault("rate_hz", tables.get("rate_hz", 1000))
+    _draw_site(site, path, draws)
+    _check_counts(site, counts, path)
+
+    def end_effector() -> list[float]:
+        if model is None or not all(map(is_number, site["q0_rad"])):
+            return [0.0] * counts.axes
+        return model.end_effector(site["q0_rad"])
+
+    holding = Holding(counts, site["q0_rad"], end_effector)
+    for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
+        site[group] = resolve_operators(site.get(group, []), kinds, holding, f"{path}.{group}", draws)
+    return {key: site[key] for key in field_names(SiteSpec) if key in site}
+
+
+def _model_arm(table: TomlTable, urdf: dict[str, str], path: str) -> ArmModel | None:
+    """Returns the model of an arm; None where its table is refused later, at its own key."""
+    try:
+        arm = msgspec.convert(table, Arm)
+    except msgspec.ValidationError:
+        return None
+    if arm.urdf:
+        planar = [key for key in table if key in ArmLinks._fields]
+        if planar:
+            raise ScenarioError(
+                f"belongs to the planar arm, and this one is {arm.urdf}", path=f"{path}.{planar[0]}"
+            )
+        if not any(arm.down):
+            raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
+    try:
+        return build_arm(arm, urdf, bool(urdf))
+    except ScenarioError as error:
+        if not arm.urdf:
+            return None
+        raise ScenarioError(error.problem, path=f"{path}.{error.path or 'urdf'}") from None
+
+
+def _chain_limits(model: ArmModel) -> TomlTable:
+    """Returns the limits that a chain's file states, and the usual ones where it states none."""
+    usual = Limits()
+    pairs = (("tau_limit_nm", model.efforts), ("qd_limit_rad_s", model.speeds))
+    return {
+        key: [one if 0.0 < one < math.inf else getattr(usual, key) for one in stated] for key, stated in pairs
+    }
+
+
+def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
+    """Refuses vectors of a site that do not fit its arm."""
+    law = site["control"].get("law", "adaptive")
+    tables: list[tuple[TomlTable, type[Frozen], str]]
+    tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm")]
+    tables += [(site["control"], LAWS[law], f"{path}.control")] if law in LAWS else []
+    for table, kind, place in tables:
+        if found := find_count_problem(table, kind, counts):
+            raise ScenarioError(found.problem, path=f"{place}.{found.key}")
+    for key, value in site["limits"].items():
+        if isinstance(value, list) and len(value) != counts.joints:
+            problem = f"has {len(value)} numbers, and the arm has {counts.joints} joints"
+            raise ScenarioError(problem, path=f"{path}.limits.{key}")
 
 
 def _draw_site(site: TomlTable, path: str, draws: Draws) -> None:
     """Replaces the distributions of a site, its operators and environments aside, by numbers."""
     site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)
-    for group in (*SITE_GROUPS, "control"):
+    for group in (*(one for one in SITE_GROUPS if one != "arm"), "control"):
         site[group] = draws.draw_numbers(site[group], f"{path}.{group}")
     if isinstance(settings := site["control"].get("settings"), dict):
         site["control"]["settings"] = draws.draw_numbers(settings, f"{path}.control.settings")

@@ -10,8 +10,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ..core.chain import MAX_JOINTS
 from ..core.delay import MAX_DELAY_US
-from ..core.link import AHEAD_LIMIT_S, SAMPLE_DTYPE, calendar_pages
+from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
 from ..errors import ScenarioError
 from .fields import suggest_nearest
 from .override import apply_overrides, expand_overrides, parse_overrides
@@ -144,14 +145,15 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     traces = sum(len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed))
     if traces > len(text):
         raise ScenarioError("its traces are not written out, link by link", source=source)
+    page_bytes = sample_dtype(MAX_JOINTS).itemsize
     for name in scenario.names:
         rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(name)]
         bound = sum(2 * ((MAX_DELAY_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3) for rate_hz in rates)
-        if bound * SAMPLE_DTYPE.itemsize <= MAX_LINKS_BYTES:
+        if bound * page_bytes <= MAX_LINKS_BYTES:
             continue  # `calendar_pages` is never more; calling it would load the compiled core, half a second
         pages = sum(map(calendar_pages, rates))
-        if pages * SAMPLE_DTYPE.itemsize > MAX_LINKS_BYTES:
-            wanted = pages * SAMPLE_DTYPE.itemsize >> 20
+        if pages * page_bytes > MAX_LINKS_BYTES:
+            wanted = pages * page_bytes >> 20
             raise ScenarioError(
                 f"its links would take {wanted} MiB, at most {MAX_LINKS_BYTES >> 20} are given",
                 path=f"sites.{name}",

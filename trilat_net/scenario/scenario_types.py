@@ -17,44 +17,20 @@ import tomli_w
 from msgspec import Meta
 
 from ..core import dominance
+from ..core.chain import MAX_JOINTS
 from ..core.philox import link_key
 from ..core.site_setup import LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
 from ..core.ticks import DominanceRamp
-from ..core.two_link_arm import ArmLinks, theta_from_links
+from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
+from ..errors import ScenarioError
+from .arms import Arm, ArmModel, build_arm
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
-from .fields import Frozen, Joints, NotNegative, Positive, RateHz
+from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
 from .laws import ControlLaw, ImportedLaw
 from .operators import Environment, Operator
-
-
-class Arm(Frozen, frozen=True):
-    """The two links of a planar arm; defaults are the paper's, as point masses at the link ends.
-
-    Attributes:
-        l1_m: this and the others down to I2_kg_m2 are those of `ArmLinks`.
-        g_m_s2: gravitational acceleration, m/s^2.
-        known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
-            formula. Only for an arm outside of the program.
-    """
-
-    l1_m: Positive = 1.0
-    m1_kg: Positive = 1.0
-    lc1_m: NotNegative = 1.0
-    I1_kg_m2: NotNegative = 0.0
-    l2_m: Positive = 1.0
-    m2_kg: Positive = 1.0
-    lc2_m: Positive = 1.0
-    I2_kg_m2: NotNegative = 0.0
-    g_m_s2: NotNegative = 9.81
-    known: bool = True
-
-    @property
-    def theta(self) -> Array:
-        """True parameters of Eq. (24), shape (5,)."""
-        return theta_from_links(ArmLinks(**{name: getattr(self, name) for name in ArmLinks._fields}))
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
@@ -78,16 +54,21 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         )
 
 
+SpeedLimit = Annotated[float, Meta(gt=0.0, le=10_000.0)]
+SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MAX_JOINTS)]
+
+
 class Limits(Frozen, frozen=True):
     """The limits of a site.
 
     Attributes:
-        tau_limit_nm: largest control torque of a joint, N m; more is cut off.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s.
+        tau_limit_nm: largest control torque of a joint, N m; more is cut off. One number, or one per joint;
+            left out, a chain has the efforts that its file states.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so too.
     """
 
-    tau_limit_nm: Positive = 200.0
-    qd_limit_rad_s: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 100.0
+    tau_limit_nm: Positive | PositiveJoints = 200.0
+    qd_limit_rad_s: SpeedLimit | SpeedLimits = 100.0
 
 
 class SiteSpec(Frozen, frozen=True):
@@ -168,6 +149,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     "timeline": ((), []),
     "expect": ({},),
     "drawn": ({},),
+    "urdf": ({},),
     "on_stale": ({},),
     "environment": ((), []),
     "plant": ("simulated",),
@@ -175,6 +157,16 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 """A list of numbers, one a line."""
+
+
+def _drop_unused(arm: dict[str, Any]) -> None:
+    """Leaves out of an arm's table what its kind of arm has not, and what means nothing."""
+    defaults = msgspec.to_builtins(Arm())
+    planar = () if arm["urdf"] else (*ArmLinks._fields, "g_m_s2")
+    unused = ArmLinks._fields if arm["urdf"] else ()
+    for key, value in list(arm.items()):
+        if key in unused or (key not in planar and value == defaults[key]):
+            del arm[key]
 
 
 class Scenario(Frozen, frozen=True, dict=True):
@@ -194,6 +186,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         timeline: changes during the run.
         expect: expectations, see `trilat test`.
         drawn: the distributions that numbers of the sites were drawn from, by dotted key.
+        urdf: the texts of the files that describe arms, by their names.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
@@ -206,6 +199,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     timeline: tuple[Change, ...] = ()
     expect: Expect = Expect()
     drawn: dict[str, Distribution] = msgspec.field(default_factory=dict)
+    urdf: dict[str, str] = msgspec.field(default_factory=dict)
     title: str = ""
     about: str = ""
     assumed: tuple[str, ...] = ()
@@ -214,6 +208,23 @@ class Scenario(Frozen, frozen=True, dict=True):
     def names(self) -> tuple[str, ...]:
         """Names of the sites, in order."""
         return tuple(self.sites)
+
+    @cached_property
+    def arms(self) -> dict[str, ArmModel]:
+        """The model of each site's arm.
+
+        Raises:
+            ScenarioError: an arm's file cannot be used.
+        """
+        chains = any(spec.arm.urdf for spec in self.sites.values())
+        models = {}
+        for name, spec in self.sites.items():
+            try:
+                models[name] = build_arm(spec.arm, self.urdf, chains)
+            except ScenarioError as error:
+                path = f"sites.{name}.arm" + (f".{error.path}" if error.path else "")
+                raise ScenarioError(error.problem, path=path) from None
+        return models
 
     @cached_property
     def alpha(self) -> Array:
@@ -232,16 +243,17 @@ class Scenario(Frozen, frozen=True, dict=True):
         words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         words = {key: value for key, value in words.items() if value}
         for site in tables["sites"].values():
-            if site["arm"]["known"]:
-                del site["arm"]["known"]
+            _drop_unused(site["arm"])
         for table in (tables, *tables["sites"].values()):
             for key, absent in _ABSENT.items():
                 if table.get(key) in absent:
                     del table[key]
+        urdf = tables.pop("urdf", None)
         numbers = _NUMBERS.sub(
             lambda one: " ".join(one[0].split()).replace("[ ", "[").replace(", ]", "]"), tomli_w.dumps(tables)
         )
-        return tomli_w.dumps(words, multiline_strings=True) + numbers
+        files = tomli_w.dumps({"urdf": urdf}, multiline_strings=True) if urdf else ""
+        return tomli_w.dumps(words, multiline_strings=True) + numbers + files
 
     @cached_property
     def sha256(self) -> str:
@@ -283,15 +295,15 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
-        spec = self.sites[site]
+        spec, arm = self.sites[site], self.arms[site]
         return SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
             scheme=Scheme[self.scheme.upper()],
-            gains=spec.control.gains(spec.arm.theta),
-            theta=spec.arm.theta,
+            gains=spec.control.gains(arm.theta),
+            theta=arm.theta,
             g_m_s2=spec.arm.g_m_s2,
-            lengths_m=(spec.arm.l1_m, spec.arm.l2_m),
+            lengths_m=arm.lengths_m,
             tau_limit_nm=spec.limits.tau_limit_nm,
             qd_limit_rad_s=spec.limits.qd_limit_rad_s,
             q0=spec.q0_rad,
@@ -307,6 +319,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             external=spec.plant == "external",
             own=spec.control.maker(len(self.sites)) if isinstance(spec.control, ImportedLaw) else None,
             theta_known=spec.arm.known,
+            chain=arm.chain,
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:

@@ -12,14 +12,14 @@ from itertools import pairwise
 from typing import get_args
 
 import msgspec
+import numpy as np
 
-from ..core.two_link_arm import is_positive_definite
 from ..errors import ScenarioError
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
 from .fields import TomlTable
-from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
+from .laws import AdaptiveBox, ForceReflecting, ImportedLaw, KnownGravityLaw
 from .operators import (
     EndEffectorSpring,
     Environment,
@@ -128,12 +128,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         drawn = resolved.get("drawn", {}).get(dotted_key(dotted))
         why = f"; {drawn['value']:g} was drawn with seed {resolved['seed']}" if drawn else ""
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
+    _check_joint_space(scenario)
     for name, site in scenario.sites.items():
-        if not is_positive_definite(site.arm.theta):
-            raise ScenarioError(
-                "its inertia matrix is singular in some pose: give the links mass away from their joints",
-                path=f"sites.{name}.arm",
-            )
         check_law(name, site, len(scenario.sites))
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
@@ -143,9 +139,52 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
+    for name, pose in scenario.expect.end_pose_rad.items():
+        joints = scenario.arms[name].counts.joints if name in scenario.arms else len(pose)
+        if len(pose) != joints:
+            problem = f"expected list of length {joints}, one angle per joint, and it has {len(pose)}"
+            raise ScenarioError(problem, path=f"expect.end_pose_rad.{name}")
     if found := find_expect_problem(scenario.expect, scenario.names):
         raise ScenarioError(found.problem, path=f"expect.{found.key}")
     return msgspec.structs.replace(scenario, timeline=tuple(map(_normalise_change, scenario.timeline)))
+
+
+def _check_joint_space(scenario: Scenario) -> None:
+    """Refuses arms of different numbers of joints, and gains that a light joint cannot take at its tick rate.
+
+    A torque -K qd that is held over a period h makes a single joint of inertia M swing from tick to tick from
+    K h / M = 1 on (of the second-order scheme, 2 of the digital one); of several joints the largest
+    eigenvalue of h K M^-1 counts, here in the start pose.
+    """
+    counts = {name: model.counts.joints for name, model in scenario.arms.items()}
+    first = scenario.names[0]
+    for name, joints in counts.items():
+        if joints != counts[first]:
+            raise ScenarioError(
+                f"its arm has {joints} joints, and that of {first} has {counts[first]}: joint angles are "
+                "compared one by one, so all arms need as many joints",
+                path=f"sites.{name}.arm",
+            )
+    for name, model in scenario.arms.items():
+        site = scenario.sites[name]
+        if model.chain is None or isinstance(site.control, ImportedLaw):
+            continue
+        gains = site.control.gains(model.theta)
+        damping = np.zeros(counts[name]) + gains.Kp + gains.Kd + gains.d
+        scaled = np.sqrt(damping)
+        spread, modes = np.linalg.eigh(
+            scaled * np.linalg.inv(model.inertia(np.array(site.q0_rad))) * scaled[:, None]
+        )
+        most = 1.0 if scenario.scheme == "second_order" else 2.0
+        if spread[-1] / site.rate_hz >= most:
+            worst = int(np.argmax(np.abs(modes[:, -1])))
+            raise ScenarioError(
+                f"damps joint {model.joint_names[worst]} by {damping[worst]:g} N m s/rad in all, "
+                f"{spread[-1] / site.rate_hz / most:.3g} times what its inertia can take at "
+                f"{site.rate_hz} Hz: lower Kp, Kd or d there, raise rate_hz, or state the drive's "
+                "armature_kg_m2",
+                path=f"sites.{name}.control",
+            )
 
 
 def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:

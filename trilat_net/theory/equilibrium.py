@@ -288,10 +288,11 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
         )
     x = gather_site_arguments(conditions, rest)
     for site, own, rates in zip(conditions.sites, x, conditions.rates(x), strict=True):
-        torque_nm = float(np.abs(rates.tau).max())
-        if torque_nm >= site.tau_limit_nm:
+        torques_nm, limits_nm = np.abs(rates.tau), np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
+        if (torques_nm >= limits_nm).any():
+            worst = int(np.argmax(torques_nm - limits_nm))
             yield (
-                f"{site.name} needs {torque_nm:.4g} N m at rest, and its clamp is {site.tau_limit_nm:g}: "
-                "the clamp is left out"
+                f"{site.name} needs {torques_nm[worst]:.4g} N m at rest, and its clamp is "
+                f"{limits_nm[worst]:g}: the clamp is left out"
             )
         yield from describe_switching_points(site, own)

@@ -39,7 +39,7 @@ class SiteConstants(NamedTuple):
         Lambda, Kp, Kd: gains, 1/s and N m s/rad.
         Gamma: adaptation gain.
         low, high: limits of the estimates.
-        tau_limit: largest torque of a joint, N m.
+        tau_limit: largest torque of a joint, N m, shape () or (n,).
         outside: True if the arm is outside of the program: theta is then what its author states.
     """
 
@@ -51,7 +51,7 @@ class SiteConstants(NamedTuple):
     Gamma: Array
     low: Array
     high: Array
-    tau_limit: float
+    tau_limit: Array
     outside: bool = False
 
     @property
@@ -67,7 +67,7 @@ def derive_site_constants(spec: SiteSpec) -> SiteConstants:
     return SiteConstants(
         theta=spec.arm.theta,
         g=spec.arm.g_m_s2,
-        tau_limit=spec.limits.tau_limit_nm,
+        tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
         outside=spec.plant == "external",
         **{name: np.array(getattr(gains, name)) for name in names},
     )

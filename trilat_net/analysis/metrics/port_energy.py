@@ -42,7 +42,7 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     if spec.plant == "external":
         return 0.5 * (records.tau[:-1] + records.tau[1:])
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
-    return records.held_torque(spec.limits.tau_limit_nm, digital=digital)
+    return records.held_torque(np.asarray(spec.limits.tau_limit_nm), digital=digital)
 
 
 def mechanical_energy(spec: SiteSpec, records: AlignedRecords) -> Array:

@@ -67,7 +67,7 @@ def draw_operator_displacement(
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
     largest = {site: np.abs(controller_torques(log[site])).max(initial=0.0) for site in log.sites}
-    limits = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
+    limits = {site: float(np.max(log.scenario.sites[site].limits.tau_limit_nm)) for site in log.sites}
     reached = sorted({limit for site, limit in limits.items() if largest[site] >= limit})
     signal = site_records(log, controller_torques)
     return _draw_joints(log, form, log.sites, signal, "control torque (N m)", reached)

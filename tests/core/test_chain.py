@@ -1,0 +1,128 @@
+"""The leaves of a chain against Pinocchio's numbers, and its own laws."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.core.chain_references import ChainState, chain_references
+from trilat_net.core.chain import (
+    LINK_PARAMETERS,
+    MAX_JOINTS,
+    ChainJoint,
+    build_chain,
+    find_acceleration,
+    inverse_dynamics,
+    mass_matrix,
+    parameter_gradient,
+    place_end_effector,
+    place_joints,
+    propagate_motion,
+)
+from trilat_net.core.vectors import Array, RowArray
+
+REFERENCES = chain_references()
+EPS = np.finfo(float).eps
+each = pytest.mark.parametrize("name", REFERENCES)
+
+
+class Arm(NamedTuple):
+    """A chain's rows, of one layout for all lengths, and its parameters."""
+
+    rows: RowArray
+    theta: Array
+
+
+def build(name: str, **drive: float) -> Arm:
+    joints = REFERENCES[name].chain.joints
+    made = [
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive) for one in joints
+    ]
+    return Arm(build_chain(made, MAX_JOINTS), np.concatenate([one.inertia for one in joints]))
+
+
+def moving(arm: Arm, state: ChainState, v: Array) -> None:
+    place_joints(arm.rows, state.q)
+    propagate_motion(arm.rows, state.gravity, state.qd, v, state.a)
+
+
+def torque_for(arm: Arm, v: Array, a: Array) -> Array:
+    torque = np.zeros(len(arm.rows))
+    inverse_dynamics(arm.rows, arm.theta, v, a, torque)
+    return torque
+
+
+def full_matrix(arm: Arm) -> Array:
+    mass_matrix(arm.rows, arm.theta)
+    n = len(arm.rows)
+    lower = np.tril(arm.rows["M"][:, :n])
+    return lower + np.tril(lower, -1).T
+
+
+def apart(got: Array, wanted: Array) -> float:
+    return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
+
+
+@each
+def test_inverse_dynamics_and_gradient_are_those_of_pinocchio(name: str) -> None:
+    """M a + C v + G with C by Christoffel symbols, Eq. (12), and Y' r, Eq. (15)."""
+    arm = build(name)
+    gradient = np.zeros(LINK_PARAMETERS * len(arm.rows))
+    for state in REFERENCES[name].states:
+        moving(arm, state, state.v)
+        assert apart(torque_for(arm, state.v, state.a), state.inverse_dynamics) <= 1e-12
+        parameter_gradient(arm.rows, gradient)
+        assert apart(gradient, state.regressor_transpose_r) <= 1e-12
+
+
+@each
+def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
+    """M to 1e-12, and accelerations to 100 eps of its condition."""
+    arm = build(name)
+    qdd = np.zeros(len(arm.rows))
+    for state in REFERENCES[name].states:
+        place_joints(arm.rows, state.q)
+        M = full_matrix(arm)
+        assert apart(M, state.inertia) <= 1e-12
+        find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
+        wanted = state.forward_dynamics
+        assert np.abs(qdd - wanted).max() <= 100 * EPS * np.linalg.cond(M) * np.abs(wanted).max()
+
+
+@each
+def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
+    arm, chain = build(name), REFERENCES[name].chain
+    for state in REFERENCES[name].states:
+        place_joints(arm.rows, state.q)
+        assert apart(np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position) <= 1e-12
+        assert apart(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian) <= 1e-12
+        rotation = arm.rows["R_base"][-1] @ np.array(chain.tip_rotation)
+        assert apart(rotation, state.tip_rotation) <= 1e-12
+
+
+def test_friction_and_drives_enter_both_dynamics_alike() -> None:
+    """What inverse dynamics asks for a motion makes that motion, with armature and friction too."""
+    arm = build("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
+    state, qdd = REFERENCES["arm7"].states[0], np.zeros(7)
+    moving(arm, state, state.qd)
+    torque = torque_for(arm, state.qd, state.a)
+    find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, torque, qdd)
+    assert apart(qdd, state.a) <= 1e-11
+
+
+def stop_torque(q: list[float], qd: list[float]) -> Array:
+    """The generalised force of the stops of two joints, N m: what they change of M qdd."""
+    arms = build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0), build("random2")
+    qdds = np.zeros((2, 2))
+    for arm, qdd in zip(arms, qdds, strict=True):
+        place_joints(arm.rows, np.array(q))
+        none = np.zeros(2)
+        find_acceleration(arm.rows, arm.theta, np.zeros(3), np.array(q), np.array(qd), none, qdd)
+    place_joints(arms[1].rows, np.array(q))
+    return full_matrix(arms[1]) @ (qdds[0] - qdds[1])
+
+
+def test_stops_push_back_and_never_pull() -> None:
+    assert np.abs(stop_torque([0.4, -0.4], [1.0, 1.0])).max() <= 1e-12
+    assert stop_torque([0.6, -0.7], [0.0, 0.0]) == pytest.approx([-100.0, 200.0])
+    assert stop_torque([0.6, 0.0], [-20.0, 0.0]) == pytest.approx([0.0, 0.0], abs=1e-9)

@@ -1,0 +1,156 @@
+"""The stages of a tick that depend on the arm, for a chain of n joints: by recursion, in rows of arrays.
+
+Invariant: `two_link_stages` has the same functions for the planar two-link arm, and `kernel` takes one or
+the other. `chain` is the rows of the site's joints, see `chain_dtype`.
+"""
+
+from math import isfinite
+
+from .chain import (
+    find_acceleration,
+    inverse_dynamics,
+    parameter_gradient,
+    place_joints,
+    propagate_motion,
+)
+from .control import limit_torque
+from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
+from .jit import leaf
+from .site_setup import Law
+from .vectors import Array, Row, RowArray, Vector
+
+_ADAPTIVE = int(Law.ADAPTIVE)
+
+
+@leaf
+def update_errors(s: Row, chain: RowArray) -> None:
+    """Writes e, ed, r, the reference velocity and acceleration v and a, and Y' r."""
+    for i in range(chain.shape[0]):
+        s.e[i] = s.q[i] - s.q_des[i]
+        s.ed[i] = s.qd[i] - s.qd_des[i]
+        s.v[i] = -s.Lambda[i] * s.e[i]
+        s.a[i] = -s.Lambda[i] * s.ed[i]
+        s.r[i] = s.qd[i] - s.v[i]
+    place_joints(chain, s.q)
+    if s.law == _ADAPTIVE:
+        propagate_motion(chain, s.gravity, s.qd, s.v, s.a)
+        parameter_gradient(chain, s.Yr)
+
+
+@leaf
+def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
+    """Advances the estimate by a time of `gain_s`, Eq. (15), within its box."""
+    for p in range(s.parameters):
+        estimate = s.theta_hat[p] - gain_s * s.Gamma[p] * Yr[p]
+        s.theta_hat[p] = min(max(estimate, s.low[p]), s.high[p])
+
+
+@leaf
+def update_torque(s: Row, chain: RowArray) -> None:
+    """Writes the torque of the site's law, within its limits: Eq. (13), or `control.damped_torque`'s."""
+    if s.law == _ADAPTIVE:
+        inverse_dynamics(chain, s.theta_hat, s.v, s.a, s.tau)
+    else:
+        _put_gravity(s, chain, s.known, s.tau)
+    for i in range(chain.shape[0]):
+        torque = s.tau[i] - s.Kd[i] * s.ed[i]
+        if s.law == _ADAPTIVE:
+            torque -= s.Kp[i] * s.r[i]
+        else:
+            torque += s.k_f[i] * s.felt[i] - s.K[i] * s.e[i] - s.d[i] * s.qd[i]
+        s.tau[i] = limit_torque(torque, s.tau_limit[i])
+
+
+@leaf
+def _put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
+    """Writes G of these parameters, N m, shape (n,), for the pose in which the joints are placed."""
+    propagate_motion(chain, s.gravity, s.zeros, s.zeros, s.zeros)
+    inverse_dynamics(chain, theta, s.zeros, s.zeros, torque)
+
+
+@leaf
+def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
+    """Writes G(q), N m, shape (n,)."""
+    place_joints(chain, q)
+    _put_gravity(s, chain, s.theta, torque)
+
+
+@leaf
+def put_source_torque(
+    t_s: float,
+    s: Row,
+    chain: RowArray,
+    state: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> None:
+    """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
+    place_joints(chain, state)
+    qd = state[chain.shape[0] :]
+    put_torque_on_chain(t_s, state, qd, s.tip, chain, actors, table, sampled, torque)
+
+
+@leaf
+def update_external_torque(
+    t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
+    place_joints(chain, s.q)
+    held_n = put_torque_on_chain(t_s, s.q, s.qd, s.tip, chain, actors, table, 1, s.held)
+    now_n = put_torque_on_chain(t_s, s.q, s.qd, s.tip, chain, actors, table, 0, s.on_arm)
+    s.wall_n = max(held_n, now_n)
+    for i in range(chain.shape[0]):
+        s.on_arm[i] += s.held[i]
+
+
+@leaf
+def _put_acceleration(
+    t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes `stage_qdd`: the acceleration at a stage's q and qd under the held u and the actors then."""
+    place_joints(chain, s.stage_q)
+    put_torque_on_chain(t_s, s.stage_q, s.stage_qd, s.tip, chain, actors, table, 0, s.stage_torque)
+    for i in range(chain.shape[0]):
+        s.stage_torque[i] += s.u[i]
+    find_acceleration(chain, s.theta, s.gravity, s.stage_q, s.stage_qd, s.stage_torque, s.stage_qdd)
+
+
+@leaf
+def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
+    """Adds a stage's rates to the sums, and writes the q and qd of the next, `ahead_s` from the beginning."""
+    for i in range(joints):
+        s.sum_qd[i] += weight * s.stage_qd[i]
+        s.sum_qdd[i] += weight * s.stage_qdd[i]
+        s.stage_q[i] = s.q[i] + ahead_s * s.stage_qd[i]
+        s.stage_qd[i] = s.qd[i] + ahead_s * s.stage_qdd[i]
+
+
+@leaf
+def advance_arm(
+    t_s: float, h_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> bool:
+    """Advances q and qd by one period under the torque `s.u`; false where the result is not finite."""
+    n = chain.shape[0]
+    for i in range(n):
+        s.stage_q[i], s.stage_qd[i] = s.q[i], s.qd[i]
+        s.sum_qd[i] = s.sum_qdd[i] = 0.0
+    half = 0.5 * h_s
+    _put_acceleration(t_s, s, chain, actors, table)
+    _use_stage(s, n, 1.0, half)
+    _put_acceleration(t_s + half, s, chain, actors, table)
+    _use_stage(s, n, 2.0, half)
+    _put_acceleration(t_s + half, s, chain, actors, table)
+    _use_stage(s, n, 2.0, h_s)
+    _put_acceleration(t_s + h_s, s, chain, actors, table)
+    _use_stage(s, n, 1.0, 0.0)
+    finite = True
+    for i in range(n):
+        s.stage_q[i] = s.q[i] + h_s / 6.0 * s.sum_qd[i]
+        s.stage_qd[i] = s.qd[i] + h_s / 6.0 * s.sum_qdd[i]
+        finite = finite and isfinite(s.stage_q[i]) and isfinite(s.stage_qd[i])
+    if finite:
+        for i in range(n):
+            s.q[i], s.qd[i] = s.stage_q[i], s.stage_qd[i]
+    return finite

@@ -1,0 +1,153 @@
+"""The stages of a tick that depend on the arm, for the planar two-link arm: unrolled, in registers.
+
+Invariant: `chain_stages` has the same functions for a chain of n joints, which take its rows as well;
+`kernel` takes one or the other.
+"""
+
+from math import inf, isfinite
+
+from . import control
+from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
+from .jit import leaf
+from .site_setup import Law
+from .two_link_arm import forward_dynamics, regressor
+from .vectors import Array, Pair, Row, Vector, five, pair, put_five, put_pair
+
+_ADAPTIVE = int(Law.ADAPTIVE)
+
+
+@leaf
+def update_errors(s: Row) -> None:
+    """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
+    q, qd, Lambda = pair(s.q), pair(s.qd), pair(s.Lambda)
+    e, ed, r = control.control_errors(q, qd, s.q_des, s.qd_des, Lambda)
+    v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
+    a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
+    Y = regressor(s.g, q, qd, v, a)
+    put_pair(s.e, e)
+    put_pair(s.ed, ed)
+    put_pair(s.r, r)
+    put_five(s.Y[0], Y[0])
+    put_five(s.Y[1], Y[1])
+    put_five(s.Yr, control.regressor_transpose_times(Y, r))
+
+
+@leaf
+def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
+    """Advances the estimate by a time of `gain_s`, Eq. (15), within its box."""
+    estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
+    put_five(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
+
+
+@leaf
+def update_torque(s: Row) -> None:
+    """Writes the torque of the site's law, within its limits."""
+    if s.law == _ADAPTIVE:
+        Y = (five(s.Y[0]), five(s.Y[1]))
+        tau = control.adaptive_torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, inf)
+    else:
+        gains = (s.K, s.d, s.Kd, s.k_f)
+        tau = control.damped_torque(s.known, s.g, *gains, s.q, s.qd, s.e, s.ed, s.felt, inf)
+    limit = s.tau_limit
+    put_pair(s.tau, (control.limit_torque(tau[0], limit[0]), control.limit_torque(tau[1], limit[1])))
+
+
+@leaf
+def put_gravity_torque(s: Row, torque: Array) -> None:
+    """Writes G(q), N m, of this tick: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
+    outer = s.Y[1, 4] * s.theta[4]
+    put_pair(torque, (s.Y[0, 3] * s.theta[3] + outer, outer))
+
+
+@leaf
+def put_source_torque(
+    t_s: float,
+    s: Row,
+    state: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> None:
+    """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
+    q, qd = (state[0], state[1]), (state[2], state[3])
+    on_arm = torque_on_arm(t_s, q, qd, pair(s.lengths), actors, table, sampled)
+    put_pair(torque, (on_arm[0], on_arm[1]))
+
+
+@leaf
+def update_external_torque(t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
+    """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
+    q, qd, lengths = pair(s.q), pair(s.qd), pair(s.lengths)
+    held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
+    now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
+    put_pair(s.held, (held[0], held[1]))
+    s.wall_n = max(held[2], now[2])
+    put_pair(s.on_arm, (now[0] + held[0], now[1] + held[1]))
+
+
+@leaf
+def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
+    """Returns x + step * rate."""
+    return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
+
+
+@leaf
+def _acceleration(
+    t_s: float,
+    q: Pair,
+    qd: Pair,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    acts: TorqueSourceRows,
+    table: TorqueTable,
+) -> Pair:
+    """Returns qdd at one stage: under the held u, and the actors at that stage's time and state."""
+    on_arm = torque_on_arm(t_s, q, qd, lengths, acts, table, 0)
+    return forward_dynamics(theta, g, q, qd, (on_arm[0] + u[0], on_arm[1] + u[1]))
+
+
+@leaf
+def rk4_step(
+    t_s: float,
+    h_s: float,
+    q: Vector,
+    qd: Vector,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    acts: TorqueSourceRows,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Returns q and qd one period of h_s later, Eq. (8).
+
+    u, shape (2,), N m, is the torque that is held over the period: control and sampled actors.
+    """
+    half, sixth = 0.5 * h_s, h_s / 6.0
+    q1, v1 = (q[0], q[1]), (qd[0], qd[1])
+    a1 = _acceleration(t_s, q1, v1, u, theta, g, lengths, acts, table)
+    q2, v2 = add_scaled(q1, half, v1), add_scaled(v1, half, a1)
+    a2 = _acceleration(t_s + half, q2, v2, u, theta, g, lengths, acts, table)
+    q3, v3 = add_scaled(q1, half, v2), add_scaled(v1, half, a2)
+    a3 = _acceleration(t_s + half, q3, v3, u, theta, g, lengths, acts, table)
+    q4, v4 = add_scaled(q1, h_s, v3), add_scaled(v1, h_s, a3)
+    a4 = _acceleration(t_s + h_s, q4, v4, u, theta, g, lengths, acts, table)
+    v_sum = (v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0], v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1])
+    a_sum = (a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0], a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1])
+    return add_scaled(q1, sixth, v_sum), add_scaled(v1, sixth, a_sum)
+
+
+@leaf
+def advance_arm(t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable) -> bool:
+    """Advances q and qd by one period under the torque `s.u`; false where the result is not finite."""
+    q, qd = rk4_step(
+        t_s, h_s, pair(s.q), pair(s.qd), pair(s.u), five(s.theta), s.g, pair(s.lengths), actors, table
+    )
+    if not (isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])):
+        return False
+    put_pair(s.q, q)
+    put_pair(s.qd, qd)
+    return True

@@ -1,0 +1,208 @@
+"""The arms of a scenario: the planar two-link arm by lengths and masses, or a chain of joints from a URDF.
+
+Invariant: in a scenario in which one arm is a chain all of them are, so that live, virtual and swept runs
+compute with the same leaves; the planar arm is then written as a chain of two joints in the x-y plane.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+
+from ..core.chain import (
+    ChainJoint,
+    build_chain,
+    mass_matrix,
+    place_end_effector,
+    place_joints,
+)
+from ..core.site_setup import ChainSetup
+from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
+from ..core.vectors import Array, Vector
+from ..errors import ScenarioError
+from .fields import Frozen, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts
+from .urdf import UrdfChain, UrdfPayload, read_urdf
+
+Three = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
+STOP_REACH_RAD = 0.05
+"""A stop answers with the joint's whole effort limit at this depth, rad or m."""
+STOP_EFFORT_NM = 100.0
+"""The effort that stops are made for where a file states none."""
+
+
+class Arm(Frozen, frozen=True):
+    """An arm: a chain of joints from a URDF, or the two links of a planar arm.
+
+    The defaults of the planar arm are the paper's, as point masses at the link ends. The keys of one kind of
+    arm have no meaning for the other.
+
+    Attributes:
+        l1_m: this and the others down to I2_kg_m2 are those of `ArmLinks`.
+        g_m_s2: gravitational acceleration, m/s^2.
+        known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
+            formula. Only for an arm outside of the program.
+        urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": it is the planar arm.
+        base: its base link; "": the root of the file.
+        tip: its end link; "": the only one that nothing hangs on.
+        down: direction of gravity in the base's frame; its length does not matter.
+        payload_kg: mass fixed to the end link.
+        payload_com_m: its centre of mass in the end link's frame.
+        payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass.
+        armature_kg_m2: inertia of each drive as its joint has it; kg of a prismatic joint.
+        stops: true: joint limits of the file are springs that an arm may run into.
+    """
+
+    l1_m: Positive = 1.0
+    m1_kg: Positive = 1.0
+    lc1_m: NotNegative = 1.0
+    I1_kg_m2: NotNegative = 0.0
+    l2_m: Positive = 1.0
+    m2_kg: Positive = 1.0
+    lc2_m: Positive = 1.0
+    I2_kg_m2: NotNegative = 0.0
+    g_m_s2: NotNegative = 9.81
+    known: bool = True
+    urdf: str = ""
+    base: str = ""
+    tip: str = ""
+    down: Three = (0.0, 0.0, -1.0)
+    payload_kg: NotNegative = 0.0
+    payload_com_m: Three = (0.0, 0.0, 0.0)
+    payload_inertia_kg_m2: Annotated[tuple[Real, ...], Meta(min_length=6, max_length=6)] = (0.0,) * 6
+    armature_kg_m2: NotNegativeJoints = (0.0,)
+    stops: bool = True
+
+    @property
+    def links(self) -> ArmLinks:
+        """The two links of the planar arm."""
+        return ArmLinks(**{name: getattr(self, name) for name in ArmLinks._fields})
+
+    @property
+    def theta(self) -> Array:
+        """True parameters of the planar arm, Eq. (24), shape (5,)."""
+        return theta_from_links(self.links)
+
+
+class ArmModel(NamedTuple):
+    """An arm as computations need it.
+
+    Attributes:
+        theta: its true parameters: Eq. (24) for the planar arm, ten a link for a chain.
+        counts: how many numbers the vectors of its site have.
+        joint_names: of its joints.
+        efforts: largest effort that its file states for each joint, N m or N; inf where it states none.
+        speeds: largest speed so, rad/s or m/s.
+        lengths_m: of the two links of the planar arm; (0, 0) of a chain.
+        chain: the chain, or None for the planar arm.
+    """
+
+    theta: Array
+    counts: VectorCounts
+    joint_names: tuple[str, ...]
+    efforts: tuple[float, ...]
+    speeds: tuple[float, ...]
+    lengths_m: tuple[float, float]
+    chain: ChainSetup | None = None
+
+    def end_effector(self, q: Vector) -> list[float]:
+        """Returns the end effector's place in a pose, m, one number per axis of the arm's space."""
+        if self.chain is None:
+            (l1, l2), turned = self.lengths_m, q[0] + q[1]
+            return [l1 * math.cos(q[0]) + l2 * math.cos(turned), l1 * math.sin(q[0]) + l2 * math.sin(turned)]
+        rows = build_chain(self.chain.joints)
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        return list(place_end_effector(rows, np.array(self.chain.tip_m)))
+
+    def inertia(self, q: Array) -> Array:
+        """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""
+        assert self.chain is not None
+        rows = build_chain(self.chain.joints)
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        mass_matrix(rows, self.theta)
+        lower = np.tril(rows["M"])
+        M: Array = lower + np.tril(lower, -1).T
+        return M
+
+
+def build_arm(arm: Arm, urdf: Mapping[str, str], chains: bool) -> ArmModel:
+    """Returns the model of an arm; `chains`: some arm of the scenario is a chain.
+
+    Raises:
+        ScenarioError: its file cannot be used; the path is that of a key below the arm's.
+    """
+    if arm.urdf:
+        return _chain_model(arm, read_arm(arm, urdf))
+    theta = arm.theta
+    if not is_positive_definite(theta):
+        raise ScenarioError(
+            "its inertia matrix is singular in some pose: give the links mass away from their joints"
+        )
+    names, none = ("q1", "q2"), (math.inf, math.inf)
+    if not chains:
+        return ArmModel(theta, VectorCounts(), names, none, none, (arm.l1_m, arm.l2_m))
+    links = ((arm.m1_kg, arm.lc1_m, arm.I1_kg_m2), (arm.m2_kg, arm.lc2_m, arm.I2_kg_m2))
+    bodies = [
+        (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own) for m, c, own in links
+    ]
+    upright, axis = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 1.0)
+    joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, arm.l1_m))
+    chain = ChainSetup(joints, (0.0, -arm.g_m_s2, 0.0), (arm.l2_m, 0.0, 0.0))
+    return ArmModel(np.concatenate(bodies), VectorCounts.of_chain(2), names, none, none, (0.0, 0.0), chain)
+
+
+def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
+    """Returns the chain that an arm's file describes between its base and its end link.
+
+    Raises:
+        ScenarioError: there is no such file, or it cannot be used.
+    """
+    if arm.urdf not in urdf:
+        raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
+    payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
+    return _read_cached(urdf[arm.urdf], arm.base, arm.tip, payload if arm.payload_kg else None)
+
+
+@cache
+def _read_cached(text: str, base: str, tip: str, payload: UrdfPayload | None) -> UrdfChain:
+    return read_urdf(text, base, tip, payload)
+
+
+def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
+    armature = np.broadcast_to(arm.armature_kg_m2, len(read.joints)).tolist()
+    joints = tuple(
+        ChainJoint(
+            prismatic=joint.kind == "prismatic",
+            axis=joint.axis,
+            rotation=joint.rotation,
+            origin_m=joint.origin_m,
+            armature_kg_m2=inertia,
+            viscous=joint.viscous,
+            coulomb=joint.coulomb,
+            **(_stops(joint.lower, joint.upper, joint.effort_limit) if arm.stops else {}),
+        )
+        for joint, inertia in zip(read.joints, armature, strict=True)
+    )
+    down = np.array(arm.down) / math.hypot(*arm.down)
+    return ArmModel(
+        theta=np.concatenate([joint.inertia for joint in read.joints]),
+        counts=VectorCounts.of_chain(len(joints)),
+        joint_names=tuple(joint.name for joint in read.joints),
+        efforts=tuple(joint.effort_limit for joint in read.joints),
+        speeds=tuple(joint.velocity_limit for joint in read.joints),
+        lengths_m=(0.0, 0.0),
+        chain=ChainSetup(joints, tuple((arm.g_m_s2 * down).tolist()), read.tip_origin_m),
+    )
+
+
+def _stops(lower: float, upper: float, effort: float) -> dict[str, float]:
+    """Returns the stops of a joint: springs, with a tenth of their stiffness in seconds as damping."""
+    stiffness = (effort if 0.0 < effort < math.inf else STOP_EFFORT_NM) / STOP_REACH_RAD
+    return {
+        "lower": lower,
+        "upper": upper,
+        "stop_stiffness": stiffness,
+        "stop_damping": 0.01 * stiffness,
+    }
