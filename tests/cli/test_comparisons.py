@@ -54,11 +54,11 @@ def test_json_is_for_programs(logs: Path) -> None:
 
 
 def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path) -> None:
-    options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "5", "--out", "fronts"]
+    options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "12", "--out", "fronts"]
     printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
     assert "18 runs on 1 core: about " in printed
     assert "torques clamped at 60 N m" in printed
-    assert "trilat sim trio.toml --set duration_s=5.0 --set 'control={law = " in printed
+    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in printed
     written = sorted(path.name for path in (logs / "fronts").iterdir())
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
     again = trilat("compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs).succeeds()
