@@ -10,7 +10,21 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from tests.core.chain_references import Array, ChainState, chain_references, to_chain
+from tests.core.test_chain import Arm, full_matrix, moving, torque_for
+from trilat_net.core.chain import (
+    LINK_PARAMETERS,
+    MAX_JOINTS,
+    ChainJoint,
+    build_chain,
+    find_acceleration,
+    parameter_gradient,
+    place_end_effector,
+    place_joints,
+)
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario.urdf import UrdfChain, read_urdf
 
@@ -18,7 +32,12 @@ pin = pytest.importorskip(
     "pinocchio", reason="the dependency group 'robots' is not installed: make test-long"
 )
 
-from tests.core.make_chain_references import answer, build_model, random_state  # noqa: E402 - needs Pinocchio
+from tests.core.make_chain_references import (  # noqa: E402 - needs Pinocchio
+    answer,
+    build_model,
+    random_chain,
+    random_state,
+)
 
 pytestmark = pytest.mark.long
 
@@ -173,7 +192,7 @@ def test_a_file_without_a_chain_is_refused_with_the_reason(file: str, tip: str, 
 
 @pytest.mark.parametrize(("file", "base", "tip", "n"), parse_chains())
 def test_a_chain_is_what_pinocchio_reads(file: str, base: str, tip: str, n: int) -> None:
-    """Bodies, frames, limits; then M, torque, pose and Jacobian of the model rebuilt from the chain."""
+    """Bodies, frames, limits; M, torque, pose and Jacobian of the model rebuilt from it; then the core's."""
     text = read_robot(file)
     chain = read_urdf(text, base, tip)
     model = parsed_model(text, chain)
@@ -205,6 +224,7 @@ def test_a_chain_is_what_pinocchio_reads(file: str, base: str, tip: str, n: int)
         acceleration = pin.aba(model, data, q, state["qd"], state["tau"])
         bound = 100 * np.finfo(float).eps * np.linalg.cond(inertia)
         assert near(ours["forward_dynamics"], acceleration, max(bound, 1e-12))
+        check_core(chain, ChainState(**state | answer(rebuilt, chain, state)))
 
 
 def check_joints(chain: UrdfChain, model: pin.Model) -> None:
@@ -222,6 +242,40 @@ def check_joints(chain: UrdfChain, model: pin.Model) -> None:
         assert (joint.viscous, joint.coulomb) == (model.damping[i], model.upperDryFrictionLimit[i])
 
 
+def check_core(chain: UrdfChain, state: ChainState) -> None:
+    """The leaves of the core against what Pinocchio said."""
+    n = len(chain.joints)
+    joints = [ChainJoint(j.kind == "prismatic", j.axis, j.rotation, j.origin_m) for j in chain.joints]
+    arm = Arm(build_chain(joints, MAX_JOINTS), np.concatenate([joint.inertia for joint in chain.joints]))
+    moving(arm, state, state.v)
+    assert near(torque_for(arm, state.v, state.a), state.inverse_dynamics, 1e-12)
+    gradient, qdd = np.zeros(LINK_PARAMETERS * n), np.zeros(n)
+    parameter_gradient(arm.rows, gradient)
+    assert near(gradient, state.regressor_transpose_r, 1e-12)
+    place_joints(arm.rows, state.q)
+    assert near(full_matrix(arm), state.inertia, 1e-12)
+    find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
+    bias = state.tau - state.inertia @ state.forward_dynamics  # where it cancels tau, qdd is their difference
+    size = max(np.abs(np.linalg.solve(state.inertia, torque)).max() for torque in (state.tau, bias))
+    bound = 100 * np.finfo(float).eps * np.linalg.cond(state.inertia)
+    assert np.abs(qdd - state.forward_dynamics).max() <= bound * size
+    place_joints(arm.rows, state.q)
+    assert near(place_end_effector(arm.rows, chain.tip_origin_m), state.tip_position, 1e-12)
+    assert near(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian, 1e-12)
+
+
+@given(seed=st.integers(0, 2**32 - 1), sliders=st.lists(st.booleans(), min_size=1, max_size=12))
+@settings(max_examples=300)
+def test_the_core_agrees_on_random_chains(seed: int, sliders: list[bool]) -> None:
+    """1 to 12 joints with axes in any direction, any of them prismatic."""
+    random = np.random.default_rng(seed)
+    n = len(sliders)
+    entry = random_chain(random, n, tuple(i for i in range(n) if sliders[i]))
+    chain = to_chain("random", entry)
+    state = random_state(random, n, weight=False)
+    check_core(chain, ChainState(**state | answer(build_model(chain), chain, state)))
+
+
 def near(a: object, b: object, tolerance: float) -> bool:
     """Relative to the largest entry."""
     a, b = np.asarray(a), np.asarray(b)
@@ -230,8 +284,6 @@ def near(a: object, b: object, tolerance: float) -> bool:
 
 def test_pinocchio_says_of_the_stored_references_what_is_stored() -> None:
     """The file of references is that of its script."""
-    from tests.core.chain_references import chain_references
-
     for chain, states in chain_references().values():
         model = build_model(chain)
         for state in states:
@@ -241,13 +293,13 @@ def test_pinocchio_says_of_the_stored_references_what_is_stored() -> None:
 
 def test_the_torque_of_two_velocities_is_the_christoffel_one() -> None:
     """Linear in v, equal to Pinocchio's where v is qd, and dM/dt = C + C'."""
-    from tests.core.chain_references import chain_references
-
     for chain, (state, *_) in chain_references().values():
         model, n = build_model(chain), len(chain.joints)
         asked = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
 
-        def C(v, model=model, chain=chain, asked=asked):
+        def C(
+            v: Array, model: pin.Model = model, chain: UrdfChain = chain, asked: dict[str, Array] = asked
+        ) -> Array:
             return answer(model, chain, asked | {"v": v})["inverse_dynamics"]
 
         matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
