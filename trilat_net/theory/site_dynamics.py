@@ -154,7 +154,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
         rate = evaluate_site_rates(site, x).estimate
         unbounded = site.gains._replace(low=(-np.inf,) * PARAMETERS, high=(np.inf,) * PARAMETERS)
         free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate
-        ends = np.stack([site.gains.low, site.gains.high])
+        ends = np.stack(np.broadcast_arrays(site.gains.low, site.gains.high, x[ESTIMATE])[:2])
         near = (np.abs(ends - x[ESTIMATE]) < SWITCHING_TOLERANCE).any(axis=0)
         near &= np.abs(rate) <= SWITCHING_TOLERANCE
         near &= ~_is_at_bound(site, x[ESTIMATE], free_rate) & (np.asarray(site.gains.Gamma) > 0)
