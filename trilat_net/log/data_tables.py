@@ -20,11 +20,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.chain import LINK_PARAMETERS
 from ..core.ticks import NS_PER_S
-from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..errors import LogError
 from ..files import import_extra
-from ..net.messages import STATE_VECTORS, Event, LinkStats, State, json_schema
+from ..net.messages import Event, LinkStats, State, json_schema
+from ..scenario.arms import ArmModel
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
     import polars
 
 UNIT_SUFFIXES = {
-    **{unit: unit for unit in ("rad", "s", "ms", "us", "ns", "tick")},
+    **{unit: unit for unit in ("rad", "m", "s", "ms", "us", "ns", "kg", "tick")},
     "rad/s": "rad_s",
+    "m/s": "m_s",
     "N m": "nm",
+    "N": "n",
     "kg m^2": "kg_m2",
     "kg m": "kg_m",
     "ns/s": "ppb",
@@ -46,8 +49,8 @@ SITE_TABLE_KINDS = ("state", "link", "arrivals")
 """Tables of a site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
 """Statistics in which -1 stands for none."""
-THETA_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
-"""Units of the five parameters of Eq. (24)."""
+_JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
+"""Vectors of a record with a number per joint."""
 
 
 class Column(NamedTuple):
@@ -186,18 +189,32 @@ def _make_time_columns(
     yield Column("publish_time_ns", publish_ns, "ns", "when it was sent, Unix time", "publish_time")
 
 
-def build_state_table(site: SiteLog, peer_rates_hz: Mapping[str, int]) -> Table:
-    """Returns a site's records, a row each, in order of their ticks."""
+def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
+    """Yields the vectors of a site's records, a column per joint and per parameter of its arm."""
+    docs = read_field_docs(State)
+    for field in _JOINT_VECTORS:
+        values = getattr(site, field)
+        units = arm.joint_units(docs[field].unit)
+        for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
+            text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)
+            name = add_unit_suffix(f"{field}{n + 1}", unit)
+            yield Column(name, np.ascontiguousarray(values[:, n]), unit, text, f"{field}[{n}]")
+    for n, (parameter, unit) in enumerate(arm.parameters):
+        stem, text = f"theta_hat{n + 1}", f"{docs['theta_hat'].text}, parameter {n + 1}"
+        if arm.chain is not None:
+            link, _, symbol = parameter.rpartition(".")
+            stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
+            text = f"estimate of {symbol} of link {link}, about the frame of its joint"
+        name, source = add_unit_suffix(stem, unit), f"theta_hat[{n}]"
+        yield Column(name, np.ascontiguousarray(site.theta_hat[:, n]), unit, text, source)
+
+
+def build_state_table(site: SiteLog, arm: ArmModel, peer_rates_hz: Mapping[str, int]) -> Table:
+    """Returns the records of a site with its arm, a row each, in order of their ticks."""
     docs = read_field_docs(State)
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
-    for field, count in STATE_VECTORS.items():
-        values = getattr(site, field)
-        units = THETA_UNITS if count == PARAMETERS else (docs[field].unit,) * count
-        element = "joint" if count == JOINTS else "parameter"
-        for n, unit in enumerate(units):
-            name, text = add_unit_suffix(f"{field}{n + 1}", unit), f"{docs[field].text}, {element} {n + 1}"
-            columns.append(Column(name, np.ascontiguousarray(values[:, n]), unit, text, f"{field}[{n}]"))
+    columns += _make_vector_columns(site, arm)
     for peer, rate_hz in peer_rates_hz.items():
         used = site.used[peer]
         known: NDArray[np.bool_] = used >= 0

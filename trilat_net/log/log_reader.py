@@ -317,7 +317,8 @@ class Log:
         site = self[name]
         match kind:
             case "" | "state":
-                return build_state_table(site, {p: self.scenario.sites[p].rate_hz for p in site.peers})
+                rates_hz = {p: self.scenario.sites[p].rate_hz for p in site.peers}
+                return build_state_table(site, self.scenario.arms[name], rates_hz)
             case "link":
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":

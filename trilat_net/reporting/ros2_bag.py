@@ -19,9 +19,7 @@ from ..log.log_reader import Log
 from ..log.mcap_writer import McapWriter
 from ..log.ros2 import cdr
 from ..log.ros2.ros2_messages import (
-    ERROR_ROW,
     SESSION_CHANNELS,
-    SLOW_ROW,
     Ros2Channel,
     Ros2SiteChannels,
     pack_event,
@@ -110,7 +108,7 @@ class _SiteMessages:
     def __init__(self, log: Log, name: str, progress: Callable[[int], None]) -> None:
         self._log, self._name, self._progress = log, name, progress
         self._epoch_unix_ns = int(log.session.get("epoch_unix_ns", "0"))
-        self._shapes = shapes = Ros2SiteChannels(name, log.scenario.peers(name))
+        self._shapes = shapes = Ros2SiteChannels(log.scenario, name)
         self._states = cdr.JointStatePacker(shapes.joints)
         self._reference = cdr.JointStatePacker(shapes.joints, effort=False)
         self.channels = {
@@ -133,8 +131,8 @@ class _SiteMessages:
             messages = (
                 ("joint_states", self._states.pack(stamp_ns, state.q, state.qd, state.tau)),
                 ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)),
-                ("error", self._shapes.arrays["error"].pack(*row[ERROR_ROW])),
-                *self._shapes.slow(row[SLOW_ROW]),
+                ("error", self._shapes.arrays["error"].pack(*row[self._shapes.error_row])),
+                *self._shapes.slow(row[self._shapes.slow_row]),
             )
             yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
             if not count % _EVERY or count == len(part):

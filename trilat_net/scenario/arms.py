@@ -31,6 +31,16 @@ STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
 STOP_EFFORT_NM = 100.0
 """The effort that stops are made for where a file states none."""
+PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
+"""Units of the five parameters of Eq. (24)."""
+BODY_UNITS = {
+    "m": "kg",
+    **dict.fromkeys(("mc_x", "mc_y", "mc_z"), "kg m"),
+    **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), "kg m^2"),
+}
+"""The ten parameters of a link of a chain, about its joint's frame, with their units."""
+_SLIDING = {"rad": "m", "rad/s": "m/s", "N m": "N"}
+"""Units of a joint that slides instead of those of one that turns."""
 
 
 class Arm(Frozen, frozen=True):
@@ -93,6 +103,7 @@ class ArmModel(NamedTuple):
         theta: its true parameters: Eq. (24) for the planar arm, ten a link for a chain.
         counts: how many numbers the vectors of its site have.
         joint_names: of its joints.
+        link_names: of the links that these move.
         efforts: largest effort that its file states for each joint, N m or N; inf where it states none.
         speeds: largest speed so, rad/s or m/s.
         lengths_m: of the two links of the planar arm; (0, 0) of a chain.
@@ -102,10 +113,24 @@ class ArmModel(NamedTuple):
     theta: Array
     counts: VectorCounts
     joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
     efforts: tuple[float, ...]
     speeds: tuple[float, ...]
     lengths_m: tuple[float, float]
     chain: ChainSetup | None = None
+
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """Name and unit of each of its parameters, in the order of theta."""
+        if self.chain is None:
+            return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
+        return [(f"{link}.{name}", unit) for link in self.link_names for name, unit in BODY_UNITS.items()]
+
+    def joint_units(self, unit: str) -> list[str]:
+        """Returns the unit of each joint's number, of what is in `unit` for a joint that turns."""
+        if self.chain is None:
+            return [unit] * self.counts.joints
+        return [_SLIDING.get(unit, unit) if joint.prismatic else unit for joint in self.chain.joints]
 
     def end_effector(self, q: Vector) -> list[float]:
         """Returns the end effector's place in a pose, m, one number per axis of the arm's space."""
@@ -140,9 +165,9 @@ def build_arm(arm: Arm, urdf: Mapping[str, str], chains: bool) -> ArmModel:
         raise ScenarioError(
             "its inertia matrix is singular in some pose: give the links mass away from their joints"
         )
-    names, none = ("q1", "q2"), (math.inf, math.inf)
+    names, bodies_moved, none = ("q1", "q2"), ("link1", "link2"), (math.inf, math.inf)
     if not chains:
-        return ArmModel(theta, VectorCounts(), names, none, none, (arm.l1_m, arm.l2_m))
+        return ArmModel(theta, VectorCounts(), names, bodies_moved, none, none, (arm.l1_m, arm.l2_m))
     links = ((arm.m1_kg, arm.lc1_m, arm.I1_kg_m2), (arm.m2_kg, arm.lc2_m, arm.I2_kg_m2))
     bodies = [
         (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own) for m, c, own in links
@@ -150,7 +175,8 @@ def build_arm(arm: Arm, urdf: Mapping[str, str], chains: bool) -> ArmModel:
     upright, axis = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 1.0)
     joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, arm.l1_m))
     chain = ChainSetup(joints, (0.0, -arm.g_m_s2, 0.0), (arm.l2_m, 0.0, 0.0))
-    return ArmModel(np.concatenate(bodies), VectorCounts.of_chain(2), names, none, none, (0.0, 0.0), chain)
+    counts = VectorCounts.of_chain(2)
+    return ArmModel(np.concatenate(bodies), counts, names, bodies_moved, none, none, (0.0, 0.0), chain)
 
 
 def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
@@ -190,6 +216,7 @@ def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
         theta=np.concatenate([joint.inertia for joint in read.joints]),
         counts=VectorCounts.of_chain(len(joints)),
         joint_names=tuple(joint.name for joint in read.joints),
+        link_names=tuple(joint.link for joint in read.joints),
         efforts=tuple(joint.effort_limit for joint in read.joints),
         speeds=tuple(joint.velocity_limit for joint in read.joints),
         lengths_m=(0.0, 0.0),

@@ -15,9 +15,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from ...core.ticks import Mode, TickRecord
-from ...core.two_link_arm import JOINTS, PARAMETERS
 from ...errors import LogError
 from ...net.messages import Event, LinkStats, State
+from ...scenario import Scenario
 from .cdr import (
     ENCODING,
     FLOAT64_ARRAY,
@@ -33,8 +33,8 @@ from .cdr import (
 
 EVENTS, LINES = "events", "log"
 """Channels of a whole session: events as plain text, and as lines with a time and a level."""
-SLOW_ARRAYS = {"tau_x": JOINTS, "theta_hat": PARAMETERS, "mode": 1}
-"""Arrays of a record besides its joints and their error, in order, and how many numbers each has."""
+SLOW_ARRAYS = ("tau_x", "theta_hat", "mode")
+"""Arrays of a record besides its joints and their error, in order."""
 
 
 class Ros2Channel(NamedTuple):
@@ -89,21 +89,30 @@ class Ros2SiteChannels:
     """The standard channels of one site with its peers in scenario order.
 
     Attributes:
-        joints: names of its joints.
+        joints: names of its joints: those of its file, or numbered ones of a planar arm.
         arrays: the channels that are arrays, by the last part of their topic.
+        joint_row: of a row of `stack_signals` the joints: q, q_des, qd, tau.
+        error_row: the error e = q - q_des, Eq. (9).
+        slow_row: the rest: tau_x, theta_hat, mode.
     """
 
-    def __init__(self, site: str, peers: Sequence[str]) -> None:
-        self._peers = peers
-        self.joints = [f"{site}_q{n + 1}" for n in range(JOINTS)]
-        parameters = [f"theta_{n + 1}" for n in range(PARAMETERS)]
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        arm, self._peers = scenario.arms[site], scenario.peers(site)
+        self._arm, n, peers = arm, arm.counts.joints, self._peers
+        self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 5 * n)
+        self.slow_row = slice(5 * n, None)
+        stated = bool(scenario.sites[site].arm.urdf)
+        self.joints = [*arm.joint_names] if stated else [f"{site}_{name}" for name in arm.joint_names]
+        labels = ["_".join(name.split()) for name in self.joints]
+        parameters = ["_".join(name.split()) for name, _ in arm.parameters]
         spread = ("median", "max")
+        estimate = ("estimate of Eq. (24)", "kg m^2, kg m^2, kg m^2, kg m, kg m")
+        if arm.chain is not None:
+            estimate = ("estimate", "kg, kg m, kg m^2")
         self.arrays = {
-            "error": ArrayChannel("q - q_des", "rad", self.joints),
-            "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", "N m", self.joints),
-            "theta_hat": ArrayChannel(
-                "estimate of Eq. (24)", "kg m^2, kg m^2, kg m^2, kg m, kg m", parameters
-            ),
+            "error": ArrayChannel("q - q_des", self._unit("rad"), labels),
+            "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels),
+            "theta_hat": ArrayChannel(*estimate, parameters),
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
             "link_age": ArrayChannel("age of the sample in use", "ms", peers),
             "link_delay": ArrayChannel("one-way delay, last 100 ms", "ms", peers, spread),
@@ -115,14 +124,22 @@ class Ros2SiteChannels:
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
         """Returns a channel of joint states with these names."""
-        return Ros2Channel(JOINT_STATE, {"unit": "rad, rad/s" + ", N m" * effort, "names": " ".join(names)})
+        units = ", ".join(map(self._unit, ("rad", "rad/s", "N m")[: 2 + effort]))
+        return Ros2Channel(
+            JOINT_STATE, {"unit": units, "names": " ".join("_".join(n.split()) for n in names)}
+        )
+
+    def _unit(self, unit: str) -> str:
+        """Returns the unit of the joints' numbers, or both where some turn and some slide."""
+        return " or ".join(dict.fromkeys(self._arm.joint_units(unit)))
 
     def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
         """Yields the arrays of one record, from all their numbers in the order of `SLOW_ARRAYS`."""
         start = 0
-        for name, size in SLOW_ARRAYS.items():
-            yield name, self.arrays[name].pack(*row[start : start + size])
-            start += size
+        for name in SLOW_ARRAYS:
+            array = self.arrays[name]
+            yield name, array.pack(*row[start : start + array.size])
+            start += array.size
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields the arrays of one statistics; those of clocks and networks only in a live session."""
@@ -171,25 +188,18 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
 Record = State | TickRecord
 SignalRow = Sequence[float]
 
-JOINT_ROW = slice(0, 4 * JOINTS)
-"""Of a row the joints: q, q_des, qd, tau."""
-ERROR_ROW = slice(4 * JOINTS, 5 * JOINTS)
-"""The error e = q - q_des, Eq. (9)."""
-SLOW_ROW = slice(5 * JOINTS, None)
-"""The rest: tau_x, theta_hat, mode."""
-
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the numbers of records, a column per curve, in the order of the rows above.
+    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x, theta_hat, mode.
 
     A column may be shorter where all of its numbers are the same.
     """
     rows = [(*m.q, *m.q_des, *m.qd, *m.tau, *m.tau_x, *m.theta_hat) for m in records]
     columns: list[SignalRow] = [*zip(*rows, strict=True)]
-    q, q_des = columns[:JOINTS], columns[JOINTS : 2 * JOINTS]
+    n = len(records[0].q)
+    q, q_des = columns[:n], columns[n : 2 * n]
     error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(q, q_des, strict=True)]
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]
-    rest = columns[JOINT_ROW.stop :]
-    return [*columns[JOINT_ROW], *error, *rest, [mode_number(mode) for mode in modes]]
+    return [*columns[: 4 * n], *error, *columns[4 * n :], [mode_number(mode) for mode in modes]]

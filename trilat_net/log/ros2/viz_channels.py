@@ -20,10 +20,7 @@ from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
 from .cdr import JointStatePacker
 from .ros2_messages import (
-    ERROR_ROW,
-    JOINT_ROW,
     SESSION_CHANNELS,
-    SLOW_ROW,
     Record,
     Ros2Channel,
     Ros2SiteChannels,
@@ -40,7 +37,7 @@ FULL_RATE_HZ = math.inf
 """A message per record."""
 
 MAX_PENDING_BYTES = 1 << 13
-"""Most bytes that the channels of a site have still to write."""
+"""Most bytes that the channels of a site have still to write, per two joints of its arm."""
 
 PutMessage = Callable[[str, bytes, int, int], None]
 """Writes one message: topic, bytes, publish time and log time, Unix ns."""
@@ -80,19 +77,21 @@ class _BucketOutput:
 
 
 class _SiteBuckets:
-    """Buckets of one site with its peers, in scenario order, at `views_hz` messages a second of the joints.
+    """Buckets of one site of a scenario, at `views_hz` messages a second of the joints.
 
     `channels` are those of the site, by topic.
     """
 
     def __init__(
-        self, site: str, peers: Sequence[str], rate_hz: int, views_hz: float, epoch_ns: int, put: PutMessage
+        self, scenario: Scenario, site: str, views_hz: float, epoch_ns: int, put: PutMessage
     ) -> None:
-        self._put, self._rate_hz, self._epoch_unix_ns = put, rate_hz, epoch_ns
-        self._shapes = shapes = Ros2SiteChannels(site, peers)
+        self._rate_hz = rate_hz = scenario.sites[site].rate_hz
+        self._put, self._epoch_unix_ns = put, epoch_ns
+        self._shapes = shapes = Ros2SiteChannels(scenario, site)
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
-        self._none = [math.nan] * len(shapes.joints)  # velocity, effort of a reference: size is dear
+        self.joints = len(shapes.joints)
+        self._none = [math.nan] * self.joints  # velocity, effort of a reference: size is dear
         self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in shapes.arrays}
         self.channels: dict[str, Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
@@ -109,10 +108,11 @@ class _SiteBuckets:
     def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the joint states, the angles of the reference as joints of their own; and the error."""
         none, n = self._none, len(self._none)
-        velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : JOINT_ROW.stop], *none]
+        velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : 4 * n], *none]
         data = self._states.pack(stamp_ns, row[: 2 * n], velocity, effort)
         self._put(self._states_topic, data, stamp_ns, log_ns)
-        self._put(self._topics["error"], self._shapes.arrays["error"].pack(*row[ERROR_ROW]), stamp_ns, log_ns)
+        error = self._shapes.arrays["error"].pack(*row[self._shapes.error_row])
+        self._put(self._topics["error"], error, stamp_ns, log_ns)
 
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         for name, data in self._shapes.slow(row):
@@ -153,7 +153,7 @@ class _SiteBuckets:
         if self._open:
             rows = self._decimate(self._open)
             self._fast.add(rows, log_ns)
-            self._slow_open += [(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows]
+            self._slow_open += [(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows]
             self._open = []
         half, was = 2 * bucket // self._ratio, 2 * self._bucket // self._ratio
         if half != was:
@@ -168,7 +168,7 @@ class _SiteBuckets:
         if self._late:
             rows = self._decimate(self._late)
             self._fast.add_late(rows, log_ns)
-            self._slow.add_late([(stamp_ns, row[SLOW_ROW]) for stamp_ns, row in rows], log_ns)
+            self._slow.add_late([(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows], log_ns)
             self._late = []
 
     def _decimate(self, records: list[Record]) -> list[StampedRow]:
@@ -229,8 +229,7 @@ class VizChannels:
         }
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
-            peers, rate_hz = scenario.peers(site), scenario.sites[site].rate_hz
-            buckets = _SiteBuckets(site, peers, rate_hz, views_hz, epoch_unix_ns, put)
+            buckets = _SiteBuckets(scenario, site, views_hz, epoch_unix_ns, put)
             self._buckets.append(buckets)
             self.channels |= buckets.channels
             self.takers[topics.key(session, site, topics.STATE)] = buckets.record
@@ -250,7 +249,7 @@ class VizChannels:
     @property
     def most_bytes(self) -> int:
         """Most bytes that are still to be written."""
-        return MAX_PENDING_BYTES * len(self._buckets)
+        return sum(MAX_PENDING_BYTES * -(-buckets.joints // 2) for buckets in self._buckets)
 
 
 def decimate_min_max(columns: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
