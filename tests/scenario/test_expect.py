@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 
+from tests.scenario.chains import six
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Expect, load_scenario, parse_scenario, read_template
-from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow, find_expect_problem
+from trilat_net.scenario.expect import ExpectWindow, find_expect_problem, window_quantities
 
 
 def with_expect(**keys: Any) -> Expect:
@@ -55,8 +56,8 @@ def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, fact
 
 
 def test_a_pair_of_limits_must_leave_room() -> None:
-    assert find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), ["m"]) is None
-    assert find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), ["m"]) is not None
+    assert find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), {"m": 2}) is None
+    assert find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), {"m": 2}) is not None
 
 
 def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
@@ -106,6 +107,17 @@ def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
     text = read_template() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
     written = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
-    assert set(named[: -len(ExpectWindow.__struct_fields__)]) | {"windows"} == set(Expect.__struct_fields__)
-    assert named[-len(ExpectWindow.__struct_fields__) :] == list(ExpectWindow.__struct_fields__)
-    assert {key for key, _ in written.windows[0].asked} == set(WINDOW_QUANTITIES)
+    window = ["from_s", "to_s", "site", *window_quantities(2)]
+    assert set(named[: -len(window)]) | {"windows"} == set(Expect.__struct_fields__)
+    assert named[-len(window) :] == window
+    assert [key for key, _ in written.windows[0].asked] == window[3:]
+
+
+def test_a_window_has_the_quantities_of_as_many_joints_as_the_arm() -> None:
+    window = {"from_s": 1.0, "to_s": 2.0, "site": "s", "q6_rad": [0.0, 1.0], "push5_mean_nm": [0.0, 1.0]}
+    asked = six(**{"expect.windows": [window]}).expect.windows[0].asked
+    assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
+    with pytest.raises(ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"):
+        six(**{"expect.windows": [window | {"q7_rad": [0.0, 1.0]}]})
+    with pytest.raises(ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"):
+        with_expect(windows=[window])

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, WINDOW_QUANTITIES
+from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, window_quantities
 from trilat_net.studies.trials.measure_run import RunMetrics, measure_virtual_run
 
 Overrides = dict[str, Any]
@@ -21,7 +21,7 @@ def measured(name: str, overrides: Overrides | None = None, *windows: tuple[floa
             "from_s": from_s,
             "to_s": to_s,
             "site": site,
-            **dict.fromkeys(WINDOW_QUANTITIES if site else ALL_SITES_QUANTITIES, (0, 0)),
+            **dict.fromkeys(window_quantities(2) if site else ALL_SITES_QUANTITIES, (0, 0)),
         }
         for from_s, to_s, site in windows
     ]

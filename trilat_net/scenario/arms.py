@@ -6,7 +6,7 @@ compute with the same leaves; the planar arm is then written as a chain of two j
 
 import math
 from collections.abc import Mapping
-from functools import cache
+from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..core.site_setup import ChainSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, Vector
 from ..errors import ScenarioError
-from .fields import Frozen, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts
+from .fields import Frozen, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts, field_names
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
 Three = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
@@ -58,7 +58,7 @@ class Arm(Frozen, frozen=True):
         base: its base link; "": the root of the file.
         tip: its end link; "": the only one that nothing hangs on.
         down: direction of gravity in the base's frame; its length does not matter.
-        payload_kg: mass fixed to the end link.
+        payload_kg: mass fixed to the end link; without one the two keys that follow mean nothing.
         payload_com_m: its centre of mass in the end link's frame.
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass.
         armature_kg_m2: inertia of each drive as its joint has it; kg of a prismatic joint.
@@ -94,6 +94,10 @@ class Arm(Frozen, frozen=True):
     def theta(self) -> Array:
         """True parameters of the planar arm, Eq. (24), shape (5,)."""
         return theta_from_links(self.links)
+
+
+CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
+"""The keys of an arm that only a chain has."""
 
 
 class ArmModel(NamedTuple):
@@ -187,16 +191,31 @@ def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
     """
     if arm.urdf not in urdf:
         raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
+    if any(arm.payload_inertia_kg_m2) and not arm.payload_kg:
+        raise ScenarioError("is of a payload without mass: give payload_kg", path="payload_inertia_kg_m2")
     payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
-    return _read_cached(urdf[arm.urdf], arm.base, arm.tip, payload if arm.payload_kg else None)
+    try:
+        return _read_cached(urdf[arm.urdf], arm.base, arm.tip, payload if arm.payload_kg else None)
+    except ScenarioError as error:
+        place, _, problem = error.problem.partition(": ")
+        if place in _OWN_KEYS:
+            raise ScenarioError(problem, path=_OWN_KEYS[place]) from None
+        raise ScenarioError(f"{arm.urdf}: {error.problem}", path="urdf") from None
 
 
-@cache
+_OWN_KEYS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
+"""Places of a problem that are keys of the arm and not of its file."""
+
+
+@lru_cache(maxsize=64)
 def _read_cached(text: str, base: str, tip: str, payload: UrdfPayload | None) -> UrdfChain:
     return read_urdf(text, base, tip, payload)
 
 
 def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
+    if len(arm.armature_kg_m2) not in (1, len(read.joints)):
+        problem = f"has {len(arm.armature_kg_m2)} numbers, and the arm has {len(read.joints)} joints"
+        raise ScenarioError(problem, path="armature_kg_m2")
     armature = np.broadcast_to(arm.armature_kg_m2, len(read.joints)).tolist()
     joints = tuple(
         ChainJoint(
@@ -211,7 +230,8 @@ def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
         )
         for joint, inertia in zip(read.joints, armature, strict=True)
     )
-    down = np.array(arm.down) / math.hypot(*arm.down)
+    length = math.sqrt(arm.down[0] * arm.down[0] + arm.down[1] * arm.down[1] + arm.down[2] * arm.down[2])
+    down = np.array(arm.down) / length
     return ArmModel(
         theta=np.concatenate([joint.inertia for joint in read.joints]),
         counts=VectorCounts.of_chain(len(joints)),

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from ..core.chain import MAX_JOINTS
 from ..core.philox import link_key
 from ..errors import ScenarioError
 from .fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
@@ -31,7 +32,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
     normal: tuple[Real, NotNegative] | None = None
     uniform: tuple[Real, Real] | None = None
-    value: float | Annotated[list[float], Meta(max_length=2)]
+    value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
         """Returns the number of a seed under a dotted key."""

@@ -5,7 +5,8 @@ an absent key asks nothing. `..._max_...` is the largest value that still holds,
 smallest; a window's key holds [least, most].
 """
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -35,10 +36,10 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         error_peak_rad: largest |e| of a joint.
         speed_peak_rad_s: largest speed of a joint.
         torque_peak_nm: largest control torque of a joint.
-        q1_rad: angle of joint 1, at every tick.
-        q2_rad: angle of joint 2, at every tick.
-        push1_mean_nm: torque of operator and environment ON joint 1, the mean over the ticks.
-        push2_mean_nm: the same of joint 2.
+        q1_rad: angle of joint 1, at every tick; q2_rad of joint 2, and so on as far as the arm has joints;
+            m of a prismatic joint.
+        push1_mean_nm: torque of operator and environment ON joint 1, the mean over the ticks; push2_mean_nm
+            of joint 2, and so on.
         wall_mean_n: force of the walls, the mean over the ticks, with or without contact.
         wall_deviation_n: its standard deviation over the ticks (of the population).
         wall_peak_n: the largest.
@@ -53,8 +54,28 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     torque_peak_nm: LeastMost | None = None
     q1_rad: LeastMost | None = None
     q2_rad: LeastMost | None = None
+    q3_rad: LeastMost | None = None
+    q4_rad: LeastMost | None = None
+    q5_rad: LeastMost | None = None
+    q6_rad: LeastMost | None = None
+    q7_rad: LeastMost | None = None
+    q8_rad: LeastMost | None = None
+    q9_rad: LeastMost | None = None
+    q10_rad: LeastMost | None = None
+    q11_rad: LeastMost | None = None
+    q12_rad: LeastMost | None = None
     push1_mean_nm: LeastMost | None = None
     push2_mean_nm: LeastMost | None = None
+    push3_mean_nm: LeastMost | None = None
+    push4_mean_nm: LeastMost | None = None
+    push5_mean_nm: LeastMost | None = None
+    push6_mean_nm: LeastMost | None = None
+    push7_mean_nm: LeastMost | None = None
+    push8_mean_nm: LeastMost | None = None
+    push9_mean_nm: LeastMost | None = None
+    push10_mean_nm: LeastMost | None = None
+    push11_mean_nm: LeastMost | None = None
+    push12_mean_nm: LeastMost | None = None
     wall_mean_n: LeastMost | None = None
     wall_deviation_n: LeastMost | None = None
     wall_peak_n: LeastMost | None = None
@@ -63,13 +84,19 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     @property
     def asked(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yields each quantity with a limit, and its least and most."""
-        for key in WINDOW_QUANTITIES:
+        for key in _QUANTITIES:
             if (limits := getattr(self, key)) is not None:
                 yield key, limits
 
 
-WINDOW_QUANTITIES: tuple[str, ...] = tuple(key for key in field_names(ExpectWindow) if key not in _WHERE)
-"""The quantities of a window."""
+_QUANTITIES = tuple(key for key in field_names(ExpectWindow) if key not in _WHERE)
+_JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
+
+
+def window_quantities(joints: int) -> tuple[str, ...]:
+    """Returns the quantities of a window of a site whose arm has so many joints."""
+    numbers = {key: _JOINT_QUANTITY.match(key) for key in _QUANTITIES}
+    return tuple(key for key, number in numbers.items() if number is None or int(number[1]) <= joints)
 
 
 def check_window_keys(written: Any) -> None:
@@ -78,19 +105,27 @@ def check_window_keys(written: Any) -> None:
         check_keys(table, field_names(ExpectWindow), f"expect.windows[{n}]")
 
 
-def find_window_problem(window: ExpectWindow, sites: Sequence[str]) -> KeyProblem | None:
-    """Returns a window's problem that no run of a scenario with these sites could meet, or None."""
+def find_window_problem(window: ExpectWindow, sites: Mapping[str, int]) -> KeyProblem | None:
+    """Returns a window's problem that no run of a scenario with these sites could meet, or None.
+
+    `sites` says how many joints the arm of each has.
+    """
     names = f"its sites are {', '.join(sites)}"
     if window.to_s <= window.from_s:
         return KeyProblem("to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}")
     if window.site and window.site not in sites:
-        return KeyProblem("site", f"no site {window.site!r}{suggest_nearest(window.site, sites)}; {names}")
+        return KeyProblem(
+            "site", f"no site {window.site!r}{suggest_nearest(window.site, list(sites))}; {names}"
+        )
     limits = dict(window.asked)
     if not limits:
-        return KeyProblem("", f"asks nothing; it may ask {', '.join(WINDOW_QUANTITIES)}")
+        valid = window_quantities(max(sites.values()))
+        return KeyProblem("", f"asks nothing; it may ask {', '.join(valid)}")
     for key, (least, most) in limits.items():
         if not window.site and key not in ALL_SITES_QUANTITIES:
             return KeyProblem("site", f"is missing: {key} is of one site; {names}")
+        if window.site and key not in window_quantities(sites[window.site]):
+            return KeyProblem(key, f"there is no such joint: that arm has {sites[window.site]}")
         if least > most:
             return KeyProblem(key, f"must be [least, most], is [{least:g}, {most:g}]")
     return None
@@ -160,11 +195,17 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
 
-def find_expect_problem(expect: Expect, sites: Sequence[str]) -> KeyProblem | None:
-    """Returns the problem, below `expect`, that no run of a scenario with these sites could meet, or None."""
-    for name in expect.end_pose_rad:
+def find_expect_problem(expect: Expect, sites: Mapping[str, int]) -> KeyProblem | None:
+    """Returns the problem, below `expect`, that no run of a scenario with these sites could meet, or None.
+
+    `sites` says how many joints the arm of each has.
+    """
+    for name, pose in expect.end_pose_rad.items():
         if name not in sites:
             return KeyProblem(f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}")
+        if len(pose) != sites[name]:
+            problem = f"expected list of length {sites[name]}, one angle per joint, and it has {len(pose)}"
+            return KeyProblem(f"end_pose_rad.{name}", problem)
     for n, window in enumerate(expect.windows):
         if found := find_window_problem(window, sites):
             return found._replace(key=f"windows[{n}].{found.key}".rstrip("."))

@@ -114,6 +114,14 @@ def is_distribution(value: Any) -> bool:
     return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
+def reword_problem(problem: str) -> str:
+    """Returns a validation message in the words of a scenario's author."""
+    words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
+    for old, new in words:
+        problem = problem.replace(old, new)
+    return problem
+
+
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
     """Returns "; did you mean ...?", or "" if nothing valid is near."""
     match = difflib.get_close_matches(word, valid, n=1, cutoff=0.5)

@@ -241,11 +241,17 @@ class Wall(ActorBase, frozen=True, tag="wall"):
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
-        length = math.hypot(*self.normal)
+        length = math.hypot(*self.normal) if len(self.normal) == 2 else math.sqrt(_sum_squares(self.normal))
         unit = tuple(x / length for x in self.normal)
         stiffness, damping = (self.stiffness_n_m, 0.0), (self.damping_n_s_m, 0.0)
         vectors: dict[str, Any] = {"a": self.point_m, "b": unit, "K": stiffness, "B": damping}
         return TorqueSource(TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled)
+
+
+def _sum_squares(vector: tuple[float, ...]) -> float:
+    """Returns x^2 + y^2 + z^2, rounded alike on every machine; `math.hypot` need not be."""
+    x, y, z = vector
+    return x * x + y * y + z * z
 
 
 Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque | Chirp | Multisine

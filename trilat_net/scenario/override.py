@@ -122,7 +122,7 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
     """Writes overrides into the tables of a scenario as read from TOML, in place.
 
     A number in a key means the entry of a list, counted from 0, as in sites.s.environment.0.stiffness_n_m. A
-    key that names a kind (a link's model or preset, a law) replaces the table's other keys.
+    key that names a kind (a link's model or preset, a law, an arm's urdf) replaces the table's other keys.
     """
     pairs = parse_overrides(overrides)
     overridden = {key for key, _ in pairs}
@@ -136,7 +136,10 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
         if isinstance(table, list):
             table[_list_index(table, last, key)] = value
             continue
-        if any(last in keys for keys in _KIND_KEYS.values()):  # the file's other keys are of another kind
+        kinds = (
+            ("urdf",) if folders[-1:] == ["arm"] else [key for keys in _KIND_KEYS.values() for key in keys]
+        )
+        if last in kinds:  # the file's other keys are of another kind
             for other in [k for k in table if ".".join([*folders, k]) not in overridden]:
                 del table[other]
         table[last] = value

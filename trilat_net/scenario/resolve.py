@@ -18,7 +18,7 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
-from .arms import Arm, ArmModel, build_arm
+from .arms import CHAIN_KEYS, Arm, ArmModel, build_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
@@ -34,11 +34,13 @@ from .fields import (
     field_names,
     find_count_problem,
     is_number,
+    reword_problem,
     suggest_nearest,
 )
 from .laws import LAW_PATH_PATTERN, LAWS, hash_law_source
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import SITE_GROUPS, Change, Limits, SiteSpec
+from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
 _TABLES = (
@@ -100,6 +102,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     draws = Draws(tables.get("seed", _DEFAULT_SEED), tables.get("drawn", {}))
     urdf = _read_urdf_files(tables, folder)
     sites = _resolve_sites(tables, draws, urdf)
+    named = [site["arm"].get("urdf") for site in sites.values()]
     written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
     for name in sites:
         if name not in written:
@@ -118,37 +121,40 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "timeline": resolve_timeline(tables.get("timeline", []), links, list(sites)),
         "expect": tables.get("expect", {}),
         "drawn": msgspec.to_builtins(draws.drawn),
-        "urdf": urdf,
+        "urdf": {name: text for name, text in urdf.items() if name in named},
     }
 
 
 def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
     """Returns the texts of the files that arms name: of the scenario itself, of `folder`, or shipped."""
-    texts = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
-    if not isinstance(tables["sites"], dict):
-        return texts
-    written = {
-        f"sites.{name}.arm": site.get("arm")
-        for name, site in tables["sites"].items()
-        if isinstance(site, dict)
-    }
-    for path, arm in {"arm": tables.get("arm"), **written}.items():
+    given = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
+    for name, text in given.items():
+        if not isinstance(text, str):
+            raise ScenarioError("must be the text of a URDF", path=f"urdf.{name}")
+    sites = tables["sites"] if isinstance(tables["sites"], dict) else {}
+    arms = {f"sites.{name}.arm": site.get("arm") for name, site in sites.items() if isinstance(site, dict)}
+    texts: dict[str, str] = {}
+    for path, arm in {"arm": tables.get("arm"), **arms}.items():
         name = arm.get("urdf", "") if isinstance(arm, dict) else ""
-        if not name or name in texts:
-            continue
-        if folder is None or not isinstance(name, str):
-            raise ScenarioError(
-                "no file may be named here" if folder is None else "must be a file's name",
-                path=f"{path}.urdf",
-            )
-        shipped = SHIPPED_FOLDER / name
-        file = shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
-        try:
-            texts = {**texts, name: file.read_text(encoding="utf-8")}
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not UTF-8 text"
-            raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None
+        if not isinstance(name, str):
+            raise ScenarioError("must be a file's name", path=f"{path}.urdf")
+        if name and name not in texts:
+            texts[name] = _unix_lines(given[name] if name in given else _read_urdf(name, folder, path))
     return texts
+
+
+def _read_urdf(name: str, folder: Path | None, path: str) -> str:
+    """Returns the text of a file that an arm names, or as much of it as shows that it is too long."""
+    if folder is None:
+        raise ScenarioError("no file may be named here", path=f"{path}.urdf")
+    shipped = SHIPPED_FOLDER / name
+    file = shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
+    try:
+        with file.open(encoding="utf-8") as stream:
+            return stream.read(MAX_CHARACTERS + 1)
+    except (OSError, ValueError) as error:  # of text that is not UTF-8, and of a name with a null
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None
 
 
 def _resolve_control(written: Any, default: TomlTable, path: str, counts: VectorCounts) -> TomlTable:
@@ -189,7 +195,8 @@ def _unix_lines(value: Any) -> Any:
 def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> TomlTable:
     if not isinstance(tables["sites"], dict):
         raise ScenarioError("must be tables [sites.NAME]", path="sites")
-    written, groups = {}, {}
+    written: TomlTable = {}
+    groups: dict[str, TomlTable] = {}
     for name, table in tables["sites"].items():
         path = f"sites.{name}"
         if not _SITE_NAME.fullmatch(name) or name in _RESERVED:
@@ -199,13 +206,10 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
                 path=path,
             )
         written[name] = check_keys(table, _SITE, path)
-        groups[name] = {
-            group: {
-                **tables.get(group, {}),
-                **check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}"),
-            }
-            for group, kind in SITE_GROUPS.items()
-        }
+        groups[name] = {}
+        for group, kind in SITE_GROUPS.items():
+            own = check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}")
+            groups[name][group] = own if "urdf" in own else {**tables.get(group, {}), **own}
     if len(written) > MAX_SITES:
         raise ScenarioError(f"has {len(written)} sites, at most {MAX_SITES} are taken", path="sites")
     if len(written) < 2:
@@ -224,8 +228,7 @@ def _resolve_site(
 ) -> TomlTable:
     """Returns a site's tables, complete; `urdf` is not empty where the arms are chains."""
     path = f"sites.{name}"
-    site["arm"] = draws.draw_numbers(site["arm"], f"{path}.arm")
-    model = _model_arm(site["arm"], urdf, f"{path}.arm")
+    site["arm"], model = _resolve_arm(site["arm"], draws, urdf, f"{path}.arm")
     counts = model.counts if model is not None else VectorCounts()
     site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
     site["control"] = _resolve_control(
@@ -249,20 +252,40 @@ def _resolve_site(
     return {key: site[key] for key in field_names(SiteSpec) if key in site}
 
 
+def _resolve_arm(
+    table: TomlTable, draws: Draws, urdf: dict[str, str], path: str
+) -> tuple[TomlTable, ArmModel | None]:
+    """Returns an arm's table with all numbers drawn, and its model, see `_model_arm`."""
+    table = dict(table)
+    armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
+    table = draws.draw_numbers(table, path)
+    model = _model_arm(table, urdf, path)
+    if not armature or model is None:
+        return {**table, **armature}, model
+    if not table.get("urdf"):
+        raise ScenarioError(_OF_A_CHAIN, path=f"{path}.armature_kg_m2")
+    table |= draws.draw_numbers(expand_vectors(armature, Arm, model.counts), path)
+    return table, _model_arm(table, urdf, path)
+
+
+_OF_A_CHAIN = "belongs to an arm with a urdf, and this one is planar"
+
+
 def _model_arm(table: TomlTable, urdf: dict[str, str], path: str) -> ArmModel | None:
-    """Returns the model of an arm; None where its table is refused later, at its own key."""
+    """Returns the model of an arm; None where the table of a planar arm is refused later, at its own key."""
     try:
         arm = msgspec.convert(table, Arm)
-    except msgspec.ValidationError:
-        return None
-    if arm.urdf:
-        planar = [key for key in table if key in ArmLinks._fields]
-        if planar:
-            raise ScenarioError(
-                f"belongs to the planar arm, and this one is {arm.urdf}", path=f"{path}.{planar[0]}"
-            )
-        if not any(arm.down):
-            raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
+    except msgspec.ValidationError as error:
+        if not table.get("urdf"):
+            return None
+        problem, _, place = str(error).partition(" - at ")
+        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('`$.')}") from None
+    foreign = [key for key in table if key in (ArmLinks._fields if arm.urdf else CHAIN_KEYS)]
+    if foreign:
+        owner = f"belongs to the planar arm, and this one is {arm.urdf}" if arm.urdf else _OF_A_CHAIN
+        raise ScenarioError(owner, path=f"{path}.{foreign[0]}")
+    if sum(abs(x) for x in arm.down) < 1e-6:
+        raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
     try:
         return build_arm(arm, urdf, bool(urdf))
     except ScenarioError as error:

@@ -18,7 +18,7 @@ from ..errors import ScenarioError
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
-from .fields import TomlTable
+from .fields import TomlTable, reword_problem
 from .laws import AdaptiveBox, ForceReflecting, ImportedLaw, KnownGravityLaw
 from .operators import (
     EndEffectorSpring,
@@ -129,6 +129,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         why = f"; {drawn['value']:g} was drawn with seed {resolved['seed']}" if drawn else ""
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
     _check_joint_space(scenario)
+    _check_start_poses(scenario)
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
         _check_actors(site.hands, f"sites.{name}.hands")
@@ -139,12 +140,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
-    for name, pose in scenario.expect.end_pose_rad.items():
-        joints = scenario.arms[name].counts.joints if name in scenario.arms else len(pose)
-        if len(pose) != joints:
-            problem = f"expected list of length {joints}, one angle per joint, and it has {len(pose)}"
-            raise ScenarioError(problem, path=f"expect.end_pose_rad.{name}")
-    if found := find_expect_problem(scenario.expect, scenario.names):
+    joints = {name: model.counts.joints for name, model in scenario.arms.items()}
+    if found := find_expect_problem(scenario.expect, joints):
         raise ScenarioError(found.problem, path=f"expect.{found.key}")
     return msgspec.structs.replace(scenario, timeline=tuple(map(_normalise_change, scenario.timeline)))
 
@@ -185,6 +182,21 @@ def _check_joint_space(scenario: Scenario) -> None:
                 "armature_kg_m2",
                 path=f"sites.{name}.control",
             )
+
+
+def _check_start_poses(scenario: Scenario) -> None:
+    """Refuses an arm that would start beyond a stop."""
+    for name, model in scenario.arms.items():
+        joints = model.chain.joints if model.chain is not None else ()
+        for n, (joint, start) in enumerate(zip(joints, scenario.sites[name].q0_rad, strict=False)):
+            if not joint.lower <= start <= joint.upper:
+                unit, path = "m" if joint.prismatic else "rad", f"sites.{name}.q0_rad[{n}]"
+                drawn = f", drawn with seed {scenario.seed}" if dotted_key(path) in scenario.drawn else ""
+                raise ScenarioError(
+                    f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, which moves "
+                    f"from {joint.lower:g} to {joint.upper:g} {unit}: start within, or set stops = false",
+                    path=path,
+                )
 
 
 def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
@@ -251,10 +263,7 @@ def _reword(problem: str, path: str) -> str:
         return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"
     if problem.startswith("Object missing required field"):
         return f"{problem.split()[-1].strip('`')} is missing"
-    words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
-    for old, new in words:
-        problem = problem.replace(old, new)
-    return problem
+    return reword_problem(problem)
 
 
 def _name_key(resolved: TomlTable, path: str) -> str:

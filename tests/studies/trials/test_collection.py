@@ -13,7 +13,7 @@ from tests.log_editing import edited, opened, recorded, without
 from trilat_net.core.two_link_arm import end_effector_jacobian
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.expect import WINDOW_QUANTITIES, ExpectWindow
+from trilat_net.scenario.expect import ExpectWindow, window_quantities
 from trilat_net.studies.record_batches import BATCH_RECORDS, RecordBatch
 from trilat_net.studies.trials.measure_run import (
     RunMetrics,
@@ -191,7 +191,8 @@ def test_a_bucket_without_records_says_so() -> None:
 
 
 WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
-ASKED = {key: [-1e9, 1e9] for key in WINDOW_QUANTITIES}
+QUANTITIES = window_quantities(2)
+ASKED = {key: [-1e9, 1e9] for key in QUANTITIES}
 CHANGES = {
     "duration_s": 2.0,
     "link.delay_ms": 20.0,
@@ -231,7 +232,7 @@ def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str,
 @given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))
 def test_the_cut_into_blocks_has_no_influence(seed: int, cuts: list[int]) -> None:
     cut, whole = stretched(rows(seed), cuts), stretched(rows(seed), [])
-    for key in WINDOW_QUANTITIES:
+    for key in QUANTITIES:
         assert cut[key] == pytest.approx(whole[key], rel=1e-12, abs=1e-12)
 
 
@@ -278,8 +279,8 @@ def test_quantities_of_a_window_are_what_their_definitions_say(log: Log) -> None
 
 def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
     (run,), (logged,) = measure_virtual_run(log.scenario).windows, measure_log(log).windows
-    assert run.keys() == set(WINDOW_QUANTITIES)
-    for key in WINDOW_QUANTITIES:
+    assert run.keys() == set(QUANTITIES)
+    for key in QUANTITIES:
         assert run[key] == pytest.approx(logged[key], rel=1e-12)
 
 

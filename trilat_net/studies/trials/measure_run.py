@@ -50,8 +50,9 @@ class WindowStats:
         self._seen_ns = -1
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
-        self._q_least, self._q_most = np.full(JOINTS, math.inf), np.full(JOINTS, -math.inf)
-        self._push_sum = np.zeros(JOINTS)
+        joints = len(spec.q0_rad)
+        self._q_least, self._q_most = np.full(joints, math.inf), np.full(joints, -math.inf)
+        self._push_sum = np.zeros(joints)
         self._force_sum = self._force_squares = self._force_peak = 0.0
         self._touched: bool | None = None
         self._hits = 0
@@ -87,18 +88,17 @@ class WindowStats:
         if not self._records or self._seen_ns < self._to_ns - self._period_ns:
             return {}
         mean_n = self._force_sum / self._records
-        push_nm = self._push_sum / self._records
+        push_nm = (self._push_sum / self._records).tolist()
         single = {
             **self._peaks,
-            "push1_mean_nm": float(push_nm[0]),
-            "push2_mean_nm": float(push_nm[1]),
+            **{f"push{n}_mean_nm": push for n, push in enumerate(push_nm, 1)},
             "wall_mean_n": mean_n,
             "wall_deviation_n": math.sqrt(max(0.0, self._force_squares / self._records - mean_n * mean_n)),
             "wall_peak_n": self._force_peak,
             "wall_hits": float(self._hits),
         }
-        angles = zip(("q1_rad", "q2_rad"), self._q_least.tolist(), self._q_most.tolist(), strict=True)
-        spans = {key: Range(least, most) for key, least, most in angles}
+        angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
+        spans = {f"q{n}_rad": Range(*ends) for n, ends in enumerate(angles, 1)}
         return {**spans, **{key: Range(value, value) for key, value in single.items()}}
 
 

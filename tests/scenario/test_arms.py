@@ -1,0 +1,301 @@
+"""Arms in scenarios: what a chain's tables may say, what is refused and where, and that its text is whole."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.core.chain_references import chain_references
+from tests.scenario.chains import SIX, six
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario, parse_embedded
+from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.scenario_reader import reseed_scenario
+from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
+
+ARM6, ARM7 = ((SHIPPED_FOLDER / f"arm{n}.urdf").read_text(encoding="utf-8") for n in (6, 7))
+UNIFORM = {"uniform": [0.1, 0.2]}
+WALL = {"kind": "wall", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "stiffness_n_m": 100.0}
+PULSE = {"kind": "pulse", "start_s": 1.0, "end_s": 2.0, "peak_nm": 3.0}
+TIP_SPRING = {"kind": "tip_spring", "stiffness_n_m": 100.0}
+Overrides = dict[str, Any]
+
+
+def refusal(changes: Overrides) -> ScenarioError:
+    with pytest.raises(ScenarioError) as caught:
+        six(**changes)
+    return caught.value
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "path", "words"),
+    [
+        ({"arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.1]}, "arm.payload_inertia_kg_m2", "payload_kg"),
+        (
+            {"arm.payload_kg": 1.0, "arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.3]},
+            "arm.payload_inertia_kg_m2",
+            "two others together",
+        ),
+        ({"arm.payload_kg": "x"}, "arm.payload_kg", "expected float, got text"),
+        ({"arm.payload_kg": -1.0}, "arm.payload_kg", ">= 0"),
+        ({"arm.tip": "wrist"}, "arm.tip", "did you mean 'wrist_3_link'"),
+        ({"arm.base": "bas"}, "arm.base", "did you mean 'base'"),
+        ({"arm.tip": "forearm"}, "arm.armature_kg_m2", "6 numbers, and the arm has 3 joints"),
+        ({"arm.armature_kg_m2": [0.1, 0.2]}, "arm.armature_kg_m2", "2 numbers, and the arm has 6 joints"),
+        ({"arm.down": [0.0, 0.0, 0.0]}, "arm.down", "point somewhere"),
+        ({"arm.down": [0.0, 0.0]}, "arm.down", "length >= 3"),
+        ({"arm.l1_m": 2.0}, "arm.l1_m", "planar"),
+        ({"arm.urdf": ""}, "q0_rad", "2 joints"),
+        ({"urdf": {"arm6.urdf": "<robot/>"}}, "arm.urdf", "arm6.urdf: has no links"),
+        ({"control.Kp": [1.0, 2.0]}, "control.Kp", "2 numbers, and the arm has 6 joints"),
+        ({"control.Gamma": [1.0, 2.0]}, "control.Gamma", "2 numbers, and the arm has 60 parameters"),
+        ({"limits.tau_limit_nm": [1.0, 2.0]}, "limits.tau_limit_nm", "2 numbers, and the arm has 6"),
+        ({"sites.m1.q0_rad": [0.0, 0.0]}, "q0_rad", "2 numbers, and the arm has 6 joints"),
+        (
+            {"sites.m1.q0_rad": [7.0, 0, 0, 0, 0, 0]},
+            "q0_rad[0]",
+            "7 rad, beyond a stop of joint shoulder_pan",
+        ),
+        (
+            {"sites.m1.q0_rad": [0, {"uniform": [7.0, 9.0]}, 0, 0, 0, 0]},
+            "q0_rad[1]",
+            "drawn with seed 1, beyond a stop of joint shoulder_lift",
+        ),
+        ({"sites.m1.environment": [{**WALL, "point_m": [0.0, 0.0]}]}, "environment[0].point_m", "x, y and z"),
+        ({"sites.m1.environment": [{**WALL, "normal": [0, 0, 0]}]}, "environment[0].normal", "somewhere"),
+        ({"sites.m1.hands": [{**PULSE, "peak_nm": [1.0, 2.0]}]}, "hands[0].peak_nm", "one for each"),
+        ({"sites.m1.hands": [{**TIP_SPRING, "to_m": [0.0, 0.0]}]}, "hands[0].to_m", "x, y and z"),
+        (
+            {"sites.m1.hands": [{"kind": "recorded", "points": [[0, 1, 2]]}]},
+            "hands[0].points[0]",
+            "each joint",
+        ),
+        ({"sites.m1.arm.known": False}, "arm.known", "moves by its masses"),
+    ],
+)
+def test_a_mistake_is_refused_at_its_own_key(changes: Overrides, path: str, words: str) -> None:
+    error = refusal(changes)
+    assert (error.path, words in error.problem) == (f"sites.m1.{path}", True), error
+
+
+@pytest.mark.parametrize(
+    ("changes", "path", "words"),
+    [
+        ({"arm.urdf": "nope.urdf"}, "arm.urdf", "nope.urdf cannot be read: No such file"),
+        ({"arm.urdf": 5}, "arm.urdf", "file's name"),
+        ({"arm.urdf": "\0"}, "arm.urdf", "cannot be read"),
+        ({"urdf": [1]}, "urdf", "table"),
+        ({"urdf": {"arm6.urdf": 5}}, "urdf.arm6.urdf", "text of a URDF"),
+        ({"expect.end_pose_rad": {"s": [0, 0]}}, "expect.end_pose_rad.s", "length 6, one angle per joint"),
+    ],
+)
+def test_a_mistake_of_the_whole_scenario_too(changes: Overrides, path: str, words: str) -> None:
+    error = refusal(changes)
+    assert (error.path, words in error.problem) == (path, True), error
+
+
+@pytest.mark.parametrize("key", ["armature_kg_m2", "payload_kg", "stops", "down", "tip"])
+def test_a_planar_arm_has_no_keys_of_a_chain(key: str) -> None:
+    value: Any = {"stops": False, "down": [0.0, -1.0, 0.0], "tip": "x"}.get(key, 1.0)
+    with pytest.raises(ScenarioError, match=f"sites.m1.arm.{key}: belongs to an arm with a urdf"):
+        load_scenario("free", {f"arm.{key}": value})
+
+
+def test_arms_of_unlike_joints_are_refused_in_joint_space() -> None:
+    error = refusal(
+        {"sites.s.arm.urdf": "arm7.urdf", "sites.s.q0_rad": [0, 0, 0, -1.5, 0, 1.5, 0], "control": {}}
+    )
+    assert error.path == "sites.s.arm"
+    assert "has 7 joints, and that of m1 has 6" in error.problem
+
+
+def test_a_link_of_meshes_alone_is_refused_with_its_name() -> None:
+    start, end = ARM6.index("<inertial>"), ARM6.index("</inertial>") + len("</inertial>")
+    mesh = '<visual><geometry><mesh filename="shoulder.dae"/></geometry></visual>'
+    error = refusal({"urdf": {"arm6.urdf": ARM6[:start] + mesh + ARM6[end:]}})
+    assert "link 'shoulder'" in error.problem
+    assert "has no <inertial>" in error.problem
+    whole = six(urdf={"arm6.urdf": ARM6.replace("<inertial>", f"{mesh}<inertial>", 1)})
+    assert whole.arms["m1"].theta.tolist() == six().arms["m1"].theta.tolist()  # and no file is opened
+
+
+@pytest.mark.parametrize(("scheme", "most"), [("second_order", 1.0), ("digital", 2.0)])
+def test_damping_that_a_light_joint_cannot_take_names_the_joint(scheme: str, most: float) -> None:
+    """The largest eigenvalue of h D M^-1 by NumPy, from Pinocchio's M of a stored pose."""
+    chain, states = chain_references()["arm6"]
+    pose, armature = states[0].q, np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+    least = np.linalg.eigvalsh(states[0].inertia + np.diag(armature))[0]
+    critical = float(most * 1000.0 * least)
+    poses = {f"sites.{name}.q0_rad": pose.tolist() for name in ("m1", "m2", "s")}
+    base = {**poses, "arm.stops": False, "scheme": scheme, "control.Kd": 0.0}
+    six(**base, **{"control.Kp": 0.999 * critical})
+    error = refusal({**base, "control.Kp": 1.001 * critical})
+    assert error.path == "sites.m1.control"
+    assert "damps joint wrist_3" in error.problem
+    assert chain.joints[5].name == "wrist_3"
+
+
+# What is accepted
+
+
+def test_one_number_stands_for_every_joint_and_each_is_drawn_by_itself() -> None:
+    same = six(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
+    assert same.sites["s"].arm.armature_kg_m2 == (0.1,) * 6
+    drawn = six(**{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM})
+    found = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
+    assert len(found) == 12
+    assert all(0.1 <= one <= 0.2 for one in found)
+    assert drawn.arms["m1"].theta[50] != drawn.arms["s"].theta[50]  # mass of the last link
+    again = reseed_scenario(drawn, 2)
+    assert again.sites["s"].arm.payload_kg != drawn.sites["s"].arm.payload_kg
+    assert not found & {*again.sites["s"].arm.armature_kg_m2}
+    assert reseed_scenario(again, 1) == drawn
+
+
+def test_a_drawn_start_pose_takes_the_operator_at_the_end_effector_along() -> None:
+    start = [0.3, {"uniform": [-1.2, -0.8]}, 1.2, -0.6, 0.5, 0.2]
+    drawn = six(**{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]})
+    again = reseed_scenario(drawn, 2)
+    for one in (drawn, again):
+        spec = one.sites["m1"]
+        assert list(spec.hands[0].from_m) == one.arms["m1"].end_effector(spec.q0_rad)
+    assert drawn.sites["m1"].hands[0].from_m != again.sites["m1"].hands[0].from_m
+
+
+def test_limits_are_those_of_the_file_unless_the_author_says_others() -> None:
+    limits = six().sites["s"].limits
+    assert limits.tau_limit_nm == (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
+    assert limits.qd_limit_rad_s == (math.pi,) * 6
+    changed = six(**{"limits.qd_limit_rad_s": 5.0}).sites["s"].limits
+    assert (changed.tau_limit_nm, changed.qd_limit_rad_s) == (limits.tau_limit_nm, 5.0)
+
+
+def test_a_start_beyond_the_limits_is_free_where_there_are_no_stops() -> None:
+    six(**{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]})
+
+
+def test_gravity_along_an_axis_or_across_it_is_only_its_direction() -> None:
+    """down = -z at 9.81 is the default; its length does not matter, its bits do not depend on a library."""
+    assert six(**{"arm.down": [0, 0, -3.0]}).arms["s"].chain.gravity_m_s2 == (0.0, 0.0, -9.81)
+    x, y, z = six(**{"arm.down": [1.0, 2.0, -2.0]}).arms["s"].chain.gravity_m_s2
+    assert (x, y, z) == pytest.approx((3.27, 6.54, -6.54), rel=1e-15)
+
+
+def test_an_arm_of_its_own_begins_anew() -> None:
+    """Nothing of [arm] holds for a site that names a file: tip and drives belong to the one of the group."""
+    own = {"arm": {"urdf": "arm7.urdf", "tip": "link6"}, "control": {"Kp": 0.01, "Kd": 0.0}}
+    start = [0, 0, 0, -1.5, 0, 1.5]
+    one = six(**{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start})
+    assert one.sites["s"].arm.armature_kg_m2 == (0.0,)
+    assert one.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
+    assert set(one.urdf) == {"arm6.urdf", "arm7.urdf"}
+    back = load_scenario(one, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1})
+    assert (back.sites["s"].arm.tip, set(back.urdf)) == ("", {"arm6.urdf"})
+
+
+def test_overrides_reach_every_arm_or_one() -> None:
+    heavy = load_scenario(six(), ["arm.payload_kg=1", "sites.s.arm.payload_kg=2", "control.Kp=[9,9,9,1,1,1]"])
+    assert [spec.arm.payload_kg for spec in heavy.sites.values()] == [1.0, 1.0, 2.0]
+    assert heavy.sites["s"].control.Kp == (9.0, 9.0, 9.0, 1.0, 1.0, 1.0)
+    wrist = load_scenario(six(), {"sites.s.arm.tip": "wrist_3_link", "sites.s.arm.payload_kg": 0.5})
+    assert wrist.arms["s"].theta[50] == six().arms["s"].theta[50] + 0.5
+
+
+# Texts
+
+
+def test_an_embedded_text_is_whole_and_names_no_file() -> None:
+    scenario = six()
+    assert parse_embedded(scenario.text) == scenario
+    with pytest.raises(ScenarioError, match=r"arm.urdf: no file may be named here"):
+        parse_embedded(SIX)
+    long = {"urdf": {"arm6.urdf": ARM6 + " " * MAX_CHARACTERS}}
+    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} are read"):
+        six(**long)
+
+
+def test_a_text_that_no_arm_names_is_left_out() -> None:
+    assert six(urdf={"arm6.urdf": ARM6, "other.urdf": "x"}) == six()
+
+
+def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
+    (tmp_path / "mine.urdf").write_text(ARM6.replace("\n", "\r\n"), newline="")
+    file = tmp_path / "six.toml"
+    file.write_text(SIX.replace("arm6.urdf", "mine.urdf"))
+    assert load_scenario(file).urdf == {"mine.urdf": ARM6}
+    (tmp_path / "mine.urdf").write_bytes(b"\xff")
+    with pytest.raises(ScenarioError, match=r"mine.urdf cannot be read: not UTF-8"):
+        load_scenario(file)
+    (tmp_path / "mine.urdf").write_text(ARM6 + " " * MAX_CHARACTERS)
+    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} are read"):
+        load_scenario(file)
+
+
+comments = (st.sampled_from(['"""', "a\r\nb", "\\", "'''", "[\n    1.0,\n]"]) | st.text(max_size=30)).filter(
+    lambda text: "--" not in text and not text.endswith("-") and all(c in "\t\r\n" or c >= " " for c in text)
+)
+pose = st.lists(st.floats(-3, 3), min_size=6, max_size=6)
+overrides = st.fixed_dictionaries(
+    {},
+    optional={
+        "arm.payload_kg": st.floats(0, 3) | st.just(UNIFORM),
+        "arm.payload_com_m": st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3),
+        "arm.armature_kg_m2": st.floats(0.3, 1) | st.lists(st.floats(0.3, 1), min_size=6, max_size=6),
+        "arm.down": st.lists(st.integers(1, 3), min_size=3, max_size=3),
+        "arm.g_m_s2": st.floats(0, 20),
+        "sites.s.arm.stops": st.booleans(),
+        "sites.s.arm.tip": st.sampled_from(["", "wrist_3_link"]),
+        "sites.s.q0_rad": pose | st.floats(-1, 1),
+        "sites.m2.hands": st.lists(st.sampled_from([PULSE, TIP_SPRING]), max_size=2),
+        "sites.s.environment": st.sampled_from([[], [WALL]]),
+        "limits.tau_limit_nm": st.floats(1, 100) | st.lists(st.floats(1, 100), min_size=6, max_size=6),
+    },
+)
+
+
+@settings(max_examples=40)
+@given(changed=overrides, comment=comments)
+def test_the_canonical_text_loads_to_the_same_scenario(changed: Overrides, comment: str) -> None:
+    urdf = {"arm6.urdf": ARM6.replace("</robot>", f"<!--{comment}--></robot>")}
+    scenario = six(urdf=urdf, **changed)
+    again = parse_embedded(scenario.text)
+    assert again == scenario
+    assert (again.text, again.sha256) == (scenario.text, scenario.sha256)
+    for name in scenario.names:
+        one, other = scenario.setup(name), again.setup(name)
+        assert one.theta.tolist() == other.theta.tolist()
+        assert (one.chain, one.gains, one.q0) == (other.chain, other.gains, other.q0)
+
+
+def test_the_end_effector_and_the_inertia_are_those_of_the_references() -> None:
+    """Pinocchio's, stored; the drives' inertia comes on top."""
+    model = six().arms["m1"]
+    _, states = chain_references()["arm6"]
+    for state in states:
+        assert model.end_effector(state.q) == pytest.approx(state.tip_position, abs=1e-13)
+        expected = state.inertia + np.diag([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+        assert np.abs(model.inertia(state.q) - expected).max() < 1e-12
+
+
+def test_a_planar_arm_beside_a_chain_is_the_same_arm() -> None:
+    """End effector of the chain of two joints against the cosines of the planar one."""
+    two = read_urdf(ARM7, base="link2", tip="link4")
+    assert len(two.joints) == 2
+    mixed = six(
+        control={},
+        **{f"sites.{name}.arm": {"urdf": ""} for name in ("m1", "m2")},
+        **{"sites.s.arm": {"urdf": "arm7.urdf", "base": "link2", "tip": "link4", "armature_kg_m2": 1.0}},
+        **{f"sites.{name}.q0_rad": [0.3, -1.0] for name in ("m1", "m2", "s")},
+    )
+    assert parse_embedded(mixed.text) == mixed
+    planar = load_scenario("free").arms["m1"]
+    x, y, z = mixed.arms["m1"].end_effector([0.3, -1.0])
+    assert [x, y] == pytest.approx(planar.end_effector([0.3, -1.0]), abs=1e-15)
+    assert z == 0.0
