@@ -52,7 +52,7 @@ class SiteReception:
         self.made: int | None = None
         self.heard_ns: int | None = None
         self._boot = boot
-        self._rate_hz = scenario.sites[name].rate_hz
+        self._rate_hz, self._layout = scenario.sites[name].rate_hz, scenario.layout(name)
         self.period_ns = 1_000_000_000 // self._rate_hz
         self._ticks = scenario.ticks(name)
         self._most = {
@@ -72,7 +72,8 @@ class SiteReception:
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError("out of range", f"{self.name} says it made {event.ticks} ticks")
         else:
-            tick = decode(payload, State) if channel == topics.STATE else decode(payload, LinkStats)
+            kind: type[State | LinkStats] = State if channel == topics.STATE else LinkStats
+            tick = decode(payload, kind, layout=self._layout)
             number = number_message(channel, tick.tick, self._rate_hz)
             t_ns = tick.sent_ns if isinstance(tick, State) else tick.t_ns
             message = SiteMessage(number, tick.tick, t_ns, tick)

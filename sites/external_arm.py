@@ -7,6 +7,7 @@ measurement counts; a site does not begin without one, and stops when none arriv
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import PlantState
 from trilat_net.errors import RunFailed, SessionError, WireError
 from trilat_net.net.bus import StampedInbox
@@ -34,11 +35,11 @@ class ExternalArm:
     """
 
     def __init__(
-        self, site: str, ring: StampedInbox, clock: Clock, dropped: Counter[str], place: str
+        self, site: Site, ring: StampedInbox, clock: Clock, dropped: Counter[str], place: str
     ) -> None:
         self.newest: PlantState | None = None
         self.taken = 0
-        self._site, self._ring, self._dropped = site, ring, dropped
+        self._site, self._layout, self._ring, self._dropped = site.name, site.layout, ring, dropped
         self._clock, self._place = clock, place
         self._boot = self._n = -1
         self._bound = self._counting = False
@@ -101,7 +102,7 @@ class ExternalArm:
 
     def _take(self, payload: bytes) -> None:
         try:
-            message = decode(payload, ArmMeasurement)
+            message = decode(payload, ArmMeasurement, layout=self._layout)
         except WireError as error:
             self._dropped[error.reason] += 1
             return

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
@@ -36,7 +37,9 @@ class PeerInbox:
         boots: Sequence[int],
         monitors: Sequence[LinkTimingMonitor],
         dropped: Counter[str],
+        layout: Layout,
     ) -> None:
+        self._layout = layout
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = boots, monitors, dropped
         self._last = [-1] * len(peers)
@@ -53,7 +56,7 @@ class PeerInbox:
 
     def _read(self, index: int, payload: bytes, arrived_ns: int, since_epoch_ns: int) -> Arrival | None:
         try:
-            sample = decode(payload, PeerSample)
+            sample = decode(payload, PeerSample, layout=self._layout)
         except WireError as error:
             self._dropped[error.reason] += 1
             return None

@@ -92,7 +92,7 @@ class SiteParts:
             key = topics.key(session, name, topics.MEASURED)
             ring = bus.stamped(key, clock.monotonic_ns, MEASUREMENTS_KEPT)
             place = " at ".join([key, *map(str, options.connection.places[:1])])
-            self.arm = ExternalArm(name, ring, clock, self.stats.dropped, place)
+            self.arm = ExternalArm(self.site, ring, clock, self.stats.dropped, place)
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries)
         self.publish_state = self._keeping_publisher(topics.STATE)
@@ -143,6 +143,10 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
         ]
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
-        decode(encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo), PeerSample)
+        decode(
+            encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo),
+            PeerSample,
+            layout=site.layout,
+        )
         estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
         estimator.estimate(k)

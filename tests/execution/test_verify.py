@@ -20,10 +20,12 @@ from tests.execution.deliveries import (
 )
 from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded, without
+from trilat_net.core.site_setup import Layout
 from trilat_net.execution.difference import RecordDifference
 from trilat_net.execution.verify import verify
-from trilat_net.net.messages import STATE_VECTORS as VECTORS
 from trilat_net.scenario import list_shipped
+
+VECTORS = Layout().lengths()
 
 ticks = st.one_of(st.sampled_from([0, 1, 2, TICKS - 2, TICKS - 1]), st.integers(0, TICKS - 1))
 

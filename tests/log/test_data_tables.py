@@ -11,11 +11,14 @@ import pytest
 from tests.analysis import logs
 from tests.log.dealt import a_file, changed, messages
 from tests.log_editing import edited, opened, recorded
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, read_field_docs
 from trilat_net.log.log_reader import Log
-from trilat_net.net.messages import STATE_VECTORS, Event, LinkStats, RecorderStats, State
+from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
+
+STATE_VECTORS = Layout().lengths()
 
 
 @cache

@@ -164,7 +164,7 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "another version": (
         lambda: edited(DATA, session={"schema_version": "2"}),
         {"schema"},
-        "has the schema trilat.State.v3, not trilat.State.v2",
+        "has the schema trilat.State.v4, not trilat.State.v2",
     ),
 }
 

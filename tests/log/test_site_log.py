@@ -8,9 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trilat_net.core.site_setup import Layout
 from trilat_net.log import site_log
 from trilat_net.log.site_log import LazyRecords, RecordsByTick
-from trilat_net.net.messages import STATE_VECTORS, State
+from trilat_net.net.messages import State
+
+STATE_VECTORS = Layout().lengths()
 
 EMPTY = State(
     v=3, site="m1", boot=1, tick=0, t_ns=0, mode="run", used={}, rx=[], rx_crc=0, cmd=[], mem=[], late_us=0,

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.messages import (
     READABLE,
-    STATE_VECTORS,
     VERSION,
     Event,
     Info,
@@ -28,6 +28,8 @@ from trilat_net.net.requests import ChangeReply, ChangeRequest, Pong
 from trilat_net.net.wire import MAX_BYTES, MAX_INFO_BYTES, decode, encode, encode_state
 
 from .parties import told
+
+STATE_VECTORS = Layout().lengths()
 
 KINDS = (State, PeerSample, LinkStats, Event, Info, Pong, ChangeRequest, ChangeReply)
 PEERS = ("m2", "s")
@@ -153,7 +155,7 @@ def test_what_is_not_finite_is_refused_at_both_ends(
 @pytest.mark.parametrize("off", [-1, 1])
 def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
     with pytest.raises(WireError, match=f"{name} has"):
-        decode(payload(**{name: [0.0] * (STATE_VECTORS[name] + off)}), State)
+        decode(payload(**{name: [0.0] * (STATE_VECTORS[name] + off)}), State, layout=Layout())
 
 
 @pytest.mark.parametrize(

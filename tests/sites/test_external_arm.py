@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.external_arm import MEASUREMENTS_KEPT, SILENCE_LIMIT_NS, ExternalArm
+from trilat_net.core.site_step import Site
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -159,7 +160,8 @@ class Heard:
         self.clock = ManualClock()
         self.ring = StampingRing(self.clock.monotonic_ns, MEASUREMENTS_KEPT)
         self.dropped: Counter[str] = Counter()
-        self.arm = ExternalArm("s", self.ring, self.clock, self.dropped, "here")
+        site = Site(load_scenario("two_sites").setup("s"))
+        self.arm = ExternalArm(site, self.ring, self.clock, self.dropped, "here")
 
     def hear(self, *payloads: bytes) -> None:
         for payload in payloads:
@@ -174,7 +176,9 @@ class Heard:
         (b"\xc1", "malformed"),
         (bytes(70_000), "oversized"),
         (measurement(v=VERSION + 1), "version"),
-        (measurement(q=[1.0]), "malformed"),
+        (measurement(q=[1.0]), "of 1 joints; the scenario has 2"),
+        (measurement(qd=[1.0]), "malformed"),
+        (measurement(q=[1.0] * 13), "malformed"),
         (measurement(q=[1.0, math.nan]), "not finite"),
         (measurement(qd=[math.inf, 0.0]), "not finite"),
         (measurement(n=-1), "malformed"),

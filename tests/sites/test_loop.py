@@ -56,7 +56,7 @@ class Alone:
         self._clock, self._ticks = clock, scenario.ticks("m")
 
     def run(self) -> object:
-        inbox = PeerInbox((), (), (), (), (), self.stats.dropped)
+        inbox = PeerInbox((), (), (), (), (), self.stats.dropped, self.site.layout)
         timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
         return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, self)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sites.site_loop import PeerInbox
 from trilat_net.core.link import AHEAD_LIMIT_NS
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import MAX_ARRIVALS
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
@@ -46,7 +47,7 @@ class Desk:
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped)
+        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, Layout())
 
     def wait(self, until_ns: int) -> None:
         """Time goes on, to an instant since the epoch."""
@@ -90,13 +91,13 @@ REFUSED = {
         b"\xc1",
         b"garbage",
         msgpack.packb([1, 2]),
-        payload(q=[1.0]),
         payload(qd=[1.0, 2.0, 3.0]),
         payload(sent_ns=-(2**63)),
         payload(sent_ns=0.5),
         payload(echo=7),
         b"\x91" * 10_000,
     ],
+    "of 1 joints; the scenario has 2": [payload(q=[1.0])],
     "oversized": [payload(padding="x" * MAX_BYTES), bytes(MAX_BYTES + 1)],
     "version": [payload(v=VERSION + 1), payload(v=0)],
     "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],

@@ -106,19 +106,24 @@ class Layout(NamedTuple):
     parameters: int = PARAMETERS
     chain: bool = False
 
+    @classmethod
+    def of_arm(cls, chain: "ChainSetup | None") -> "Layout":
+        """Returns the layout of a chain; None: of the planar two-link arm."""
+        if chain is None:
+            return cls()
+        n = len(chain.joints)
+        return cls(n, n, LINK_PARAMETERS * n, True)
+
+    def lengths(self) -> dict[str, int]:
+        """Returns how many numbers the vectors of a record have, in their order."""
+        n, m = self.joints, self.shared
+        vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
+        return {**vectors, "theta_hat": self.parameters}
+
     def columns(self) -> dict[str, slice]:
         """Returns where the vectors of a record stand in its row of floats, in their order."""
-        n, m = self.joints, self.shared
-        lengths = {
-            "q": n,
-            "qd": n,
-            "q_des": m,
-            "qd_des": m,
-            "tau": n,
-            "tau_x": n,
-            "theta_hat": self.parameters,
-        }
-        ends = list(accumulate(lengths.values()))
+        lengths = self.lengths()
+        ends = accumulate(lengths.values())
         return {
             name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
         }
@@ -225,7 +230,4 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        if self.chain is None:
-            return Layout()
-        n = len(self.chain.joints)
-        return Layout(n, n, LINK_PARAMETERS * n, True)
+        return Layout.of_arm(self.chain)

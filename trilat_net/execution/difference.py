@@ -3,7 +3,7 @@
 Two criteria: equal bits on the platform that made the log, else |a - b| <= 1e-9 (1 + |a|).
 """
 
-import struct
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -53,15 +53,15 @@ def _equal_lists(a: Sequence[float], b: Sequence[float], equal: NumberEquality) 
     return len(a) == len(b) and all(equal(float(x), float(y)) for x, y in zip(a, b, strict=True))
 
 
-_NUMBERS = struct.Struct(f"<{sum(STATE_VECTORS.values())}d").pack
+def _pack(a: State | TickRecord) -> bytes:
+    return array("d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat]).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
     """True if every computed field of a record has the same bits; fast, for the common case."""
     a, b = logged, computed
     return (
-        _NUMBERS(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat)
-        == _NUMBERS(*b.q, *b.qd, *b.q_des, *b.qd_des, *b.tau, *b.tau_x, *b.theta_hat)
+        _pack(a) == _pack(b)
         and a.used == dict(zip(peers, b.used, strict=True))
         and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
         and a.mode == b.mode.name.lower()

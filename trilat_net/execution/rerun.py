@@ -113,7 +113,9 @@ def compare_site_rerun(
     """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
     before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
-    after = SiteLog(site.name, before.peers, rate_hz, [tick.payload for tick in executed], "rerun")
+    after = SiteLog(
+        site.name, before.peers, rate_hz, [tick.payload for tick in executed], "rerun", layout=before.layout
+    )
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     last = executed[-1] if executed else None
     effect = SiteEffect(

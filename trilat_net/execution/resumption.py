@@ -12,7 +12,6 @@ from typing import Generic, TypeVar
 from ..core.delay import MAX_DELAY_US
 from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
-from ..core.two_link_arm import JOINTS
 from ..log.site_log import SiteLog
 from ..net.messages import State
 
@@ -46,7 +45,7 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
         [state.used.get(peer, -1) for peer in peers],
         state.rx_crc,
         state.cmd,
-        state.mem if len(state.mem) > JOINTS else [],
+        state.mem if len(state.mem) > len(state.q_des) else [],
     )
 
 

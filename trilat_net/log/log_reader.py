@@ -239,7 +239,8 @@ class Log:
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
-            part = SiteLog(site, self.scenario.peers(site), rate_hz, channel.payloads, self.source, times)
+            peers, layout = self.scenario.peers(site), self.scenario.layout(site)
+            part = SiteLog(site, peers, rate_hz, channel.payloads, self.source, times, layout)
             most, last = self.scenario.ticks(site), part.last_tick
             if last >= most:  # a tick of others is nothing to count up to
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")

@@ -14,10 +14,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.site_setup import Layout
 from ..core.ticks import Mode
 from ..core.vectors import Array
 from ..errors import WireError
-from ..net.messages import READABLE, STATE_VECTORS, Stamp, State, TickNumber
+from ..net.messages import READABLE, Stamp, State, TickNumber
 from ..net.wire import MAX_BYTES, decode
 
 Ints = NDArray[np.int64]
@@ -29,9 +30,8 @@ _TYPES: dict[str, Any] = {
     "tick": TickNumber,
     "mode": _MODE,
     "rx": list[Stamp],
-    **{field: tuple.__class_getitem__((float,) * count) for field, count in STATE_VECTORS.items()},
 }
-"""Types of fields that are narrower here than in `State`: of a fixed length, of a few words."""
+"""Types of fields that are narrower here than in `State`, as vectors are: of a fixed length."""
 _DEFAULTS = {"sent_ns": 0}
 """Values of fields that records of older versions lack."""
 
@@ -53,16 +53,17 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
     return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
 
-def decode_vectors(payloads: Sequence[bytes], *fields: str) -> dict[str, Array]:
+def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
     """Returns vectors of every record by their fields, shape (K, length of the vector) each, in one pass."""
-    counts = [STATE_VECTORS[field] for field in fields]
-    values = chain.from_iterable(_decode_fields(payloads, *fields))
+    lengths = layout.lengths()
+    counts = [lengths[field] for field in fields]
+    values = chain.from_iterable(_decode_fields(payloads, *fields, layout=layout))
     if len(fields) > 1:
         values = chain.from_iterable(values)
-    rows: Array = _to_array(payloads, values, np.float64, sum(counts) * len(payloads))
+    rows: Array = _to_array(payloads, values, np.float64, sum(counts) * len(payloads), layout)
     rows = rows.reshape(-1, sum(counts))
     if not np.isfinite(rows).all():
-        raise _explain(payloads)
+        raise _explain(payloads, layout=layout)
     if len(fields) == 1:
         return {fields[0]: rows}
     parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
@@ -105,15 +106,17 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
     return counts, _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
 
 
-def _decode_fields(payloads: Sequence[bytes], *fields: str) -> Iterator[Any]:
+def _decode_fields(payloads: Sequence[bytes], *fields: str, layout: Layout | None = None) -> Iterator[Any]:
     """Yields a field of every record, or a tuple of several."""
     take: Callable[[Any], Any] = attrgetter(*fields)
-    return map(take, map(_find_decoder(fields).decode, payloads))
+    return map(take, map(_find_decoder(fields, layout).decode, payloads))
 
 
 @cache
-def _find_decoder(fields: tuple[str, ...]) -> msgspec.msgpack.Decoder[Any]:
+def _find_decoder(fields: tuple[str, ...], layout: Layout | None) -> msgspec.msgpack.Decoder[Any]:
     types = {field.name: field.type for field in msgspec.structs.fields(State)} | _TYPES
+    for field, count in layout.lengths().items() if layout else ():
+        types[field] = tuple.__class_getitem__((float,) * count)
     return _make_decoder({field: types[field] for field in fields})
 
 
@@ -125,18 +128,22 @@ def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
     return msgspec.msgpack.Decoder(msgspec.defstruct("Fields", fields, frozen=True, gc=False))
 
 
-def _to_array(payloads: Sequence[bytes], values: Iterable[Any], kind: Any, count: int) -> NDArray[Any]:
+def _to_array(
+    payloads: Sequence[bytes], values: Iterable[Any], kind: Any, count: int, layout: Layout | None = None
+) -> NDArray[Any]:
     try:
         return np.fromiter(values, kind, count)
     except (ValueError, OverflowError, RecursionError) as error:
-        raise _explain(payloads, str(error)) from None
+        raise _explain(payloads, str(error), layout) from None
 
 
-def _explain(payloads: Sequence[bytes], else_text: str = "a number is out of range") -> WireError:
+def _explain(
+    payloads: Sequence[bytes], else_text: str = "a number is out of range", layout: Layout | None = None
+) -> WireError:
     """Returns the error of the first payload that is no record, as that record alone would raise it."""
     for payload in payloads:
         try:
-            decode(payload, State, READABLE)
+            decode(payload, State, READABLE, layout)
         except WireError as error:
             return error
     return WireError("malformed", else_text)

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..net import topics
@@ -114,6 +115,7 @@ class ChannelCheck:
         rate_hz: tick rate of the member; 0 of the recorder.
         epoch_ns: Unix time of tick 0.
         version: schema version of the session.
+        layout: how many numbers the vectors of its records have; None of the recorder.
         problems: receives the problems, by check.
 
     Attributes:
@@ -123,9 +125,16 @@ class ChannelCheck:
     """
 
     def __init__(
-        self, member: str, kind: str, rate_hz: int, epoch_ns: int, version: int, problems: ProblemLists
+        self,
+        member: str,
+        kind: str,
+        rate_hz: int,
+        epoch_ns: int,
+        version: int,
+        layout: Layout | None,
+        problems: ProblemLists,
     ) -> None:
-        self.member, self.kind, self.rate_hz = member, kind, rate_hz
+        self.member, self.kind, self.rate_hz, self._layout = member, kind, rate_hz, layout
         self.accounts: dict[int, Account] = defaultdict(Account)
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
@@ -186,7 +195,7 @@ class ChannelCheck:
         """Checks a message; `offset` is its place, or that of its chunk."""
         kind: Any = CHANNEL_TYPES[self.kind]
         try:
-            message = decode(stored.payload, kind, READABLE)
+            message = decode(stored.payload, kind, READABLE, self._layout)
         except WireError as error:
             self._add("schema", offset, str(error))
             return
@@ -364,9 +373,11 @@ class SessionCheck:
         sites = self._scenario.sites if self._scenario else {}
         if self._scenario and key.member not in (*sites, topics.RECORDER):
             self._problems["schema"].add(self._file, None, f"{topic[:80]}: the scenario has no such member")
-        rate_hz = sites[key.member].rate_hz if key.member in sites else 0
+        rate_hz, layout = 0, None
+        if self._scenario and key.member in sites:
+            rate_hz, layout = sites[key.member].rate_hz, self._scenario.layout(key.member)
         epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
-        return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, self._problems)
+        return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, layout, self._problems)
 
     def findings(self) -> Iterator[CheckFinding]:
         """Yields the results, once all files were read; without a session only that it was taken out."""

@@ -12,6 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 import numpy as np
 
 from .. import process
+from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import LogError, WireError
@@ -117,15 +118,19 @@ class TimedMessages(NamedTuple, Generic[M]):
     publish_ns: Ints
 
 
-def _decode_vector(payloads: Sequence[bytes], field: str) -> Array:
-    return record_columns.decode_vectors(payloads, field)[field]
-
-
 class _RecordField(cached_property[T]):
     """A field of every record as an array, by the attribute's name; it is decoded on first access."""
 
     def __init__(self, decode_column: Callable[[Sequence[bytes], str], T], meaning: str) -> None:
         super().__init__(lambda site: site._read(decode_column, self.attrname))
+        self.__doc__ = meaning
+
+
+class _RecordVector(cached_property[Array]):
+    """A vector of every record; as `_RecordField`."""
+
+    def __init__(self, meaning: str) -> None:
+        super().__init__(lambda site: site._read_vectors(self.attrname)[self.attrname])
         self.__doc__ = meaning
 
 
@@ -139,6 +144,7 @@ class SiteLog:
         payloads: the records as published.
         source: the file's name in errors.
         times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
+        layout: how many numbers the vectors of its records have; n joints, m shared, P parameters.
 
     Attributes:
         payloads: the records as published, in tick order.
@@ -157,8 +163,9 @@ class SiteLog:
         payloads: Sequence[bytes],
         source: str,
         times: tuple[Ints, Ints] | None = None,
+        layout: Layout = Layout(),  # noqa: B008
     ) -> None:
-        self.name, self.peers, self.rate_hz = name, peers, rate_hz
+        self.name, self.peers, self.rate_hz, self.layout = name, peers, rate_hz, layout
         self._source = source
         self.payloads = payloads
         self.tick = self._read(record_columns.decode_ticks)
@@ -190,7 +197,10 @@ class SiteLog:
     def prepare(self, *fields: str) -> None:
         """Decodes several vectors by their names in one pass, three times as fast as one by one."""
         if absent := [field for field in fields if field not in self.__dict__]:
-            self.__dict__.update(self._read(record_columns.decode_vectors, *absent))
+            self.__dict__.update(self._read_vectors(*absent))
+
+    def _read_vectors(self, *fields: str) -> dict[str, Array]:
+        return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
         """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
@@ -201,7 +211,7 @@ class SiteLog:
         return self._decode([self.payloads[n]])[0]
 
     def _decode(self, payloads: Sequence[bytes]) -> list[State]:
-        return self._read(lambda _: [decode(payload, State, READABLE) for payload in payloads])
+        return self._read(lambda _: [decode(payload, State, READABLE, self.layout) for payload in payloads])
 
     @cached_property
     def states(self) -> Sequence[State]:
@@ -228,17 +238,16 @@ class SiteLog:
     mode = _RecordField(
         record_columns.decode_strings, 'Mode, shape (K,): "run", "hold", "brake", "return" or "diverged".'
     )
-    q = _RecordField(_decode_vector, "Joint angles, shape (K, 2), rad.")
-    qd = _RecordField(_decode_vector, "Joint velocities, shape (K, 2), rad/s.")
-    q_des = _RecordField(_decode_vector, "Reference of Eq. (6), shape (K, 2), rad.")
-    qd_des = _RecordField(_decode_vector, "Its derivative, shape (K, 2), rad/s.")
-    tau = _RecordField(_decode_vector, "Control torque of Eq. (13), shape (K, 2), N m.")
-    tau_x = _RecordField(
-        _decode_vector,
-        "Exogenous torque in the sign of Eq. (8), shape (K, 2), N m; ON the arm acts its negative.",
+    q = _RecordVector("Joint angles, shape (K, n), rad.")
+    qd = _RecordVector("Joint velocities, shape (K, n), rad/s.")
+    q_des = _RecordVector("Reference of Eq. (6), shape (K, m), rad.")
+    qd_des = _RecordVector("Its derivative, shape (K, m), rad/s.")
+    tau = _RecordVector("Control torque of Eq. (13), shape (K, n), N m.")
+    tau_x = _RecordVector(
+        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m; ON the arm acts its negative.",
     )
-    theta_hat = _RecordField(
-        _decode_vector, "Estimate of the parameters, Eq. (15), shape (K, 5), kg m^2 and kg m as in Eq. (24)."
+    theta_hat = _RecordVector(
+        "Estimate of the parameters, Eq. (15), shape (K, P), of two links as in Eq. (24)."
     )
     t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
     late_us = _RecordField(
@@ -256,7 +265,7 @@ class SiteLog:
 
     @property
     def e(self) -> Array:
-        """Position error q - q_des, Eq. (9), shape (K, 2), rad."""
+        """Position error q - q_des, Eq. (9), shape (K, n), rad."""
         return self.q - self.q_des
 
     @cached_property

@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.two_link_arm import JOINTS, PARAMETERS
+from ..core.chain import MAX_JOINTS
+from ..core.site_setup import Layout
 from ..core.user_law import MAX_LAW_MEMORY
 
-VERSION = 3
+VERSION = 4
 """The version sent, and the only one accepted from others."""
-READABLE = (1, 2, 3)
+READABLE = (1, 2, 3, 4)
 """The versions read in files: all released ones."""
 SENT_TIME_SINCE = 2
 """First version whose records hold their sending time."""
@@ -82,7 +83,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rx: list[Stamp]
     rx_crc: U64
     cmd: list[str]
-    mem: Annotated[list[float], Meta(max_length=JOINTS + 1 + MAX_LAW_MEMORY)]
+    mem: Annotated[list[float], Meta(max_length=MAX_JOINTS + 1 + MAX_LAW_MEMORY)]
     late_us: Annotated[int, _unit("us", "wake-up minus deadline")]
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
     sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
@@ -291,12 +292,8 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     boots: dict[str, int] = {}
 
 
-SAMPLE_VECTORS = {"q": JOINTS, "qd": JOINTS, "tau_x": JOINTS}
-STATE_VECTORS = {
-    **dict.fromkeys(("q", "qd", "q_des", "qd_des", "tau", "tau_x"), JOINTS),
-    "theta_hat": PARAMETERS,
-}
-"""Lengths of a record's vectors."""
+STATE_VECTORS = tuple(Layout().lengths())
+"""The vectors of a record; their lengths are those of the site's `Layout`."""
 
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import msgspec
 
-from ..core.two_link_arm import JOINTS
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber
 
 BACKFILL_MESSAGES = 64
@@ -85,9 +84,6 @@ class Backfill(Request, frozen=True, kw_only=True):
     first: TickNumber
     payloads: list[bytes]
     made: TickNumber
-
-
-MEASUREMENT_VECTORS = {"q": JOINTS, "qd": JOINTS}
 
 
 class ArmMeasurement(Request, frozen=True, kw_only=True):

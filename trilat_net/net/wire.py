@@ -8,18 +8,19 @@ Payloads are MessagePack maps with string keys and plain lists, encoded by `msgp
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import cache
 from operator import attrgetter
 from typing import Any, TypeVar
 
 import msgpack
 import msgspec
 
+from ..core.chain import MAX_JOINTS
+from ..core.site_setup import Layout
 from ..core.ticks import Arrival, TickRecord
 from ..errors import WireError
 from .messages import (
-    SAMPLE_VECTORS,
-    STATE_VECTORS,
     VERSION,
     Event,
     Info,
@@ -28,7 +29,7 @@ from .messages import (
     RecorderStats,
     State,
 )
-from .requests import MEASUREMENT_VECTORS, ArmMeasurement, Backfill, Request
+from .requests import ArmMeasurement, Backfill, Request
 
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
@@ -43,11 +44,21 @@ _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_
 _isfinite = math.isfinite
 
 
-_VECTORS = {PeerSample: SAMPLE_VECTORS, State: STATE_VECTORS, ArmMeasurement: MEASUREMENT_VECTORS}
-_CHECKS = {
-    kind: (attrgetter(*lengths), tuple(lengths.values()), tuple(lengths))
-    for kind, lengths in _VECTORS.items()
-}
+@cache
+def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
+    """Returns the lengths of a message's vectors."""
+    if kind is State:
+        return layout.lengths()
+    if kind is PeerSample:
+        return dict.fromkeys(("q", "qd", "tau_x"), layout.shared)
+    return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
+
+
+@cache
+def _vectors_getter(kind: type[msgspec.Struct]) -> Callable[[Any], tuple[list[float], ...]] | None:
+    """Returns a function that takes the vectors out of a message; None for one without any."""
+    names = _vectors(kind, Layout())
+    return attrgetter(*names) if names else None
 
 
 def encode_state(
@@ -111,8 +122,12 @@ def encode(message: _Sent) -> bytes:
 M = TypeVar("M", bound=msgspec.Struct)
 
 
-def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)) -> M:
+def decode(
+    payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,), layout: Layout | None = None
+) -> M:
     """Returns the message of a payload, of the present schema version or of those that a file may have.
+
+    Without the `layout` of its sender vectors may have any length.
 
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
@@ -126,16 +141,23 @@ def decode(payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,)
         raise WireError("malformed", str(error)) from None
     if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    check = _CHECKS.get(kind)
-    if check is not None:
-        vectors_of, lengths, names = check
+    vectors_of = _vectors_getter(kind)
+    if vectors_of is not None:
         vectors = vectors_of(message)
+        if layout is not None:
+            _check_lengths(vectors, _vectors(kind, layout))
         # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
-        if tuple(map(len, vectors)) != lengths or not _isfinite(sum(map(sum, vectors))):
-            for name, vector, length in zip(names, vectors, lengths, strict=True):
-                if len(vector) != length:
-                    raise WireError("malformed", f"{name} has {len(vector)} numbers, not {length}")
+        if not _isfinite(sum(map(sum, vectors))):
+            for name, vector in zip(_vectors(kind, Layout()), vectors, strict=True):
                 if not all(map(_isfinite, vector)):
                     number = message.n if kind is ArmMeasurement else message.tick
                     raise WireError("not finite", f"{name} of {message.site} at {number}")
     return message  # type: ignore[no-any-return]
+
+
+def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
+    for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
+        if (count := len(vector)) != length:
+            joints = name == "q" and 1 <= count <= MAX_JOINTS  # so that reasons are few
+            reason = f"of {count} joints; the scenario has {length}" if joints else "malformed"
+            raise WireError(reason, f"{name} has {count} numbers, not {length}")

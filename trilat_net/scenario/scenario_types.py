@@ -19,7 +19,7 @@ from msgspec import Meta
 from ..core import dominance
 from ..core.chain import MAX_JOINTS
 from ..core.philox import link_key
-from ..core.site_setup import LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
+from ..core.site_setup import Layout, LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
 from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
@@ -292,6 +292,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     def external(self) -> tuple[str, ...]:
         """The sites whose arms are outside of the program."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
+    def layout(self, site: str) -> Layout:
+        """Returns how many numbers the vectors of a site have."""
+        return Layout.of_arm(self.arms[site].chain)
 
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
