@@ -40,7 +40,7 @@ def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
 
 
 REFUSED = {
-    "a pose with letters": (["free", "--pose", "up"], ["--pose is two angles in rad", "'up'"]),
+    "a pose with letters": (["free", "--pose", "up"], ["--pose is angles in rad", "'up'"]),
     "a range without a colon": (["free", "--over", "control.Kd=5"], ["--over reads KEY=LOW:HIGH"]),
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),

@@ -11,20 +11,14 @@ from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_on_arm, t
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.two_link_arm import forward_dynamics, regressor
 from trilat_net.theory.site_dynamics import (
-    ARGUMENT_COUNT,
-    ESTIMATE,
-    EXTERNAL_TORQUE,
-    PEER_TORQUE,
-    Q_DES,
-    QD,
-    QD_DES,
-    Q,
+    ArgumentLayout,
     describe_switching_points,
     differentiate_site_rates,
     evaluate_site_rates,
 )
 
 LATE_S = 100.0
+AT = ArgumentLayout(2, 5)
 seeds = st.integers(0, 2**32 - 1)
 laws = st.sampled_from(["adaptive", "known"])
 
@@ -32,33 +26,31 @@ laws = st.sampled_from(["adaptive", "known"])
 def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
     """The rates as a tick computes them: errors, regressor, torque, what acts, forward dynamics."""
     gains = one.gains
-    q, qd = x[Q], x[QD]
-    e, ed, r = control.control_errors(q, qd, x[Q_DES], x[QD_DES], np.asarray(gains.Lambda))
-    Lambda = np.asarray(gains.Lambda)
+    q, qd = x[AT.q], x[AT.qd]
+    Lambda = np.broadcast_to(gains.Lambda, 2)
+    e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
     Y = regressor(one.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
     wide = np.inf
-    vectors = [
-        np.asarray(v, dtype=float) for v in (gains.Kp, gains.Kd, gains.known, gains.K, gains.d, gains.k_f)
-    ]
-    Kp, Kd, known, K, d, k_f = vectors
+    Kp, Kd, K, d, k_f = (np.zeros(2) + gain for gain in (gains.Kp, gains.Kd, gains.K, gains.d, gains.k_f))
+    known = np.zeros(5) + gains.known
     if gains.law.name == "ADAPTIVE":
-        tau = control.adaptive_torque(Y, x[ESTIMATE], Kp, Kd, r, ed, wide)
+        tau = control.adaptive_torque(Y, x[AT.estimate], Kp, Kd, r, ed, wide)
         estimate = -np.asarray(gains.Gamma) * control.regressor_transpose_times(Y, r)
     else:
-        tau = control.damped_torque(known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[PEER_TORQUE], wide)
+        tau = control.damped_torque(known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide)
         estimate = np.zeros(5)
     rows, table = torque_source_rows(one.actors)
     acted, held = (
         np.array(torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2])
         for sampled in (0, 1)
     )
-    total = np.array(tau) + acted + held + x[EXTERNAL_TORQUE]
+    total = np.array(tau) + acted + held + x[AT.external_torque]
     qdd = np.array(forward_dynamics(one.theta, one.g_m_s2, q, qd, total))
     return {
         "qdd": qdd,
         "estimate": estimate,
         "tau": np.array(tau),
-        "external": acted + x[EXTERNAL_TORQUE],
+        "external": acted + x[AT.external_torque],
         "held": held,
     }
 
@@ -67,12 +59,14 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
 def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     one = site(rng, law, actors(rng))
-    x = rng.uniform(-2, 2, ARGUMENT_COUNT)
+    x = rng.uniform(-2, 2, AT.arguments)
     found, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
     for name, value in wanted.items():
         scale = 1.0 + max(np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max())
         inverse = (
-            np.abs(differentiate_site_rates(one, x).qdd[:, EXTERNAL_TORQUE]).max() if name == "qdd" else 1.0
+            np.abs(differentiate_site_rates(one, x).qdd[:, AT.external_torque]).max()
+            if name == "qdd"
+            else 1.0
         )
         assert np.abs(getattr(found, name) - value).max() <= 1e-12 * scale * max(1.0, inverse), name
 
@@ -83,12 +77,12 @@ def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     """Away from the surfaces of walls, where there is none."""
     rng = np.random.default_rng(seed)
     one = site(rng, law, [actor for actor in actors(rng) if actor.acts is not TorqueKind.WALL])
-    x = rng.uniform(-1, 1, ARGUMENT_COUNT)
+    x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
     found = differentiate_site_rates(one, x)
-    for k in range(ARGUMENT_COUNT):
+    for k in range(AT.arguments):
         ahead, behind = (
-            evaluate_site_rates(one, x + sign * step * np.eye(ARGUMENT_COUNT)[k]) for sign in (1, -1)
+            evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k]) for sign in (1, -1)
         )
         for name in found._fields:
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
@@ -100,29 +94,29 @@ def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     rng = np.random.default_rng(1)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0))
     one = site(rng, "known", [wall])
-    x = np.zeros(ARGUMENT_COUNT)
+    x = np.zeros(AT.arguments)
     assert not evaluate_site_rates(one, x).external.any()  # the stretched arm is on the free side
-    x[Q] = np.pi, 0.0
+    x[AT.q] = np.pi, 0.0
     assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
-    x[Q] = 2.5, 0.1
+    x[AT.q] = 2.5, 0.1
     assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
     outward = np.sign(
-        evaluate_site_rates(one, x * np.where(np.arange(ARGUMENT_COUNT) == QD.start, 0.0, 1.0)).external[0]
+        evaluate_site_rates(one, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)).external[0]
     )
-    x[QD] = outward * 1e3, 0.0
+    x[AT.qd] = outward * 1e3, 0.0
     assert not evaluate_site_rates(one, x).external.any()  # faster outward than the spring would push
 
 
 def test_an_estimate_at_an_end_of_its_box_stays_where_it_would_leave_and_goes_where_it_would_return() -> None:
     rng = np.random.default_rng(2)
     one = site(rng, "adaptive")
-    x = rng.uniform(-1, 1, ARGUMENT_COUNT)
+    x = rng.uniform(-1, 1, AT.arguments)
     free = evaluate_site_rates(one, x).estimate
-    ends = np.where(free > 0, x[ESTIMATE], np.inf), np.where(free > 0, -np.inf, x[ESTIMATE])
+    ends = np.where(free > 0, x[AT.estimate], np.inf), np.where(free > 0, -np.inf, x[AT.estimate])
     held = one._replace(gains=one.gains._replace(high=tuple(ends[0]), low=tuple(ends[1])))
     assert not evaluate_site_rates(held, x).estimate.any()
     assert not differentiate_site_rates(held, x).estimate.any()
-    back = one._replace(gains=one.gains._replace(low=tuple(np.where(free > 0, x[ESTIMATE], -np.inf))))
+    back = one._replace(gains=one.gains._replace(low=tuple(np.where(free > 0, x[AT.estimate], -np.inf))))
     assert (evaluate_site_rates(back, x).estimate == free).all()
 
 
@@ -130,7 +124,7 @@ def test_what_is_exactly_on_an_edge_is_said() -> None:
     rng = np.random.default_rng(3)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0))
     one = site(rng, "known", [wall])
-    x = np.zeros(ARGUMENT_COUNT)
+    x = np.zeros(AT.arguments)
     assert not list(describe_switching_points(one, x))
     on = one._replace(actors=(wall._replace(a=(sum(one.lengths_m), 0.0)),))
     assert list(describe_switching_points(on, x)) == [
@@ -138,7 +132,7 @@ def test_what_is_exactly_on_an_edge_is_said() -> None:
     ]
     boxed = site(rng, "adaptive")
     boxed = boxed._replace(gains=boxed.gains._replace(high=(9.0, 9.0, 9.0, 1.0, 9.0)))
-    x[ESTIMATE] = 0.0, 0.0, 0.0, 1.0, 0.0
+    x[AT.estimate] = 0.0, 0.0, 0.0, 1.0, 0.0
     assert list(describe_switching_points(boxed, x)) == [
         "theta4 of x rests exactly on the edge of its box: it counts as free"
     ]

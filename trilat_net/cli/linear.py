@@ -28,7 +28,7 @@ def linear_command(
     pose: Annotated[
         str | None,
         typer.Option(
-            "--pose", metavar="Q1,Q2", help="All sites here, rad, estimates true; default: a run's end."
+            "--pose", metavar="Q1,Q2,...", help="All sites here, rad, estimates true; default: a run's end."
         ),
     ] = None,
     roots: Annotated[int, typer.Option("--roots", metavar="N", help="Number of roots to print.")] = 6,
@@ -87,14 +87,13 @@ def linear_command(
         terminal.print_paths([picture])
 
 
-def _pose(text: str | None) -> tuple[float, float] | None:
+def _pose(text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
-        q1_rad, q2_rad = (float(part) for part in text.split(","))
+        return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--pose is two angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
-    return q1_rad, q2_rad
+        raise UsageError(f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
 
 
 def _range(text: str) -> tuple[str, float, float]:

@@ -17,10 +17,10 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
     if float(np.ptp(rest.q, axis=0).max()) < 5e-5:
-        yield f"  all sites at ({rest.q[0, 0]:.4f}, {rest.q[0, 1]:.4f}) rad"
+        yield f"  all sites at ({', '.join(f'{angle:.4f}' for angle in rest.q[0])}) rad"
         return
     for name, q in zip(analysis.scenario.names, rest.q, strict=True):
-        yield f"  {name} at ({q[0]:.4f}, {q[1]:.4f}) rad"
+        yield f"  {name} at ({', '.join(f'{angle:.4f}' for angle in q)}) rad"
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:

@@ -145,7 +145,7 @@ class MovingPart(NamedTuple):
     Attributes:
         pencil: its characteristic equation.
         names: of its states.
-        constant: number of states left out, each with a root at zero.
+        constant: number of states left out, of the loop's too, each with a root at zero.
     """
 
     pencil: Pencil
@@ -338,7 +338,8 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop that moves."""
     Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    return extract_moving_part(Pencil(loop.A, delays_s, Ad), loop.names)
+    moving = extract_moving_part(Pencil(loop.A, delays_s, Ad), loop.names)
+    return moving._replace(constant=moving.constant + loop.left_out)
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:

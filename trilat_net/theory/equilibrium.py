@@ -14,7 +14,6 @@ import numpy as np
 from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S
 from ..core.site_setup import Law
 from ..core.ticks import BUCKETS_PER_S
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
@@ -22,7 +21,7 @@ from ..scenario import Scenario
 from ..scenario.operators import Chirp, Multisine
 from .linear_loop import LinearLoop, find_loop_states, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import ESTIMATE, Q, describe_switching_points, has_estimate
+from .site_dynamics import describe_switching_points, has_estimate, lay_out_arguments
 
 MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""
@@ -46,8 +45,8 @@ class EquilibriumRun(NamedTuple):
     Attributes:
         at_rest: True if it ended at an equilibrium; otherwise the pose is the mean over its last quarter.
         diverged: True if a site left its limits.
-        q: joint angles, shape (N, 2), rad.
-        theta_hat: estimates, shape (N, 5).
+        q: joint angles, shape (N, n), rad.
+        theta_hat: estimates, shape (N, P).
     """
 
     t_s: float
@@ -111,7 +110,7 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     """
     x = gather_site_arguments(conditions, rest)
     states = np.array(
-        [np.concatenate([np.zeros(JOINTS), one.qdd, one.estimate]) for one in conditions.rates(x)]
+        [np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate]) for one in conditions.rates(x)]
     )
     return states[find_loop_states(conditions)]
 
@@ -122,7 +121,7 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
-        loop = linearise_loop(conditions, rest)
+        loop = linearise_loop(conditions, rest, every_estimate=True)
         effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
         # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
         free = [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(effects[n])]
@@ -143,10 +142,10 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
-    mask = find_loop_states(conditions)
+    at, mask = lay_out_arguments(conditions.sites[0]), find_loop_states(conditions)
     states = np.zeros(mask.shape)
     states[mask] = step
-    return rest._replace(q=rest.q + states[:, Q], theta_hat=rest.theta_hat + states[:, ESTIMATE])
+    return rest._replace(q=rest.q + states[:, at.q], theta_hat=rest.theta_hat + states[:, at.estimate])
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
@@ -162,7 +161,7 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     for _ in range(3):
         moved = np.hstack([start.q - rest.q, np.zeros_like(rest.q), start.theta_hat - rest.theta_hat])
         deviation = moved[find_loop_states(conditions)]
-        kept = _project_on_zero_roots(linearise_loop(conditions, rest), deviation)
+        kept = _project_on_zero_roots(linearise_loop(conditions, rest, every_estimate=True), deviation)
         if kept is None:
             break
         rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))
@@ -186,12 +185,12 @@ def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
     return kept
 
 
-def find_equilibrium(scenario: Scenario, pose: tuple[float, float] | None = None) -> Equilibrium:
+def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
     """Returns the equilibrium of a scenario: at the end of a run, or at a pose, rad, with true estimates.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its run.
-        UsageError: the pose is not two finite angles.
+        UsageError: the pose is not a finite angle for every joint.
     """
     conditions = derive_operating_conditions(scenario)
     rest = _find_at_run_end(scenario, conditions) if pose is None else _take_pose(pose, conditions)
@@ -238,15 +237,17 @@ def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None
     """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters."""
     truth = [site.theta for site in conditions.sites]
     rows = [
-        own if has_estimate(site) else site.gains.known
+        own if has_estimate(site) else np.broadcast_to(site.gains.known, site.theta.shape)
         for site, own in zip(conditions.sites, truth if theta_hat is None else theta_hat, strict=True)
     ]
     return np.array(rows, dtype=np.float64)
 
 
-def _take_pose(pose: tuple[float, float], conditions: OperatingConditions) -> Equilibrium:
-    if len(pose) != 2 or not np.isfinite(pose).all():
-        raise UsageError(f"--pose is two angles in rad, as in --pose 0.1,0.3, not {pose}")
+def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
+    joints = lay_out_arguments(conditions.sites[0]).joints
+    if len(pose) != joints or not np.isfinite(pose).all():
+        angles = "two angles in rad" if joints == 2 else f"{joints} angles in rad, one per joint"
+        raise UsageError(f"--pose is {angles}, as in --pose 0.1,0.3{',...' * (joints > 2)}, not {pose}")
     q = np.tile(np.array(pose, dtype=np.float64), (len(conditions.sites), 1))
     rest = Equilibrium(
         q, _complete_estimates(conditions), "the pose that was asked for, with theta_hat = theta", 0.0

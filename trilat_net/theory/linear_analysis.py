@@ -90,7 +90,7 @@ def analyse_linear_loop(
     source: str | Path | Scenario,
     overrides: Sequence[str] = (),
     *,
-    pose: tuple[float, float] | None = None,
+    pose: tuple[float, ...] | None = None,
     roots: int = DEFAULT_ROOTS,
 ) -> LinearAnalysis:
     """Returns the linear analysis of a scenario, by name, by path, or itself, changed by texts KEY=VALUE.

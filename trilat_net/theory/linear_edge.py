@@ -19,8 +19,7 @@ from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import choose_equilibrium, find_equilibrium, follow_equilibrium
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import has_estimate
-from .textbook_arm import end_effector_position
+from .site_dynamics import has_estimate, place_arm
 from .tick_map import compute_decisive_spectrum
 
 EDGE_SCAN_POINTS = 24
@@ -52,13 +51,13 @@ def find_rightmost_root(
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
-    """Returns which of some states, shape (K, N, 2), rad, is deepest in a sampled wall; None if none is."""
+    """Returns which of some states, shape (K, N, n), rad, is deepest in a sampled wall; None if none is."""
     depth_m = np.full(len(q), -np.inf)
     for n, name in enumerate(scenario.names):
         site = scenario.setup(name)
         for wall in site.actors:
             if wall.acts is TorqueKind.WALL and wall.sampled:
-                at = end_effector_position(site.lengths_m, q[:, n].T)
+                at = place_arm(site, q[:, n].T).end_effector_position()
                 depth_m = np.maximum(depth_m, (np.array(wall.a) - at.T) @ np.array(wall.b))
     deepest = int(depth_m.argmax())
     return deepest if depth_m[deepest] > 0.0 else None
@@ -68,7 +67,7 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
     """Returns how fast small motions grow in contact with sampled walls, 1/s; NaN if none is pressed.
 
     That is the real part of the sampled loop's rightmost root at the rest next to the state, of those given,
-    that is deepest in a wall: angles, shape (K, N, 2), rad, and estimates, shape (K, N, 5). Chatter leaves
+    that is deepest in a wall: angles, shape (K, N, n), rad, and estimates, shape (K, N, P). Chatter leaves
     the wall in between, and its mean may be no contact.
     """
     deepest = find_deepest_contact(scenario, q)
@@ -223,5 +222,5 @@ def _assume_equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple
     sites = derive_operating_conditions(scenario).sites
     if any(map(has_estimate, sites)) and not any(site.actors for site in sites):
         mean: Array = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0)
-        return find_equilibrium(scenario, (float(mean[0]), float(mean[1]))), ASSUMED_EQUILIBRIUM_REMARK
+        return find_equilibrium(scenario, tuple(mean.tolist())), ASSUMED_EQUILIBRIUM_REMARK
     return choose_equilibrium(scenario) if before is None else follow_equilibrium(scenario, before), ""

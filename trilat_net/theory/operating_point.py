@@ -36,8 +36,8 @@ class Equilibrium(NamedTuple):
     """The pose about which a loop is linearised, all sites at rest.
 
     Attributes:
-        q: joint angles, shape (N, 2), rad.
-        theta_hat: estimates, shape (N, 5); of a law that knows gravity the parameters that it assumes.
+        q: joint angles, shape (N, n), rad.
+        theta_hat: estimates, shape (N, P); of a law that knows gravity the parameters that it assumes.
         how: the way it was found, in words.
         residual: the largest remaining acceleration, rad/s^2, or rate of an estimate.
         notes: remarks on it.

@@ -14,7 +14,6 @@ from ..analysis.json_values import finite_or_none
 from ..analysis.lyapunov_weights import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..scenario import Scenario
 from .characteristic_roots import compute_delay_spectrum
@@ -86,8 +85,8 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> Loo
     delays_s = conditions.age_s[conditions.alpha != 0.0]
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
     for i, site in enumerate(conditions.sites):
-        for joint in range(JOINTS):
-            row = JOINTS * i + joint
+        for joint in range(len(ports := find_site_ports(loop, site.name))):
+            row = ports[joint]
             C[row, loop.names.index(f"{site.name}.q{joint + 1}")] += site.gains.Lambda[joint]
             for j in np.flatnonzero(conditions.alpha[i]):
                 angle = loop.names.index(f"{conditions.sites[j].name}.q{joint + 1}")
@@ -211,7 +210,7 @@ def analyse_ports(
 
 def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
     output = build_proof_output(conditions, loop)
-    beta = np.repeat(compute_proof_weights(conditions), JOINTS)
+    beta = np.repeat(compute_proof_weights(conditions), len(loop.inputs) // len(conditions.sites))
     if output is None or not (beta > 0.0).all():
         return None
     return check_passivity(lambda w: evaluate_transfer(loop, to_imaginary_axis(w), output), w_rad_s, beta)

@@ -1,21 +1,39 @@
-"""The planar two-joint arm in plain NumPy: M(q), C(q, qd), G(q), the regressor and the end effector.
+"""Arms in plain NumPy: the planar two-joint arm by its printed matrices, a chain of joints by Jacobians.
 
-Invariant: independent of the compiled core, and analytic in every argument, so that a complex step gives
-derivatives exact to rounding.
+Invariant: independent of the compiled core, and analytic in every argument but where a chain meets a stop
+(there the real part decides), so that a complex step gives derivatives exact to rounding.
 
-Vectors have their components on the first axis and any number of columns behind it: shape (2,) or (2, B).
+Vectors have their components on the first axis and any number of columns behind it: shape (n,) or (n, B).
 
-Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
+The planar arm: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
 Eq. (1)-(5), (24).
+
+A chain: of a spatial vector the linear half comes first, at the origin of the link's own frame. With the
+Jacobian J_i of link i, its velocities V_i = J_i qd and W_i = J_i v, and its acceleration
+A_i = X A_p + S a + V_i x (S v), gravity included, link i needs
+
+    f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))
+
+which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n' F_n), Eq. (12), and
+M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
+from ..core.site_setup import ChainSetup
+
 Numbers = NDArray[Any]
 """Real numbers, or complex ones for a derivative by complex step."""
+
+_EPSILON = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _EPSILON[_i, _j, _k], _EPSILON[_i, _k, _j] = 1.0, -1.0
+_INERTIA_PLACES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+"""Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
 
 
 def inertia_matrix(theta: Numbers, q: Numbers) -> Numbers:
@@ -80,3 +98,206 @@ def position_jacobian(lengths_m: tuple[float, float], q: Numbers) -> Numbers:
     q12 = q[0] + q[1]
     s, c = l2_m * np.sin(q12), l2_m * np.cos(q12)
     return np.array([[-l1_m * np.sin(q[0]) - s, -s], [l1_m * np.cos(q[0]) + c, c]])
+
+
+class PlacedArm(NamedTuple):
+    """The planar arm in the poses q: the same methods as `PlacedChain`.
+
+    Attributes:
+        g_m_s2: gravitational acceleration, m/s^2.
+        lengths_m: of the two links.
+        q: shape (2, ...), rad.
+    """
+
+    g_m_s2: float
+    lengths_m: tuple[float, float]
+    q: Numbers
+
+    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12)."""
+        return regressor_matrix(self.g_m_s2, self.q, qd, v, a)
+
+    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m."""
+        return required_torque(theta, self.g_m_s2, self.q, qd, v, a)
+
+    def gravity_torque(self, theta: Numbers) -> Numbers:
+        """Returns G(q), shape (2, ...), N m."""
+        return gravity_torque(theta, self.g_m_s2, self.q)
+
+    def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
+        """Returns qdd, shape (2, ...), rad/s^2."""
+        return joint_acceleration(theta, self.g_m_s2, self.q, qd, torque)
+
+    def end_effector_position(self) -> Numbers:
+        """Returns the position of the end effector, shape (2, ...), m."""
+        return end_effector_position(self.lengths_m, self.q)
+
+    def position_jacobian(self) -> Numbers:
+        """Returns its Jacobian, shape (2, 2, ...), m/rad."""
+        return position_jacobian(self.lengths_m, self.q)
+
+
+def build_cross_matrix(a: Numbers) -> Numbers:
+    """Returns the matrix of a x, shape (3, 3, ...)."""
+    matrix: Numbers = np.einsum("ijk,j...->ik...", _EPSILON, a)
+    return matrix
+
+
+def _build_inertia_units() -> Numbers:
+    """Returns I(pi) of unit parameters, shape (10, 6, 6): a link's inertia is linear in them."""
+    units = np.zeros((LINK_PARAMETERS, 6, 6))
+    units[0, :3, :3] = np.eye(3)
+    for n in range(3):
+        across = build_cross_matrix(np.eye(3)[n])
+        units[1 + n, :3, 3:], units[1 + n, 3:, :3] = -across, across
+    for n, (row, column) in enumerate(_INERTIA_PLACES):
+        units[4 + n, 3 + row, 3 + column] = units[4 + n, 3 + column, 3 + row] = 1.0
+    return units
+
+
+_INERTIA_UNITS = _build_inertia_units()
+
+
+def _cross_motion(V: Numbers) -> Numbers:
+    """Returns the matrix of V x, shape (6, 6, ...); that of V x* is minus its transpose."""
+    matrix = np.zeros((6, 6, *V.shape[1:]), V.dtype)
+    matrix[:3, :3] = matrix[3:, 3:] = build_cross_matrix(V[3:])
+    matrix[:3, 3:] = build_cross_matrix(V[:3])
+    return matrix
+
+
+def _multiply(a: Numbers, b: Numbers) -> Numbers:
+    """Returns the product of matrices, shapes (a, b, ...) and (b, c, ...)."""
+    product: Numbers = np.einsum("ab...,bc...->ac...", a, b)
+    return product
+
+
+class PlacedLink(NamedTuple):
+    """A link of a chain in some poses.
+
+    Attributes:
+        X: carries spatial velocities of the link before into its frame, shape (6, 6, ...).
+        S: motion of its joint at speed 1, shape (6,).
+        J: its Jacobian, shape (6, n, ...).
+        R_base: its orientation in the base, shape (3, 3, ...).
+        place_m: its origin in the base, shape (3, ...).
+    """
+
+    X: Numbers
+    S: Numbers
+    J: Numbers
+    R_base: Numbers
+    place_m: Numbers
+
+
+class PlacedChain:
+    """A chain in the poses q, shape (n, ...): the same methods as `PlacedArm`."""
+
+    def __init__(self, chain: ChainSetup, q: Numbers) -> None:
+        self._chain, self._q = chain, q
+        self._links: list[PlacedLink] = []
+        columns = q.shape[1:]
+        J = np.zeros((6, len(q), *columns))
+        R_base, place_m = np.multiply.outer(np.eye(3), np.ones(columns)), np.zeros((3, *columns))
+        for i, joint in enumerate(chain.joints):
+            R, p = _place_joint(joint, q[i])
+            X = np.zeros((6, 6, *columns), R.dtype)
+            X[:3, :3] = X[3:, 3:] = R.swapaxes(0, 1)
+            X[:3, 3:] = -_multiply(R.swapaxes(0, 1), build_cross_matrix(p))
+            S = np.zeros(6)
+            S[slice(0, 3) if joint.prismatic else slice(3, 6)] = joint.axis
+            J = _multiply(X, J)
+            J[:, i] += S.reshape(6, *(1,) * len(columns))
+            place_m = place_m + multiply_columns(R_base, p)
+            R_base = _multiply(R_base, R)
+            self._links.append(PlacedLink(X, S, J, R_base, place_m))
+
+    def _per_joint(self, name: str) -> Numbers:
+        """Returns a number of every joint, shape (n, 1, ...)."""
+        values = np.array([getattr(joint, name) for joint in self._chain.joints])
+        return values.reshape(-1, *(1,) * (self._q.ndim - 1))
+
+    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns Y(q, qd, v, a) of the links alone, without drives, shape (n, 10 n, ...), Eq. (12)."""
+        parts = []
+        gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
+        A = -np.multiply.outer(gravity, np.ones(self._q.shape[1:]))
+        for i, (X, S, J, _, _) in enumerate(self._links):
+            V, W = multiply_columns(J, qd), multiply_columns(J, v)
+            V_x, W_x = _cross_motion(V), _cross_motion(W)
+            A = multiply_columns(X, A) + np.multiply.outer(S, a[i])
+            A = A + multiply_columns(V_x, np.multiply.outer(S, v[i]))
+            I_A, I_V, I_W, I_VW = (
+                np.einsum("pab,b...->ap...", _INERTIA_UNITS, motion)
+                for motion in (A, V, W, multiply_columns(V_x, W))
+            )
+            F = I_A - 0.5 * (_multiply(V_x.swapaxes(0, 1), I_W) + _multiply(W_x.swapaxes(0, 1), I_V) + I_VW)
+            parts.append(_multiply(J.swapaxes(0, 1), F))
+        return np.concatenate(parts, axis=1)
+
+    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns M(q) a + C(q, qd) v + G(q) with the drives' inertia and friction at v, shape (n, ...)."""
+        x = v / COULOMB_SPEED
+        friction = self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(1.0 + x * x)
+        body = multiply_columns(self.regressor_matrix(qd, v, a), theta)
+        torque: Numbers = body + self._per_joint("armature_kg_m2") * a + friction
+        return torque
+
+    def gravity_torque(self, theta: Numbers) -> Numbers:
+        """Returns G(q), shape (n, ...), N m."""
+        still = np.zeros_like(self._q)
+        return self.required_torque(theta, still, still, still)
+
+    def inertia_matrix(self, theta: Numbers) -> Numbers:
+        """Returns M(q) with the drives' inertia, shape (n, n, ...)."""
+        M = np.multiply.outer(
+            np.diag([joint.armature_kg_m2 for joint in self._chain.joints]), np.ones(self._q.shape[1:])
+        )
+        for i, link in enumerate(self._links):
+            own = theta[LINK_PARAMETERS * i : LINK_PARAMETERS * (i + 1)]
+            inertia = np.einsum("pab,p...->ab...", _INERTIA_UNITS, own)
+            M = M + _multiply(link.J.swapaxes(0, 1), _multiply(inertia, link.J))
+        return M
+
+    def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
+        """Returns qdd of M qdd + C qd + G + friction = torque + stops, Eq. (8), shape (n, ...)."""
+        at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
+        M = np.moveaxis(self.inertia_matrix(theta), (0, 1), (-2, -1))
+        force = np.moveaxis(torque + self._stop_torque(qd) - at_no_acceleration, 0, -1)[..., np.newaxis]
+        return np.moveaxis(np.linalg.solve(M, force)[..., 0], -1, 0)
+
+    def _stop_torque(self, qd: Numbers) -> Numbers:
+        """Returns the torque of the stops on the joints: springs and dampers that never pull."""
+        q, stiffness, damping = self._q, self._per_joint("stop_stiffness"), self._per_joint("stop_damping")
+        total: Numbers = np.zeros_like(q)
+        for name, sign in (("lower", 1.0), ("upper", -1.0)):
+            limit = self._per_joint(name)
+            beyond = sign * (limit - q.real) > 0.0
+            push = stiffness * (np.where(beyond, limit, 0.0) - q) - damping * qd
+            total = total + np.where(beyond & (sign * push.real > 0.0), push, 0.0)
+        return total
+
+    def end_effector_position(self) -> Numbers:
+        """Returns the position of the end effector in the base, shape (3, ...), m."""
+        last = self._links[-1]
+        tip = np.multiply.outer(np.array(self._chain.tip_m), np.ones(self._q.shape[1:]))
+        position: Numbers = last.place_m + multiply_columns(last.R_base, tip)
+        return position
+
+    def position_jacobian(self) -> Numbers:
+        """Returns the Jacobian of the end effector's position, shape (3, n, ...), m/rad or 1."""
+        last = self._links[-1]
+        across = np.einsum("ab,bn...->an...", build_cross_matrix(np.array(self._chain.tip_m)), last.J[3:])
+        return _multiply(last.R_base, last.J[:3] - across)
+
+
+def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
+    """Returns a link's orientation, shape (3, 3, ...), and origin in the frame of the link before."""
+    at_rest, axis, ones = np.array(joint.rotation), np.array(joint.axis), np.ones(np.shape(q))
+    R, p = np.multiply.outer(at_rest, ones), np.multiply.outer(np.array(joint.origin_m), ones)
+    if joint.prismatic:
+        return R, p + np.multiply.outer(at_rest @ axis, q)
+    across = build_cross_matrix(axis)
+    turned = np.multiply.outer(at_rest @ across, np.sin(q))
+    return R + turned + np.multiply.outer(at_rest @ across @ across, 1.0 - np.cos(q)), p

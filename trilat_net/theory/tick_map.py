@@ -19,7 +19,6 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 from ..core.site_setup import Scheme, SiteSetup
-from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
 from .characteristic_roots import (
     Complex,
@@ -33,25 +32,9 @@ from .characteristic_roots import (
     refine_roots,
     sort_root_guesses,
 )
-from .linear_loop import STATE_NAMES, differentiate_rates, linearise_loop
+from .linear_loop import SiteJacobian, differentiate_rates, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
-from .site_dynamics import (
-    ARGUMENT_COUNT,
-    ESTIMATE,
-    EXTERNAL_TORQUE,
-    PEER_TORQUE,
-    Q_DES,
-    QD,
-    Q,
-    SiteRates,
-    has_estimate,
-)
 
-ARM_STATE = slice(Q.start, QD.stop)
-"""Angles and velocities, in a site's arguments and in its X alike."""
-PEER_INPUT = slice(Q_DES.start, PEER_TORQUE.stop)
-"""A site's inputs from its peers, among its arguments: q_id, its derivative, peer torque."""
-PEER_INPUT_SIZE = PEER_INPUT.stop - PEER_INPUT.start
 MAX_COMPANION_SIZE = 600
 """The largest companion matrix whose eigenvalues are computed; beyond it Newton's method starts from the
 continuous roots."""
@@ -74,8 +57,8 @@ class SiteTickMap(NamedTuple):
 
     Attributes:
         P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque before.
-        Q: shape (n, 6).
-        sent: its output to peers, shape (6, n): q, qd, and the torque on its arm.
+        Q: shape (n, 3 joints).
+        sent: its output to peers, shape (3 joints, n): q, qd, and the torque on its arm.
         names: of its states.
     """
 
@@ -85,39 +68,38 @@ class SiteTickMap(NamedTuple):
     names: tuple[str, ...]
 
 
-def linearise_site_tick(site: SiteSetup, rates: SiteRates, h_s: float) -> SiteTickMap:
-    """Returns one site over a period, from the derivatives of its rates (`differentiate_site_rates`)."""
+def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> SiteTickMap:
+    """Returns one site over a period, from the derivatives of its rates (`differentiate_rates`)."""
+    at, rates = jacobian.at, jacobian.rates
     second = site.scheme is Scheme.SECOND_ORDER
-    memory = slice(QD.stop, QD.stop + (PARAMETERS if has_estimate(site) else 0))
-    count = memory.stop - memory.start
-    n = memory.stop + (JOINTS if second else 0)
-    own, peers = np.zeros((ARGUMENT_COUNT, n)), np.zeros((ARGUMENT_COUNT, PEER_INPUT_SIZE))
-    own[ARM_STATE, ARM_STATE] = np.eye(QD.stop)
-    own[ESTIMATE, memory] = np.eye(PARAMETERS)[:, :count]
-    peers[PEER_INPUT] = np.eye(PEER_INPUT_SIZE)
-    inverse_inertia = rates.qdd[:, EXTERNAL_TORQUE]
-    zero = np.zeros((JOINTS, JOINTS))
-    free = rates.qdd[:, ARM_STATE] - inverse_inertia @ (rates.tau + rates.held)[:, ARM_STATE]
+    arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
+    inputs = slice(at.q_des.start, at.peer_torque.stop)
+    n = at.states + (at.joints if second else 0)
+    own, peers = np.eye(at.arguments, n), np.eye(at.arguments, 3 * at.joints, -inputs.start)
+    own[at.states :] = 0.0
+    inverse_inertia = rates.qdd[:, at.external_torque]
+    zero = np.zeros((at.joints, at.joints))
+    free = rates.qdd[:, arm] - inverse_inertia @ (rates.tau + rates.held)[:, arm]
     Phi, Gamma = discretise_zero_order_hold(
-        np.block([[zero, np.eye(JOINTS)], [free]]), np.vstack([zero, inverse_inertia]), h_s
+        np.block([[zero, np.eye(at.joints)], [free]]), np.vstack([zero, inverse_inertia]), h_s
     )
 
     def control(by: Array) -> Array:
         """Returns the change of X by the controller, whose arguments are `by` times a vector."""
         f = rates.estimate @ by
-        tau = rates.tau @ by + (0.5 * h_s * rates.tau[:, ESTIMATE] @ f if second else 0.0)
+        tau = rates.tau @ by + (0.5 * h_s * rates.tau[:, memory] @ f if second else 0.0)
         u = (1.5 if second else 1.0) * tau + rates.held @ by
-        return np.vstack([Gamma @ u, h_s * f[:count], *([tau] if second else [])])
+        return np.vstack([Gamma @ u, h_s * f, *([tau] if second else [])])
 
     P, Q = control(own), control(peers)
-    P[ARM_STATE, ARM_STATE] += Phi
-    P[memory, memory] += np.eye(count)
+    P[arm, arm] += Phi
+    P[memory, memory] += np.eye(at.parameters)
     if second:
-        P[ARM_STATE, memory.stop :] -= 0.5 * Gamma
-    sent = np.zeros((PEER_INPUT_SIZE, n))
-    sent[: QD.stop, ARM_STATE] = np.eye(QD.stop)
-    sent[QD.stop :, ARM_STATE] = (rates.external + rates.held)[:, ARM_STATE]
-    states = (*STATE_NAMES[: memory.stop], *(("tau1", "tau2") if second else ()))
+        P[arm, memory.stop :] -= 0.5 * Gamma
+    sent = np.zeros((3 * at.joints, n))
+    sent[arm, arm] = np.eye(arm.stop)
+    sent[arm.stop :, arm] = (rates.external + rates.held)[:, arm]
+    states = (*jacobian.states, *(f"tau{joint + 1}" for joint in range(at.joints) if second))
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
 
 
@@ -189,10 +171,8 @@ def build_companion_matrix(pencil: Pencil) -> Array:
 def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> MovingPart:
     """Returns the part of the sampled loop that moves; all sites must have one rate."""
     h_s = 1.0 / conditions.sites[0].rate_hz
-    maps = [
-        linearise_site_tick(site, rates, h_s)
-        for site, rates in zip(conditions.sites, differentiate_rates(conditions, rest), strict=True)
-    ]
+    sites = differentiate_rates(conditions, rest)
+    maps = [linearise_site_tick(*one, h_s) for one in zip(conditions.sites, sites, strict=True)]
     ends = np.cumsum([0, *(len(one.P) for one in maps)])
     at = [slice(a, b) for a, b in itertools.pairwise(ends)]
     S = block_diag(*(one.P for one in maps))
@@ -203,4 +183,5 @@ def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> Mov
         S_d[at[i], at[j]] += conditions.alpha[i, j] * maps[i].Q @ maps[j].sent
     ticks = np.array(sorted(Sd), dtype=np.int64)
     delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
-    return extract_moving_part(Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names])
+    moving = extract_moving_part(Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names])
+    return moving._replace(constant=moving.constant + sum(one.left_out for one in sites))
