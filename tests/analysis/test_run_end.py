@@ -178,3 +178,18 @@ def test_arms_that_hang_or_were_thrown_are_not_called_stable(pose: list[float], 
     found = classify_log_end(logs.rewritten(still(), change=change))
     assert found.stability is Stability.OPEN
     assert says in found.text
+
+
+@pytest.mark.parametrize(("wide", "motion"), [(0.5, EndBehaviour.UNDECIDED), (0.1, EndBehaviour.BOUNDED)])
+def test_a_joint_is_no_oscillation_while_a_faster_one_that_may_feed_it_falls(
+    wide: float, motion: EndBehaviour
+) -> None:
+    """Joint 2 of s is steady at 0.05 rad/s; all else falls, to 0.15 rad/s at the end, or to 0.03."""
+
+    def changed(state):
+        t_s = state.t_ns * 1e-9
+        steady = swing(0.0, 0.05)(t_s) if state.site == "s" else 0.0
+        falls = swing(-0.1, wide)(t_s)
+        return logs.replaced(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
+
+    assert classify_log_end(logs.rewritten(still(), change=changed)).behaviour is motion

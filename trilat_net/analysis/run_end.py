@@ -20,7 +20,8 @@ DECAYS: the upper bound is negative, the line falls by a factor of two or more o
 quarter still takes half of its share in that; or nothing in the last quarter exceeds `FLOOR_RAD`. HARDLY: the
 line falls, by 4 % or more, and that is all. STEADY: the bounds exclude that the envelope doubles or halves
 within the half. All require that the last quarter of the half is at most twice the one before. A sustained
-oscillation of any size is steady.
+oscillation of any size is steady; a joint that is steady while a faster one of the coupled sites falls may
+live on that (modes that decay beat), and is undecided.
 
 UNDECIDED: everything else: too short, too irregular, growing ever more slowly, a V. No finite record
 excludes growth that begins later, or a beat longer than the run, whose rising flank looks like growth.
@@ -326,11 +327,25 @@ def _find_worst_joint(scenario: Scenario, t_s: Array, columns: Array, buckets: S
                 behaviour = _name_motion(behaviour, q, fastest, t_s)
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
             joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
+    for n in [fed for group in find_coupled_sites(scenario) for fed in _find_fed_joints(joints, group)]:
+        joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
     worst = max(joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s))
     return worst._replace(
         end_error_rad=max(one.end_error_rad for one in joints),
         end_speed_rad_s=max(one.end_speed_rad_s for one in joints),
     )
+
+
+def _find_fed_joints(joints: Sequence[RunEnd], group: Sequence[int]) -> list[int]:
+    """Returns the bounded joints of coupled sites of which a faster joint falls: they may live on that.
+
+    Modes that decay at several frequencies beat, and hand their energy on: some joint is steady for a while.
+    """
+    own = [JOINTS * n + joint for n in group for joint in range(JOINTS)]
+    falling = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+    fastest = max((joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling), default=0.0)
+    bounded = [n for n in own if joints[n].behaviour is EndBehaviour.BOUNDED]
+    return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
 
 
 def _classify_joint(

@@ -112,6 +112,18 @@ def test_a_few_per_cent_beside_the_edge_the_word_is_right(d: float) -> None:
     assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
 
 
+@pytest.mark.parametrize(("d", "verdict"), [(0.93, CellClass.UNDECIDED), (1.0, CellClass.CONVERGED)])
+def test_what_hardly_moves_beside_an_unstable_rest_is_undecided(d: float, verdict: CellClass) -> None:
+    """Arms 1e-3 rad apart: by their speed they rest, and the rightmost root is +0.002 /s or -0.02 /s."""
+    starts = {
+        f"sites.{name}.q0_rad": [-0.6, 1.8 + off] for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
+    }
+    found = judged(load_scenario("p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}))
+    assert found.motion is EndBehaviour.CONVERGED
+    assert found.verdict is verdict
+    assert found.reasons.startswith("this rest: unstable") is (d < 0.94)
+
+
 def test_a_run_that_diverges_says_when() -> None:
     found = judged(load_scenario(*RUNS["diverged"]), longest_s=100.0)
     assert found.motion is EndBehaviour.DIVERGED

@@ -10,9 +10,10 @@ import math
 from enum import StrEnum
 
 import msgspec
+import numpy as np
 
 from ...analysis.json_values import finite_or_none
-from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.run_end import FLOOR_RAD, EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
@@ -98,7 +99,8 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
     A run that is not conclusive when its time is over (see `is_conclusive`) goes on for as long again, and
     so on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for
-    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance. If small
+    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance. A run that
+    looks stable and of which a joint moves on is undecided if the loop linearised there is unstable. If small
     motions grow in contact with a sampled wall it is not extended: such chatter may die in minutes, when the
     estimates have drifted, and that makes no cell stable.
 
@@ -122,8 +124,39 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
         extended += 1
         run.advance(ends_s)
     trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
-    wanders = scenario.links_random and trend and not _pronounced(outcome)
-    return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED) if wanders else outcome
+    if scenario.links_random and trend and not _pronounced(outcome):
+        return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED)
+    if outcome.verdict is CellClass.CONVERGED and _moves_on(run):
+        return _doubt_unstable_rest(outcome, scenario, run)
+    return outcome
+
+
+def _moves_on(run: FusedRun) -> bool:
+    """True if the largest speed of a joint did not halve from the first to the last quarter of the half."""
+    for site in run.buckets:
+        joints = site.shape[1] // 3
+        half = site[len(site) // 2 :, joints : 2 * joints]
+        quarter = len(half) // 4
+        first, last = half[:quarter].max(axis=0), half[-quarter:].max(axis=0)
+        if (last > np.maximum(0.5 * first, FLOOR_RAD)).any():
+            return True
+    return False
+
+
+def _doubt_unstable_rest(outcome: CellResult, scenario: Scenario, run: FusedRun) -> CellResult:
+    """Returns a stable result as undecided if small motions grow where the run ended."""
+    # SciPy takes a worker half a second, which few cells need
+    from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
+    from ...theory.linear_edge import find_growth_at
+    from ...theory.operating_point import is_constant_link
+
+    if not all(map(is_constant_link, scenario.links.values())):
+        return outcome
+    growth_per_s = find_growth_at(scenario, run.q, run.theta_hat)
+    if not growth_per_s > STABILITY_EDGE_PER_S:
+        return outcome
+    reason = f"this rest: unstable, {growth_per_s:+.3g} /s"
+    return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED, reasons=reason)
 
 
 def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
