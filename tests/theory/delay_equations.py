@@ -6,13 +6,13 @@ Nothing of `trilat_net.core` is in here: SciPy's DOP853 with dense output, by th
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 Array = NDArray[np.float64]
-STATE = 9  # q (2), qd (2), theta_hat (5)
 
 
 def theta_of(arm) -> Array:
@@ -64,26 +64,41 @@ class DelayEquations:
     starts: list[float] = field(default_factory=list)
     pieces: list[Callable[[float], Array]] = field(default_factory=list)
 
+    @property
+    def joints(self) -> int:
+        return self.q0.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Length of a site's state: q, qd and theta_hat."""
+        return 2 * self.joints + len(self.theta)
+
     def past(self, t: float) -> Array:
-        """The state at t, shape (N, 9); before the start the start pose, at rest."""
+        """The state at t, shape (N, width); before the start the start pose, at rest."""
         if t <= 0 or not self.pieces:
-            return np.hstack([self.q0, np.zeros((len(self.q0), STATE - 2))])
-        return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, STATE)
+            return np.hstack([self.q0, np.zeros((len(self.q0), self.width - self.joints))])
+        return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, self.width)
 
     def rate(self, t: float, flat: Array) -> Array:
-        x = flat.reshape(-1, STATE)
-        q, qd, estimate = x[:, :2], x[:, 2:4], x[:, 4:]
+        x, n = flat.reshape(-1, self.width), self.joints
+        q, qd, estimate = x[:, :n], x[:, n : 2 * n], x[:, 2 * n :]
         before = x if self.delay_s == 0 else self.past(t - self.delay_s)
-        e = q - self.alpha @ before[:, :2]
-        ed = qd - self.alpha @ before[:, 2:4]
+        e = q - self.alpha @ before[:, :n]
+        ed = qd - self.alpha @ before[:, n : 2 * n]
         r = qd + self.Lambda * e
+        qdd, gradient = self.accelerate(q, qd, e, ed, r, estimate, self.hands(t))
+        return np.hstack([qd, qdd, -self.Gamma * gradient]).ravel()
+
+    def accelerate(
+        self, q: Array, qd: Array, e: Array, ed: Array, r: Array, estimate: Array, pushed: Array
+    ) -> tuple[Array, Array]:
+        """The accelerations under the law's torque and the operators', and Y'r: of the planar arm."""
         Y = regressor(self.g, q, qd, -self.Lambda * e, -self.Lambda * ed)
         tau = (Y @ estimate[..., None])[..., 0] - self.Kp * r - self.Kd * ed
         forces = regressor(self.g, q, qd, qd, np.zeros_like(qd)) @ self.theta  # C qd + G, Eq. (5)
-        pushed = tau + self.hands(t) - forces
-        qdd = np.linalg.solve(inertia(self.theta, q), pushed[..., None])[..., 0]
-        update = -self.Gamma * (Y.swapaxes(1, 2) @ r[..., None])[..., 0]
-        return np.hstack([qd, qdd, update]).ravel()
+        left = tau + pushed - forces
+        qdd = np.linalg.solve(inertia(self.theta, q), left[..., None])[..., 0]
+        return qdd, (Y.swapaxes(1, 2) @ r[..., None])[..., 0]
 
     def solve(self, end_s: float) -> "DelayEquations":
         """Method of steps: one piece per delay, and no piece across an edge of a pulse."""
@@ -101,21 +116,28 @@ class DelayEquations:
         return self
 
     def at(self, times: Array) -> Array:
-        """States at sorted times, shape (N, K, 9)."""
+        """States at sorted times, shape (N, K, width)."""
         piece = np.searchsorted(self.starts, times, side="right") - 1
         parts = [self.pieces[p](times[piece == p]) for p in np.unique(piece)]
-        return np.hstack(parts).reshape(len(self.q0), STATE, -1).swapaxes(1, 2)
+        return np.hstack(parts).reshape(len(self.q0), self.width, -1).swapaxes(1, 2)
 
 
 def equations(scenario) -> DelayEquations:
     """The equations of a scenario whose arms, gains and delays are all alike."""
     specs = list(scenario.sites.values())
-    (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
     assert len({(s.arm, s.control) for s in specs}) == 1
-    arm, control = specs[0].arm, specs[0].control
+    arm = specs[0].arm
+    return DelayEquations(theta=theta_of(arm), g=arm.g_m_s2, **common_terms(scenario))
+
+
+def common_terms(scenario) -> dict[str, Any]:
+    """What the equations have of a scenario, whatever its arms are."""
+    specs = list(scenario.sites.values())
+    (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
+    control = specs[0].control
 
     def hands(t: float) -> Array:
-        total = np.zeros((len(specs), 2))
+        total = np.zeros((len(specs), len(specs[0].q0_rad)))
         for i, spec in enumerate(specs):
             for p in spec.hands:
                 if p.start_s < t < p.end_s:
@@ -123,16 +145,16 @@ def equations(scenario) -> DelayEquations:
                     total[i] += np.array(p.peak_nm) * height
         return total
 
-    return DelayEquations(
-        theta=theta_of(arm),
-        g=arm.g_m_s2,
-        alpha=np.array([[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites]),
-        delay_s=delay_ms * 1e-3,
-        Lambda=np.array(control.Lambda),
-        Kp=np.array(control.Kp),
-        Kd=np.array(control.Kd),
-        Gamma=np.array(control.Gamma),
-        q0=np.array([s.q0_rad for s in specs]),
-        hands=hands,
-        edges_s=[edge for s in specs for p in s.hands for edge in (p.start_s, p.end_s)],
-    )
+    return {
+        "alpha": np.array(
+            [[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites]
+        ),
+        "delay_s": delay_ms * 1e-3,
+        "Lambda": np.array(control.Lambda),
+        "Kp": np.array(control.Kp),
+        "Kd": np.array(control.Kd),
+        "Gamma": np.array(control.Gamma),
+        "q0": np.array([s.q0_rad for s in specs]),
+        "hands": hands,
+        "edges_s": [edge for s in specs for p in s.hands for edge in (p.start_s, p.end_s)],
+    }
