@@ -120,7 +120,7 @@ def test_shares_are_of_all_that_there_is():
 
 def test_arms_stand_where_their_angles_put_them_in_panels_with_equal_axes():
     log = logs.simulated("four")
-    arm = log.scenario.sites["c"].arm
+    arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
     figure = arm_poses.draw_arms(log, instants=[0.0, 1.0])

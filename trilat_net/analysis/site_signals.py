@@ -81,5 +81,5 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
 
 
 def true_parameters(log: Log, site: str) -> Array:
-    """Returns theta of Eq. (24) for the arm of a site, shape (5,)."""
-    return log.scenario.sites[site].arm.theta
+    """Returns the true parameters of the arm of a site, shape (P,): theta of Eq. (24), or ten a link."""
+    return log.scenario.arms[site].theta

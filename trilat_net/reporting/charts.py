@@ -15,30 +15,39 @@ from ..analysis import site_signals
 from ..analysis.json_values import JsonObject
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
 from ..analysis.trace_decimation import decimate
-from ..core.two_link_arm import JOINTS, PARAMETERS
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from . import style
 from .figures import arm_poses, loop_timing, sample_age
-from .figures.joint_motion import THETA_UNITS
 
 BUCKET_BUDGET = 48_000
 """Buckets of all columns together: what keeps a page near a megabyte, however many sites there are."""
+_FRAMES = 400
+"""Instants at which the page knows where the joints of a chain are."""
+PICTURE_SIDE = 4.0
+"""Width of a picture of a chain, in the units in which the page's lines have their widths."""
 LIMIT_COLOUR = "limit"
 """Colour of references, true values and limits."""
 
 
 class Charts:
-    """The charts of a log; `twin` is the same experiment without operators, or None."""
+    """The charts of a log; `twin` is the same experiment without operators, or None.
 
-    def __init__(self, log: Log, twin: Log | None) -> None:
+    `bounds_m` are those of `workspace_box_m`.
+    """
+
+    def __init__(self, log: Log, twin: Log | None, bounds_m: tuple[float, float, float, float]) -> None:
         self._log = log
+        self._bounds_m = bounds_m
         self._twin = twin
         self._changes = list_changes(log)
         self._tables: list[JsonObject] = []
-        columns_per_site = 9 * JOINTS + PARAMETERS + len(log.sites)
+        self._titles = [f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)]
+        counts = max(arm.counts for arm in log.scenario.arms.values())
+        self._small = counts.joints > 2
+        columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
         self._buckets = max(100, min(1200, BUCKET_BUDGET // (columns_per_site * len(log.sites))))
 
     def data(self) -> JsonObject:
@@ -91,42 +100,56 @@ class Charts:
         yield from self._estimates()
         if self._twin is not None:
             moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites}
-            tables = {s: self._table(s, *columns) for s, columns in moved.items()}
+            tables = {s: self._columns(s, *columns) for s, columns in moved.items()}
             yield from self._per_joint("moved", "moved by the operators", "rad", tables)
         tables = self._tables_of(site_signals.controller_torques)
         yield from self._per_joint("control", "control torque", "N m", tables)
 
     def _tables_of(
         self, signal: Callable[[SiteLog], NDArray[Any]], sites: list[str] | None = None
-    ) -> dict[str, int]:
-        return {s: self._site_table(s, signal(self._log[s])) for s in sites or self._log.sites}
+    ) -> dict[str, list[JsonObject]]:
+        """Returns the columns of a signal of sites, one after the other, as series."""
+        parts = {site: self._log[site] for site in sites or self._log.sites}
+        return {s: self._columns(s, part.tick, part.t_s, signal(part)) for s, part in parts.items()}
 
-    def _per_joint(self, section: str, title: str, unit: str, tables: dict[str, int]) -> Iterator[JsonObject]:
-        for joint in range(JOINTS):
-            series = [self._series(site, table, joint) for site, table in tables.items()]
-            yield _chart(section, f"{title}, joint {joint + 1}", unit, series)
+    def _columns(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> list[JsonObject]:
+        """Stores columns of a site: in one table, or each in its own, since decimation keeps all extremes."""
+        count = values.shape[1]
+        if not self._small:
+            table = self._table(site, tick, t_s, values)
+            return [self._series(site, table, column) for column in range(count)]
+        return [self._series(site, self._table(site, tick, t_s, one[:, np.newaxis]), 0) for one in values.T]
+
+    def _per_joint(
+        self, section: str, title: str, unit: str, tables: dict[str, list[JsonObject]]
+    ) -> Iterator[JsonObject]:
+        for joint, name in enumerate(self._titles):
+            series = [columns[joint] for columns in tables.values() if joint < len(columns)]
+            yield _chart(section, f"{title}, {name}", unit, series)
 
     def _positions(self) -> Iterator[JsonObject]:
         for site in self._log.sites:
             part = self._log[site]
             both = np.stack([site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2)
-            for joint in range(JOINTS):
+            for joint, name in enumerate(self._titles[: both.shape[1]]):
                 table = self._site_table(site, both[:, joint])
                 desired = {**self._series(site, table, 1, "desired"), "colour": LIMIT_COLOUR, "dash": True}
                 series = [self._series(site, table, 0), desired]
-                yield _chart("positions", f"{site}, joint {joint + 1}", "rad", series, sites=[site])
+                yield _chart("positions", f"{site}, {name}", "rad", series, sites=[site])
 
     def _estimates(self) -> Iterator[JsonObject]:
         log = self._log
         tables = self._tables_of(site_signals.parameter_estimates)
-        for index in range(PARAMETERS):
-            series = [self._series(site, table, index) for site, table in tables.items()]
-            truths = [float(site_signals.true_parameters(log, site)[index]) for site in log.sites]
+        arm = max(log.scenario.arms.values(), key=lambda each: each.counts)
+        for index, (name, unit) in enumerate(arm.parameters):
+            series = [columns[index] for columns in tables.values() if index < len(columns)]
+            every = [site_signals.true_parameters(log, site) for site in log.sites]
+            truths = [float(theta[index]) for theta in every if index < len(theta)]
             lines: list[JsonObject] = [{"value": truth, "colour": n} for n, truth in enumerate(truths)]
             if len(set(truths)) == 1:
                 lines = [{"value": truths[0], "colour": LIMIT_COLOUR}]
-            title = f"estimate of θ{'₁₂₃₄₅'[index]}"
-            yield _chart("estimates", title, THETA_UNITS[index], series, lines=lines)
+            title = name if arm.chain else f"estimate of θ{'₁₂₃₄₅'[index]}"
+            yield _chart("estimates", title, style.typeset_unit(unit), series, lines=lines)
 
     def _timing(self) -> Iterator[JsonObject]:
         log = self._log
@@ -135,7 +158,7 @@ class Charts:
             yield from self._distributions()
         if not loop_timing.explain_missing_loop_times(log):
             tables = self._tables_of(lambda part: part.late_us[:, np.newaxis] * 1e-3)
-            series = [self._series(site, table, 0) for site, table in tables.items()]
+            series = [columns[0] for columns in tables.values()]
             yield _chart("timing", "wake-up after the deadline", "ms", series, zero=True)
             yield from self._histograms()
 
@@ -192,10 +215,33 @@ class Charts:
             yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
 
     def _arm(self, index: int, site: str) -> JsonObject:
-        part, arm = self._log[site], self._log.scenario.sites[site].arm
+        part, arm = self._log[site], self._log.scenario.arms[site]
+        if arm.chain is not None:
+            return {"site": site, "colour": index, **self._projected(site)}
         values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
         table = self._site_table(site, values)
-        return {"site": site, "colour": index, "links_m": [arm.l1_m, arm.l2_m], "table": table}
+        return {"site": site, "colour": index, "links_m": list(arm.lengths_m), "table": table}
+
+    def _projected(self, site: str) -> JsonObject:
+        """Stores where a chain's joints, those of its reference and their shadows are in the picture."""
+        part, arm = self._log[site], self._log.scenario.arms[site]
+        rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
+        actual, desired = (arm_poses.joint_positions_m(arm, q[rows]) for q in (part.q, part.q_des))
+        pictures = (
+            arm_poses.project_arm_m(arm, actual),
+            arm_poses.project_arm_m(arm, desired),
+            arm_poses.project_arm_m(arm, actual, onto_floor=True),
+        )
+        factor = picture_scale(self._log, self._bounds_m)
+        points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * factor
+        self._tables.append(
+            {
+                "rate_hz": self._log.scenario.sites[site].rate_hz,
+                "tick": _packed(part.tick[rows].astype("<i4")),
+                "columns": [_packed(column.astype("<f4")) for column in points.reshape(len(rows), -1).T],
+            }
+        )
+        return {"points": points.shape[2], "table": len(self._tables) - 1}
 
 
 def _chart(section: str, title: str, unit: str, series: list[JsonObject], **options: Any) -> JsonObject:
@@ -206,6 +252,14 @@ def workspace_box_m(log: Log) -> tuple[float, float, float, float]:
     """Returns left, right, bottom and top of a box around the motion of all arms, m."""
     times = np.linspace(0.0, recorded_end_s(log), 60)
     return arm_poses.pose_box_m([arm_poses.pose_at(log, site, t) for site in log.sites for t in times])
+
+
+def picture_scale(log: Log, bounds_m: tuple[float, float, float, float]) -> float:
+    """Returns the units per m of pictures of the arms: 1 for planar arms, whatever their size."""
+    if all(arm.chain is None for arm in log.scenario.arms.values()):
+        return 1.0
+    left, right, bottom, top = bounds_m
+    return PICTURE_SIDE / max(right - left, top - bottom)
 
 
 def _packed(column: NDArray[Any]) -> str:

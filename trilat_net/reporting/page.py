@@ -103,7 +103,11 @@ def render_report(
     """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML."""
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
-    data = {**charts.Charts(log, twin).data(), "bounds_m": bounds}
+    factor = charts.picture_scale(log, bounds)
+    data = {
+        **charts.Charts(log, twin, bounds).data(),
+        "bounds_m": [factor * bound for bound in bounds],
+    }
     return Template(_asset("report.html")).substitute(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
@@ -113,7 +117,7 @@ def render_report(
         sites=page_tables.render_sites(log, facts),
         loops=page_tables.render_loops(log, facts),
         links=_links(log, facts),
-        strip=arm_svg.render_arms_svg(log, bounds),
+        strip=arm_svg.render_arms_svg(log, bounds, factor),
         sections=certificate + _sections(log, data["charts"]),
         assumed=page_tables.render_assumptions(scenario),
         again=page_tables.render_commands(log),
@@ -132,11 +136,15 @@ def render_report(
 def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
     """Returns a heading, a sentence and room for charts per section, or the reason why there are none."""
     filled = {chart["section"] for chart in drawn}
+    chains = any(arm.chain for arm in log.scenario.arms.values())
     absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
     html = ""
     for key, (heading, sentence) in _SECTIONS.items():
         if key in filled:
-            body = f'<p class="note">{escape(sentence)}</p><div class="charts" data-section="{key}"></div>'
+            kind = "charts small" if key == "estimates" and chains else "charts"
+            if chains and key == "estimates":
+                sentence = "Of every link, about the frame of its joint. Dashed: the true value."
+            body = f'<p class="note">{escape(sentence)}</p><div class="{kind}" data-section="{key}"></div>'
         elif key in absent:
             body = f'<p class="note">{escape(absent[key])}.</p>'
         else:

@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -140,15 +140,80 @@ def set_time_axis(log: Log, row: Sequence[Axes]) -> None:
         axes.set_xlim(0.0, recorded_end_s(log))
 
 
-def title_joints(row: Sequence[Axes]) -> None:
-    """Titles a row of panels, one per joint."""
-    for joint, axes in enumerate(row, 1):
-        axes.set_title(f"joint {joint}")
+def name_joints(log: Log) -> list[str]:
+    """Returns the titles of the joints: numbers, and names if all arms are chains with the same ones."""
+    arms = [log.scenario.arms[site] for site in log.sites]
+    most = max(arms, key=lambda arm: arm.counts.joints)
+    if most.chain is None or len({arm.joint_names for arm in arms}) > 1:
+        return [f"joint {n + 1}" for n in range(most.counts.joints)]
+    units = most.joint_units("rad")
+    titles = [f"{n}: {name}" for n, name in enumerate(most.joint_names, 1)]
+    return [title + " (m, N)" * (unit == "m") for title, unit in zip(titles, units, strict=True)]
+
+
+def title_joints(log: Log, row: Sequence[Axes]) -> None:
+    """Titles panels, one per joint."""
+    for title, axes in zip(name_joints(log), row, strict=True):
+        axes.set_title(title)
+
+
+def label_row(axes: Axes, text: str, form: FigureSize) -> None:
+    """Writes beside the first panel of a low row what the row shows."""
+    axes.set_ylabel("\n".join(textwrap.wrap(text, 12)), fontsize=form.tick_pt)
+
+
+class JointPanels(NamedTuple):
+    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and wide ones."""
+
+    joints: list[Axes]
+    columns: int
+    lowest: list[Axes]
+    wide: dict[str, Axes]
+
+
+def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
+    """Returns rows of places for a panel per joint: their numbers, and "." for a place that stays empty."""
+    choices = (2,) if narrow or joints == 2 else (3, 4)
+    columns = min(choices, key=lambda count: (-(-joints // count), -joints % count))
+    places = [str(n) if n < joints else "." for n in range(-(-joints // columns) * columns)]
+    return [places[first : first + columns] for first in range(0, len(places), columns)]
+
+
+def add_joint_panels(
+    figure: Figure, joints: int, form: FigureSize, above: Sequence[str] = (), below: Sequence[str] = ()
+) -> JointPanels:
+    """Returns a panel per joint, and wide ones above and below them by their names.
+
+    Two joints share their axis of values; of more, each has its own, since wrists bear less than shoulders.
+    """
+    grid = arrange_joints(joints, form.narrow)
+    columns = len(grid[0])
+    rows = [[name] * columns for name in above] + grid + [[name] * columns for name in below]
+    panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
+    made = [panels[str(n)] for n in range(joints)]
+    for upper, lower in zip(made, made[columns:], strict=False):
+        upper.sharex(lower)
+        upper.tick_params(labelbottom=False)
+    if joints == 2:
+        made[1].sharey(made[0])
+        made[1].tick_params(labelleft=False)
+    return JointPanels(made, columns, made[-columns:], {name: panels[name] for name in (*above, *below)})
 
 
 def typeset(text: str) -> str:
     """Returns a text of the terminal with the signs that type has."""
     return text.replace("+-", "±").replace("->", " → ")
+
+
+def typeset_unit(unit: str) -> str:
+    """Returns a unit with the signs that type has."""
+    return unit.replace("^2", "²")
+
+
+def typeset_symbol(parameter: str) -> str:
+    """Returns the name of a link's parameter with its index below: "mc_x", "Ixx"."""
+    stem, index = (parameter[:1], parameter[1:]) if parameter[0] == "I" else (parameter[:2], parameter[3:])
+    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
 def add_legend(figure: Figure, entries: LegendEntries) -> None:

@@ -23,12 +23,13 @@
     row.append(cell);
     const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
       "aria-label": arm.site });
-    element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
+    if (arm.links_m) element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
+    const shadow = element(svg, "polyline", { class: "shadow" });
     const desired = element(svg, "polyline", { class: "desired" });
     const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
-    const joints = [0, 1].map(() => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
+    const joints = Array.from({ length: arm.points || 2 }, () => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
     element(svg, "rect", { class: "base", x: -0.05, y: -0.05, width: 0.1, height: 0.1 });
-    return { arm, desired, actual, joints };
+    return { arm, shadow, desired, actual, joints };
   });
   const at = (table, time) => {
     const { t, columns } = tables[table];
@@ -48,16 +49,22 @@
     const [x, y] = [l1 * Math.cos(q1), -l1 * Math.sin(q1)];
     return [[x, y], [x + l2 * Math.cos(q1 + q2), y - l2 * Math.sin(q1 + q2)]];
   };
+  const places = (arm, q) => {  // of the arm's joints, of its reference's, and of the shadows of a chain
+    if (arm.links_m) return [bends(arm.links_m, q[0], q[1]), bends(arm.links_m, q[2], q[3]), []];
+    const point = (first, n) => [q[first + 2 * n], -q[first + 2 * n + 1]];
+    return [0, 1, 2].map((part) => Array.from({ length: arm.points }, (_, n) => point(2 * arm.points * part, n)));
+  };
   function show(time) {
     const now = Math.max(0, Math.min(page.end_s, time));
     slider.value = (1000 * now) / page.end_s;
     clock.textContent = `${now.toFixed(3)} s`;
-    for (const { arm, desired, actual, joints } of drawn) {
-      const q = at(arm.table, now) || [NaN, NaN, NaN, NaN];
-      const known = !Number.isNaN(q[0]);
-      const points = bends(arm.links_m, q[0], q[1]);
+    for (const { arm, shadow, desired, actual, joints } of drawn) {
+      const q = at(arm.table, now);
+      const known = q !== null;
+      const [points, reference, shadows] = known ? places(arm, q) : [[], [], []];
       actual.setAttribute("points", known ? `0,0 ${points.join(" ")}` : "");
-      desired.setAttribute("points", known ? `0,0 ${bends(arm.links_m, q[2], q[3]).join(" ")}` : "");
+      desired.setAttribute("points", known ? `0,0 ${reference.join(" ")}` : "");
+      shadow.setAttribute("points", shadows.length ? `0,0 ${shadows.join(" ")}` : "");
       joints.forEach((joint, n) => {
         joint.setAttribute("visibility", known ? "visible" : "hidden");
         if (known) { joint.setAttribute("cx", points[n][0]); joint.setAttribute("cy", points[n][1]); }

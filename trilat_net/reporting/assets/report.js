@@ -121,6 +121,8 @@
   const rungs = (u, index, min, max) => [-3, -2, -1, 0, 1, 2, 3, 4, 5, 6].flatMap((power) =>
     [1, 2, 5].map((step) => step * 10 ** power).filter((value) => value >= min && value <= max));
 
+  const tall = (box) => (box.closest(".small") ? 110 : 210);
+
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
     const lines = chart.lines || [];
@@ -134,7 +136,7 @@
     };
     const shared = order.length > 1 && !order.some((series) => series.dash);
     const options = {
-      width: box.clientWidth, height: 210, padding: [8, 10, 0, 0],
+      width: box.clientWidth, height: tall(box), padding: [8, 10, 0, 0],
       scales: { x: { time: false, range: (u, min, max) => (min == null ? zoom : [min, max]) }, y: { range, distr: chart.log ? 3 : 1 } },
       cursor: {
         drag: { x: true, y: false }, points: { size: 6 }, dataIdx: nearest,
@@ -246,7 +248,7 @@
   let pending = 0;
   addEventListener("resize", () => {
     clearTimeout(pending);
-    pending = setTimeout(() => plots.forEach((plot, n) => plot.setSize({ width: boxes[n].clientWidth, height: 210 })), 120);
+    pending = setTimeout(() => plots.forEach((plot, n) => plot.setSize({ width: boxes[n].clientWidth, height: tall(boxes[n]) })), 120);
   });
   darkQuery.addEventListener("change", build);
   addEventListener("beforeprint", () => { printing = true; build(); });

@@ -1,6 +1,7 @@
-"""Poses of the arms at a few instants: base, elbow and end effector, and the figure of them.
+"""Poses of the arms at a few instants: base, joints and end effector, and the figure of them.
 
-Invariant: forward kinematics are those of `core.arm`; the reference pose is dashed behind each arm.
+Invariant: forward kinematics are those of the core; the reference pose is dashed behind each arm. A chain is
+seen along parallel lines from one fixed direction, with up where gravity does not pull.
 """
 
 from collections.abc import Sequence
@@ -12,34 +13,80 @@ from matplotlib.figure import Figure
 
 from ...analysis import site_signals
 from ...analysis.timeline import recorded_end_s
+from ...core.chain import build_chain, place_end_effector, place_joints
+from ...core.site_setup import ChainSetup
 from ...core.two_link_arm import JOINTS, forward_kinematics
 from ...core.vectors import Array
 from ...log.log_reader import Log
-from ...scenario import Arm
+from ...scenario.arms import ArmModel
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 
 INSTANTS = 6
 _NARROW_INSTANTS = 3
 _PATH_POINTS = 400
+_AZIMUTH, _ELEVATION = np.deg2rad((-50.0, 22.0))
+"""Direction from which chains are seen: about the vertical from the base's x axis on, and above the floor."""
+_SHADOW: dict[str, Any] = {"color": "#c9c9c9", "linewidth": 1.6, "solid_capstyle": "round", "zorder": 1.0}
 _DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
 _BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
 
 
 class ArmPose(NamedTuple):
-    """A site at an instant: base, elbow and end effector, (3, 2), and the path of the last, (P, 2), m."""
+    """A site at an instant: its base, joints and end effector, (L, 2), and the path of the last, (P, 2), m.
+
+    `shadow` is what a light straight above would cast onto a floor at the base: that of a chain, (L, 2), or
+    nothing, (0, 2).
+    """
 
     actual: Array
     desired: Array
     path: Array
+    shadow: Array
 
 
-def joint_positions_m(arm: Arm, q: Array) -> Array:
-    """Returns base, elbow and end effector in the plane, shape (K, 3, 2), m, of angles (K, 2), rad."""
-    points = np.zeros((len(q), 1 + JOINTS, 2))
+def joint_positions_m(arm: ArmModel, q: Array) -> Array:
+    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K, L, 3)."""
+    if arm.chain is None:
+        points = np.zeros((len(q), 1 + JOINTS, 2))
+        for pose, angles in zip(points, q, strict=True):
+            pose[1:] = forward_kinematics(arm.lengths_m, angles)
+        return points
+    rows, tip_m = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
+    points = np.zeros((len(q), len(rows) + 2, 3))
     for pose, angles in zip(points, q, strict=True):
-        pose[1:] = forward_kinematics((arm.l1_m, arm.l2_m), angles)
+        place_joints(rows, np.ascontiguousarray(angles))
+        pose[-1] = place_end_effector(rows, tip_m)
+        at, turned = np.zeros(3), np.eye(3)
+        for n, row in enumerate(rows, 1):
+            at = at + turned @ row.p
+            pose[n], turned = at, row.R_base.copy()
     return points
+
+
+def _upright_axes(chain: ChainSetup) -> Array:
+    """Returns two directions of the floor and the one up, as rows in the base's frame, shape (3, 3)."""
+    down = np.array(chain.gravity_m_s2)
+    size = float(np.linalg.norm(down))
+    up = -down / size if size else np.array([0.0, 0.0, 1.0])
+    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along it
+    ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return np.array([ahead, np.cross(up, ahead), up])
+
+
+def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
+    """Returns points of an arm in the plane of a picture, shape (..., 2), m: a planar arm's are that already.
+
+    `onto_floor`: those of their shadows.
+    """
+    if arm.chain is None:
+        return points
+    x, y, z = np.moveaxis(points @ _upright_axes(arm.chain).T, -1, 0)
+    across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
+    towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
+    height = np.zeros_like(z) if onto_floor else z
+    return np.stack([across, height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)], axis=-1)
 
 
 def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
@@ -64,13 +111,16 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     """Returns the pose of a site at an instant: that of its last record until then; None without one."""
-    part, arm = log[site], log.scenario.sites[site].arm
+    part, arm = log[site], log.scenario.arms[site]
     last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
     if last < 0:
         return None
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
-    actual = joint_positions_m(arm, part.q[rows])
-    return ArmPose(actual[-1], joint_positions_m(arm, part.q_des[last : last + 1])[0], actual[:, 2])
+    found = joint_positions_m(arm, part.q[rows])
+    actual = project_arm_m(arm, found)
+    desired = project_arm_m(arm, joint_positions_m(arm, part.q_des[last : last + 1])[0])
+    shadow = project_arm_m(arm, found[-1 if arm.chain else len(found) :][:1], onto_floor=True)
+    return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2))
 
 
 def pose_box_m(poses: Sequence[ArmPose | None]) -> tuple[float, float, float, float]:
@@ -93,6 +143,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[fl
     count = _NARROW_INSTANTS if form.narrow else INSTANTS
     times = choose_instants_s(log, count) if instants is None else list(instants)
     drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
+    planar = all(arm.chain is None for arm in log.scenario.arms.values())
     left, right, bottom, top = pose_box_m([p for row in drawn.values() for p in row])
     side_in = (form.width_in - 0.6) / len(times)
     height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
@@ -101,11 +152,11 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[fl
         for site, row in zip(log.sites, grid, strict=True):
             for axes, one in zip(row, drawn[site], strict=True):
                 _arm(axes, one, style.site_colour(log, site))
-            row[0].set_ylabel(f"{site}: y (m)")
+            row[0].set_ylabel(f"{site}: y (m)" if planar else f"{site}: up (m)")
         for axes, t_s in zip(grid[0], times, strict=True):
             axes.set_title(f"t = {t_s:.4g} s")
         for axes in grid[-1]:
-            axes.set_xlabel("x (m)")
+            axes.set_xlabel("x (m)" if planar else "across (m)")
         grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
         sites = [
             (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0})
@@ -120,6 +171,8 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
     if drawn is None:
         style.annotate_empty_panel(axes, "no record")
         return
+    if len(drawn.shadow):
+        axes.plot(*drawn.shadow.T, **_SHADOW)
     axes.plot(*drawn.path.T, color=colour, linewidth=0.6, alpha=0.55)
     axes.plot(*drawn.desired.T, **_DESIRED)
     axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")

@@ -3,12 +3,12 @@
 Invariant: dominance factors follow from the scenario and the changes in the records, Eq. (6) and (7).
 """
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ...analysis.dominance_history import trace_dominance
 from ...analysis.site_signals import joint_angles
 from ...analysis.timeline import list_changes
-from ...core.two_link_arm import JOINTS
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
@@ -24,8 +24,10 @@ def sites_with_changing_dominance(log: Log) -> list[str]:
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the shares that change, and how far every arm is from where it started, rad."""
     owners = sites_with_changing_dominance(log)
-    rows = len(owners) + JOINTS
-    with time_figure(log, form, 0.8 + 1.05 * rows) as plot:
+    titles = style.name_joints(log)
+    rows = len(owners) + len(titles)
+    low = len(titles) > 2
+    with time_figure(log, form, 0.8 + (0.8 if low else 1.05) * rows) as plot:
         column = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
         for site, axes in zip(owners, column, strict=False):
             part, peers = log[site], log.scenario.peers(site)
@@ -34,11 +36,12 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 plot.trace(axes, site, share, **style.site_line(log, peer))
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
             plot.mark(axes, [site])
-        for joint, axes in enumerate(column[len(owners) :]):
-            for site in log.sites:
-                q0_rad = log.scenario.sites[site].q0_rad[joint]
-                plot.trace(axes, site, joint_angles(log[site])[:, joint] - q0_rad)
-            axes.set_ylabel(f"joint {joint + 1} (rad)")
+        for site in log.sites:
+            moved = joint_angles(log[site]) - np.array(log.scenario.sites[site].q0_rad)
+            for axes, values in zip(column[len(owners) :], moved.T, strict=False):
+                plot.trace(axes, site, values)
+        for title, axes in zip(titles, column[len(owners) :], strict=True):
+            style.label_row(axes, title, form) if low else axes.set_ylabel(f"{title} (rad)")
             plot.mark(axes, log.sites)
         plot.finish([column[-1]], style.site_legend_entries(log, log.sites))
     return plot.figure

@@ -6,7 +6,6 @@ those of `analysis.site_signals`.
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import product
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,7 +26,7 @@ from ...analysis.site_signals import (
     sites_with_operator,
     true_parameters,
 )
-from ...core.two_link_arm import JOINTS, PARAMETERS
+from ...core.chain import LINK_PARAMETERS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
@@ -35,11 +34,14 @@ from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 from .time_figure import SiteSignal, TimeFigure, site_records, time_figure
 
-THETA_UNITS = ("kg m²", "kg m²", "kg m²", "kg m", "kg m")
-"""Of the five parameters of Eq. (24)."""
-
+_ROW_IN = 1.2
+"""Height of a row of panels, where there are several."""
+_ACROSS = {"col": "row", "none": "none"}
+"""What shares an axis of values if rows and columns change places."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
 """Lower end of the axis of errors, rad."""
+_LEAST_RANGE = 1e-9
+"""Of an axis of estimates; less is rounding."""
 _LOOP_PT = 0.8
 """Width of a line that crosses itself."""
 _STEP = 0.01
@@ -66,11 +68,14 @@ def draw_operator_displacement(
 
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
-    largest = {site: np.abs(controller_torques(log[site])).max(initial=0.0) for site in log.sites}
-    limits = {site: float(np.max(log.scenario.sites[site].limits.tau_limit_nm)) for site in log.sites}
-    reached = sorted({limit for site, limit in limits.items() if largest[site] >= limit})
+    limits: dict[str, Array] = {}
+    for site in log.sites:
+        largest = np.abs(controller_torques(log[site])).max(axis=0, initial=0.0)
+        stated = np.broadcast_to(log.scenario.sites[site].limits.tau_limit_nm, largest.shape)
+        if (largest >= stated).any():
+            limits[site] = stated
     signal = site_records(log, controller_torques)
-    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", reached)
+    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", [*limits.values()])
 
 
 def _draw_joints(
@@ -79,53 +84,92 @@ def _draw_joints(
     sites: Sequence[str],
     signal: SiteSignal,
     label: str,
-    limits: Sequence[float] = (),
+    limits: Sequence[Array] = (),
 ) -> Figure:
     """Returns a signal over time: a panel per joint, a line per site, dashed ones at its limits."""
-    with time_figure(log, form, 2.2) as plot:
-        row = style.add_panels(plot.figure, 1, JOINTS, sharex=True, sharey=True)[0]
-        style.title_joints(row)
-        plot.joint_row(row, sites, signal, label)
-        for axes, limit in product(row, (sign * limit for limit in limits for sign in (1, -1))):
-            axes.axhline(limit, **style.LIMIT_LINE)
+    count = len(style.name_joints(log))
+    rows = len(style.arrange_joints(count, form.narrow))
+    with time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, count, form)
+        style.title_joints(log, panels.joints)
+        plot.joint_row(panels.joints, sites, signal)
+        for joint, axes in enumerate(panels.joints):
+            for limit in sorted({float(each[joint]) for each in limits if joint < len(each)}):
+                axes.axhline(limit, **style.LIMIT_LINE)
+                axes.axhline(-limit, **style.LIMIT_LINE)
+        for axes in panels.joints[:: panels.columns]:
+            axes.set_ylabel(label)
         entries = [("limit", style.LIMIT_LINE)] if limits else []
-        plot.finish(row, [*style.site_legend_entries(log, sites), *entries])
+        plot.finish(panels.lowest, [*style.site_legend_entries(log, sites), *entries])
     return plot.figure
+
+
+def _add_joint_rows(
+    plot: TimeFigure, form: FigureSize, heads: Sequence[str], labels: Sequence[str], sharey: str
+) -> tuple[list[list[Axes]], list[Axes]]:
+    """Returns panels per quantity and joint, and the lowest of them.
+
+    Two joints have columns beside each other, and a row per quantity, see `labels`; more have a row each,
+    and a column per quantity, see `heads`. `sharey` says which two joints share their axes of values.
+    """
+    titles = style.name_joints(plot.log)
+    if len(titles) == 2:
+        grid = style.add_panels(plot.figure, len(labels), 2, sharex=True, sharey=sharey)
+        style.title_joints(plot.log, grid[0])
+        for row, label in zip(grid, labels, strict=True):
+            row[0].set_ylabel(label)
+        return [[*row] for row in grid], [*grid[-1]]
+    grid = style.add_panels(plot.figure, len(titles), len(heads), sharex=True, sharey=_ACROSS[sharey])
+    for row, title in zip(grid, titles, strict=True):
+        style.label_row(row[0], title, form)
+    for axes, head in zip(grid[0], heads, strict=True):
+        axes.set_title(head)
+    return [[*column] for column in grid.T], [*grid[-1]]
 
 
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the torques ON the arms, N m, above the angles of all arms, rad: a column per joint."""
-    with time_figure(log, form, 2.9 if form.narrow else 3.4) as plot:
-        grid = style.add_panels(plot.figure, 2, JOINTS, sharex=True)
-        grid[0, 1].sharey(grid[0, 0])
-        grid[0, 1].tick_params(labelleft=False)
-        style.title_joints(grid[0])
-        torque, angle = "torque (N m)", "angle (rad)"
-        if not form.narrow:
-            torque, angle = "torque on the arm (N m)", "joint angle (rad)"
-        plot.joint_row(grid[0], sites_with_operator(log), site_records(log, external_torques), torque)
-        plot.joint_row(grid[1], log.sites, site_records(log, joint_angles), angle)
-        plot.finish(grid[1], style.site_legend_entries(log, log.sites))
+    """Returns the torques ON the arms, N m, above the angles of all arms, rad: a column per joint.
+
+    Arms of more joints have a row per joint, with both quantities beside each other.
+    """
+    heads = ("torque (N m)", "angle (rad)")
+    if not form.narrow:
+        heads = ("torque on the arm (N m)", "joint angle (rad)")
+    height_in = 2.9 if form.narrow else 3.4
+    with time_figure(log, form, _height_in(log, height_in)) as plot:
+        (upper, lower), lowest = _add_joint_rows(plot, form, heads, heads, "none")
+        if len(upper) == 2:
+            upper[1].sharey(upper[0])
+            upper[1].tick_params(labelleft=False)
+        plot.joint_row(upper, sites_with_operator(log), site_records(log, external_torques))
+        plot.joint_row(lower, log.sites, site_records(log, joint_angles))
+        plot.finish(lowest, style.site_legend_entries(log, log.sites))
     return plot.figure
+
+
+def _height_in(log: Log, of_two: float) -> float:
+    """Returns the height of a figure that has a row per joint if there are more than two."""
+    count = len(style.name_joints(log))
+    return of_two if count == 2 else 0.8 + 0.9 * count
 
 
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
-    label = "{}: q (rad)" if form.narrow else "angle of {} (rad)"
+    labels = [("{}: q (rad)" if form.narrow else "angle of {} (rad)").format(site) for site in log.sites]
+    heads = [f"{site}: q (rad)" for site in log.sites]
     entries = [(f"{style.site_title(log, s)}, actual", style.site_line(log, s, 1.6)) for s in log.sites]
-    with time_figure(log, form, 0.7 + (0.95 if form.narrow else 1.25) * len(log.sites)) as plot:
-        grid = style.add_panels(plot.figure, len(log.sites), JOINTS, sharex=True, sharey="col")
+    height_in = 0.7 + (0.95 if form.narrow else 1.25) * len(log.sites)
+    with time_figure(log, form, _height_in(log, height_in)) as plot:
+        grid, lowest = _add_joint_rows(plot, form, heads, labels, "col")
         for site, row in zip(log.sites, grid, strict=True):
             actual, desired = joint_angles(log[site]), reference_angles(log[site])
-            for joint, axes in enumerate(row):
+            for joint, axes in enumerate(row[: actual.shape[1]]):
                 plot.trace(axes, site, actual[:, joint], 1.6)
                 plot.trace(axes, site, desired[:, joint], **style.LIMIT_LINE)
                 plot.mark(axes, [site])
                 if not len(log[site]):
                     style.annotate_empty_panel(axes, f"no records of {site}")
-            row[0].set_ylabel(label.format(site))
-        style.title_joints(grid[0])
-        plot.finish(grid[-1], [*entries, ("desired", style.LIMIT_LINE)])
+        plot.finish(lowest, [*entries, ("desired", style.LIMIT_LINE)])
     return plot.figure
 
 
@@ -135,13 +179,15 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     The lowest panel shows, at every time, the largest error of any joint that is still to come: where it
     crosses the dashed line, the site has settled.
     """
-    with time_figure(log, form, 3.6) as plot:
-        panels = plot.figure.subplot_mosaic([["1", "2"], ["all", "all"]])
-        row, settling = [panels["1"], panels["2"]], panels["all"]
-        row[1].sharey(row[0])
-        row[1].tick_params(labelleft=False)
-        style.title_joints(row)
-        plot.joint_row(row, log.sites, site_records(log, joint_errors), "tracking error (rad)")
+    count = len(style.name_joints(log))
+    rows = len(style.arrange_joints(count, form.narrow))
+    with time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, count, form, below=["all"])
+        settling = panels.wide["all"]
+        style.title_joints(log, panels.joints)
+        plot.joint_row(panels.joints, log.sites, site_records(log, joint_errors))
+        for axes in panels.joints[:: panels.columns]:
+            axes.set_ylabel("tracking error (rad)")
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             remaining = largest_remaining_error(log[site])
@@ -152,7 +198,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         settling.set(yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel="largest error\nstill to come (rad)")
         plot.mark(settling, log.sites)
         limit = (f"settled: {SETTLED_ERROR_RAD:g} rad", style.LIMIT_LINE)
-        plot.finish([*row, settling], [*style.site_legend_entries(log, log.sites), limit])
+        plot.finish([*panels.lowest, settling], [*style.site_legend_entries(log, log.sites), limit])
     return plot.figure
 
 
@@ -189,18 +235,21 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def draw_parameter_estimates(
     log: Log, form: FigureSize = REPORT_SIZE, *, sites: Sequence[str] | None = None
 ) -> Figure:
-    """Returns the estimates of the five parameters over time with the true values; Fig. 6 of the paper.
+    """Returns the estimates of the parameters over time with the true values; Fig. 6 of the paper.
 
-    They are those of all sites unless `sites` are given; the paper shows master 1.
+    They are those of all sites unless `sites` are given; the paper shows master 1. A chain has a row per
+    link, two in a narrow figure.
     """
     chosen = log.sites if sites is None else tuple(sites)
+    if log.scenario.arms[chosen[0]].chain is not None:
+        return _draw_link_estimates(log, form, chosen)
     rows = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
     with time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
         panels = plot.figure.subplot_mosaic([[*row] for row in rows])
-        for index in range(PARAMETERS):
+        for index, (_, unit) in enumerate(log.scenario.arms[chosen[0]].parameters):
             axes = panels[str(index + 1)]
             _draw_estimate(plot, chosen, index, axes)
-            symbol = rf"$\theta_{index + 1}$ ({THETA_UNITS[index]})"
+            symbol = rf"$\theta_{index + 1}$ ({style.typeset_unit(unit)})"
             axes.set_ylabel(symbol if form.narrow else f"estimate of {symbol}")
             plot.mark(axes, chosen)
         entries = [*style.site_legend_entries(log, chosen), ("true value", style.LIMIT_LINE)]
@@ -208,11 +257,47 @@ def draw_parameter_estimates(
     return plot.figure
 
 
-def _draw_estimate(plot: TimeFigure, sites: Sequence[str], index: int, axes: Axes) -> None:
+def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Figure:
+    """Returns the estimates of chains: a panel per parameter, with its smallest and largest number."""
+    arm = max((log.scenario.arms[site] for site in sites), key=lambda each: each.counts.joints)
+    columns = LINK_PARAMETERS // (2 if form.narrow else 1)
+    rows = len(arm.theta) // columns
+    with time_figure(log, form, 0.8 + 0.74 * rows) as plot:
+        grid = style.add_panels(plot.figure, rows, columns, sharex=True)
+        panels: list[Axes] = [*grid.flat]
+        for index, (axes, (name, unit)) in enumerate(zip(panels, arm.parameters, strict=True)):
+            known = [s for s in sites if index < len(log.scenario.arms[s].theta)]
+            _draw_estimate(plot, known, index, axes, 0.9)
+            plot.mark(axes, sites, numbered=False)
+            link, _, symbol = name.rpartition(".")
+            axes.set_title(
+                f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})", fontsize=5.5, pad=2.0
+            )
+            axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
+            axes.locator_params(axis="y", nbins=2)
+            if np.ptp(axes.get_ylim()) < _LEAST_RANGE:
+                axes.set_ylim(-0.05, 0.05)
+            if form.narrow:  # no room for numbers beside the panels
+                axes.margins(y=0.25)
+                axes.tick_params(axis="y", pad=-2.0)
+                for number in axes.get_yticklabels():
+                    number.set(ha="left", va="bottom")
+            if not index % LINK_PARAMETERS:
+                style.label_row(axes, f"{1 + index // LINK_PARAMETERS}: {link}", form)
+        entries = [*style.site_legend_entries(log, sites), ("true value", style.LIMIT_LINE)]
+        plot.finish([*grid[-1]], entries)
+        for axes in grid[-1]:
+            axes.set_xlabel("t (s)", fontsize=5.5, labelpad=1.0)
+    return plot.figure
+
+
+def _draw_estimate(
+    plot: TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
+) -> None:
     """Draws the estimates of one parameter, and its true value once if all sites share it."""
     truths = {site: float(true_parameters(plot.log, site)[index]) for site in sites}
     for site in sites:
-        plot.trace(axes, site, parameter_estimates(plot.log[site])[:, index])
+        plot.trace(axes, site, parameter_estimates(plot.log[site])[:, index], width)
     if len(set(truths.values())) == 1:
         axes.axhline(truths[sites[0]], **style.LIMIT_LINE)
         return
@@ -225,23 +310,27 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A ring marks the start of a site, a disc its end.
     """
-    with style.styled_figure(form, 1.0 + 0.36 * form.width_in) as figure:
-        row = style.add_panels(figure, 1, JOINTS)[0]
+    places = style.arrange_joints(len(style.name_joints(log)), form.narrow)
+    height_in = 0.72 * form.width_in / len(places[0])
+    with style.styled_figure(form, 1.0 + len(places) * height_in) as figure:
+        panels = figure.subplot_mosaic([[*row] for row in places])
+        row = [axes for name, axes in panels.items() if name != "."]
         for site in log.sites:
             part, line = log[site], style.site_line(log, site, _LOOP_PT)
             e, ed = joint_errors(part), joint_error_rates(part)
-            for joint, axes in enumerate(row if len(part) else ()):
+            for joint, axes in enumerate(row[: e.shape[1]] if len(part) else ()):
                 path = thin_path(np.stack([e[:, joint], ed[:, joint]], axis=1))
                 axes.plot(*path.T, **line)
                 ends = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": line["color"]}
                 axes.plot(*path[0], **{**ends, "markerfacecolor": "white"}, zorder=3)
                 axes.plot(*path[-1], **ends, zorder=3)
-        style.title_joints(row)
+        style.title_joints(log, row)
         for axes in row:
             axes.set_xlabel("error (rad)")
             if form.narrow:
                 axes.locator_params(axis="x", nbins=3)
-        row[0].set_ylabel("its rate (rad/s)")
+        for axes in row[:: len(places[0])]:
+            axes.set_ylabel("its rate (rad/s)")
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
 

@@ -67,15 +67,14 @@ class TimeFigure:
         line = {**style.site_line(self.log, site, width), **options}
         style.plot_decimated(axes, part.tick, part.t_s, values, **line)
 
-    def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal, label: str) -> None:
+    def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
         """Draws a signal of sites: a panel per joint, a line per site, markers."""
         for site in sites:
             tick, t_s, values = signal(site)
-            for joint, axes in enumerate(row):
-                style.plot_decimated(axes, tick, t_s, values[:, joint], **style.site_line(self.log, site))
+            for axes, one in zip(row, values.T, strict=False):
+                style.plot_decimated(axes, tick, t_s, one, **style.site_line(self.log, site))
         for axes in row:
             self.mark(axes, sites)
-        row[0].set_ylabel(label)
 
     def mark(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
         """Marks a panel: shaded in the color of a site while it does not follow its peers, lines at changes.

@@ -1,0 +1,125 @@
+"""Reports of arms of six joints: where pictures put the joints, names and units, panels and the page."""
+
+import json
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.core.chain_references import chain_references
+from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.log.log_reader import Log
+from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
+from trilat_net.reporting import arm_svg, charts
+from trilat_net.reporting.figure_size import REPORT_SIZE, make_print_size
+from trilat_net.reporting.figures import arm_poses, joint_motion
+from trilat_net.reporting.style import arrange_joints
+from trilat_net.scenario import parse_scenario
+
+SIX = """
+name = "six"
+rate_hz = 200
+duration_s = 1.0
+[arm]
+urdf = "arm6.urdf"
+armature_kg_m2 = 0.2
+[control]
+law = "adaptive"
+Lambda = 1.0
+Kp = 10.0
+Kd = 2.0
+Gamma = 1.0
+[link]
+delay_ms = 40.0
+[sites.m]
+q0_rad = [0.3, -1.0, 1.2, -0.6, 0.5, 0.2]
+[sites.s]
+role = "slave"
+q0_rad = [0.0, -1.1, 1.0, -0.4, 0.3, 0.1]
+[dominance]
+m = { s = 1.0 }
+s = { m = 1.0 }
+"""
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+
+
+@cache
+def six() -> Log:
+    return simulate_scenario(parse_scenario(SIX, "six.toml"))
+
+
+def test_the_end_of_a_chain_is_where_pinocchio_has_it_and_links_keep_their_lengths():
+    arm = six().scenario.arms["m"]
+    states = chain_references()["arm6"].states
+    points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
+    assert points[:, -1] == pytest.approx(np.array([state.tip_position for state in states]), abs=1e-12)
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    assert lengths == pytest.approx(np.tile(lengths[0], (len(states), 1)), abs=1e-12)
+    assert not points[:, 0].any()
+
+
+def test_pictures_of_a_chain_have_up_on_top_and_shadows_below():
+    arm = six().scenario.arms["m"]
+    origin, above, aside = arm_poses.project_arm_m(arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]]))
+    assert not origin.any()
+    assert above[0] == pytest.approx(0.0)
+    assert 0.8 < above[1] < 1.0
+    shadow = arm_poses.project_arm_m(arm, np.array([0.3, 0.2, 0.9]), onto_floor=True)
+    assert shadow == pytest.approx(aside)
+
+
+def test_panels_of_joints_fill_their_rows():
+    assert arrange_joints(2, narrow=False) == [["0", "1"]]
+    assert [len(row) for row in arrange_joints(6, narrow=False)] == [3, 3]
+    assert arrange_joints(7, narrow=False) == [["0", "1", "2", "3"], ["4", "5", "6", "."]]
+    assert len(arrange_joints(7, narrow=True)) == 4
+
+
+@pytest.mark.parametrize("form", [REPORT_SIZE, make_print_size(3.5)], ids=["report", "narrow"])
+@pytest.mark.parametrize(
+    ("draw", "panels"),
+    [
+        (joint_motion.draw_positions, 12),
+        (joint_motion.draw_tracking_errors, 7),
+        (joint_motion.draw_control_torques, 6),
+        (joint_motion.draw_parameter_estimates, 60),
+        (joint_motion.draw_phase_portrait, 6),
+        (arm_poses.draw_arms, None),
+    ],
+)
+def test_every_joint_has_its_panel(form, draw, panels):
+    figure = draw(six(), form)
+    assert panels in (None, len(figure.axes))
+    words = " ".join(axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes)
+    if panels in (6, 7):
+        assert all(f"{n}: {name}" in words for n, name in enumerate(JOINTS, 1))
+
+
+def test_columns_and_messages_name_joints_and_links():
+    table = six().table("m")
+    assert table["q3_rad"].meaning.endswith("joint 3, elbow")
+    inertia = table["theta_hat3_Izz_kg_m2"]
+    assert (inertia.unit, inertia.source) == ("kg m^2", "theta_hat[29]")
+    assert (inertia.values == six()["m"].theta_hat[:, 29]).all()
+    assert table["theta_hat1_m_kg"].unit == "kg"
+    channels = Ros2SiteChannels(six().scenario, "m")
+    assert channels.joints == JOINTS
+    names = channels.arrays["theta_hat"].channel.about["names"].split(" ")
+    assert (len(names), names[0], names[29]) == (60, "shoulder.m", "forearm.Izz")
+
+
+def test_the_page_draws_chains_from_their_joints():
+    log = six()
+    bounds = charts.workspace_box_m(log)
+    data = charts.Charts(log, None, bounds).data()
+    assert [arm["points"] for arm in data["arms"]] == [7, 7]
+    table = data["tables"][data["arms"][0]["table"]]
+    assert len(table["columns"]) == 3 * 7 * 2
+    titles = [chart["title"] for chart in data["charts"] if chart["section"] == "estimates"]
+    assert titles[29] == "forearm.Izz"
+    svg = arm_svg.render_arms_svg(log, bounds, charts.picture_scale(log, bounds))
+    box = [float(x) for x in re.search(r'viewBox="([^"]*)"', svg).group(1).split()]
+    assert max(box[2:]) == pytest.approx(charts.PICTURE_SIDE, abs=2e-3)
+    assert svg.count('class="shadow"') == svg.count('class="desired"') > 4
+    assert len(json.dumps(data)) < 3_000_000
