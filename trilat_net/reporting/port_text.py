@@ -9,11 +9,12 @@ import math
 import numpy as np
 
 from ..theory.frequency_search import FrequencyBand
-from ..theory.port_analysis import PortAnalysis
+from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
 from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
 
 _SHOWN_BANDS = 3
+_JOINTS_BY_LINE = 2
 WEIGHTS_ALIKE = 1e-9
 
 
@@ -89,13 +90,22 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     holding = len(ports.two_ports) - len(failing)
     third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""
     every = f"every pair and joint{third}" if not failing else "the others"
+    groups: dict[tuple[object, ...], list[TwoPort]] = {}
+    for one in failing:  # of arms of many joints those of one pair share a line
+        joint = one.joint if len(ports.joints) <= _JOINTS_BY_LINE else ""
+        groups.setdefault((one.sites, one.clamped, joint), []).append(one)
     lines = []
-    for one in failing:
-        which = (
-            f"{' and '.join(one.sites)}{f', {one.clamped} clamped' if one.clamped else ''}, joint {one.joint}"
+    for group in groups.values():
+        worst = min(group, key=lambda one: one.minima.least)
+        sites, _, clamped, minima = worst
+        joints, bands = (
+            ", ".join(str(one.joint) for one in group),
+            [b for one in group for b in one.minima.below],
         )
-        least = f"least {one.minima.least:.3g} at {one.minima.least_hz:.3g} Hz"
-        lines.append(f"{which}: fails {_list_bands(one.minima.below)}; {least}")
+        within = f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
+        which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, joint {joints}"
+        least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+        lines.append(f"{which}: fails {_list_bands(minima.below) if len(group) == 1 else within}; {least}")
     return [*lines, *([f"{every}: holds ({holding} two-ports)"] if holding else [])]
 
 
