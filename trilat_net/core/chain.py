@@ -21,7 +21,7 @@ Robotics Research 10 (1991), for the recursion of the adaptive law.
 from collections.abc import Sequence
 from functools import cache
 from math import sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class ChainJoint(NamedTuple):
 
 _DRIVE = ("armature_kg_m2", "viscous", "coulomb", "lower", "upper", "stop_stiffness", "stop_damping")
 _MOTIONS = ("V_lin", "V_ang", "W_lin", "W_ang", "A_lin", "A_ang", "f_lin", "f_ang")
-_TIP = ("J_lin", "J_ang")
+_TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 
 @cache
@@ -100,14 +100,15 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
     row: Row
     for row, joint in zip(rows, joints, strict=True):
         x, y, z = joint.axis
-        across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        turned = np.asarray(joint.rotation, dtype=np.float64)
+        across = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+        turned = joint.rotation
         row.prismatic, row.axis, row.origin = int(joint.prismatic), joint.axis, joint.origin_m
         row.at_rest = turned
         if joint.prismatic:
-            row.slide = turned @ np.array(joint.axis)
+            row.slide = apply(turned, joint.axis)
         else:
-            row.by_sine, row.by_cosine = turned @ across, turned @ across @ across
+            row.by_sine = by_sine = multiply(turned, across)
+            row.by_cosine = multiply(by_sine, across)
         for name in _DRIVE:
             row[name] = getattr(joint, name)
     return rows
@@ -144,6 +145,12 @@ def add(a: Three, b: Three) -> Three:
 
 
 @leaf
+def subtract(a: Three, b: Three) -> Three:
+    """Returns a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@leaf
 def scale(factor: float, a: Three) -> Three:
     """Returns a number times a vector."""
     return factor * a[0], factor * a[1], factor * a[2]
@@ -167,6 +174,23 @@ def rotate_back(R: Array, a: Three) -> Three:
         R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
         R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
     )
+
+
+def apply(a: Matrix, b: Three) -> Three:
+    """Returns a b by sums in a fixed order."""
+    x, y, z = a
+    return (
+        x[0] * b[0] + x[1] * b[1] + x[2] * b[2],
+        y[0] * b[0] + y[1] * b[1] + y[2] * b[2],
+        z[0] * b[0] + z[1] * b[1] + z[2] * b[2],
+    )
+
+
+def multiply(a: Matrix, b: Matrix) -> Matrix:
+    """Returns a b by sums in a fixed order; those of a library may differ in the last bit."""
+    columns = tuple(zip(*b, strict=True))
+    rows: Any = tuple(tuple(x * u + y * v + z * w for u, v, w in columns) for x, y, z in a)
+    return rows  # type: ignore[no-any-return]
 
 
 @leaf
@@ -464,8 +488,8 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
     """Returns the end effector's place, and writes Jacobian and orientations into the rows, all in base axes.
 
     Args:
-        chain: the chain's rows, after `place_joints`; written: J_lin, m/rad or 1, J_ang, 1 or 0, and R_base,
-            the orientation of every link.
+        chain: the chain's rows, after `place_joints`; written: J_lin, m/rad or 1, J_ang, 1 or 0, and of
+            every link its orientation R_base, its joint's place p_base and axis axis_base.
         tip: the end effector in the last link's frame, m, shape (3,).
     """
     n = chain.shape[0]
@@ -483,14 +507,15 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
             for k in range(3):
                 column = rotate(before, (R[0, k], R[1, k], R[2, k]))
                 R_base[0, k], R_base[1, k], R_base[2, k] = column
-        put_three(row.J_ang, rotate(R_base, three(row.axis)))
-        put_three(row.J_lin, place)  # the joint's own place, until the tip's is known
+        put_three(row.axis_base, rotate(R_base, three(row.axis)))
+        put_three(row.p_base, place)
     place = add(place, rotate(chain[n - 1].R_base, three(tip)))
     for i in range(n):
         row = chain[i]
-        axis = three(row.J_ang)
+        axis = three(row.axis_base)
         if row.prismatic == 0:
-            put_three(row.J_lin, cross(axis, add(place, scale(-1.0, three(row.J_lin)))))
+            put_three(row.J_lin, cross(axis, subtract(place, three(row.p_base))))
+            put_three(row.J_ang, axis)
         else:
             put_three(row.J_lin, axis)
             put_three(row.J_ang, (0.0, 0.0, 0.0))

@@ -17,24 +17,45 @@ from .control import limit_torque
 from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
 from .jit import leaf
 from .site_setup import Law
+from .task_space import (
+    add_task_torque,
+    update_pose,
+    update_task_errors,
+    update_wrench,
+)
 from .vectors import Array, Row, RowArray, Vector
 
 _ADAPTIVE = int(Law.ADAPTIVE)
 
 
 @leaf
+def place_arm(s: Row, chain: RowArray) -> None:
+    """Places the joints, and in task space the end effector."""
+    place_joints(chain, s.q)
+    if s.task:
+        update_pose(s, chain)
+
+
+@leaf
 def update_errors(s: Row, chain: RowArray) -> None:
     """Writes e, ed, r, the reference velocity and acceleration v and a, and Y' r."""
-    for i in range(chain.shape[0]):
+    if s.task:
+        update_task_errors(s)
+    else:
+        _update_joint_errors(s, chain.shape[0])
+    if s.law == _ADAPTIVE:
+        propagate_motion(chain, s.gravity, s.qd, s.v, s.a)
+        parameter_gradient(chain, s.Yr)
+
+
+@leaf
+def _update_joint_errors(s: Row, joints: int) -> None:
+    for i in range(joints):
         s.e[i] = s.q[i] - s.q_des[i]
         s.ed[i] = s.qd[i] - s.qd_des[i]
         s.v[i] = -s.Lambda[i] * s.e[i]
         s.a[i] = -s.Lambda[i] * s.ed[i]
         s.r[i] = s.qd[i] - s.v[i]
-    place_joints(chain, s.q)
-    if s.law == _ADAPTIVE:
-        propagate_motion(chain, s.gravity, s.qd, s.v, s.a)
-        parameter_gradient(chain, s.Yr)
 
 
 @leaf
@@ -52,12 +73,21 @@ def update_torque(s: Row, chain: RowArray) -> None:
         inverse_dynamics(chain, s.theta_hat, s.v, s.a, s.tau)
     else:
         _put_gravity(s, chain, s.known, s.tau)
+    if s.task:
+        add_task_torque(s, s.Kd, s.ed, -1.0, s.tau)
+        if s.law != _ADAPTIVE:
+            add_task_torque(s, s.K, s.e, -1.0, s.tau)
+            add_task_torque(s, s.k_f, s.felt, 1.0, s.tau)
     for i in range(chain.shape[0]):
-        torque = s.tau[i] - s.Kd[i] * s.ed[i]
+        torque: float = s.tau[i]
+        if not s.task:
+            torque -= s.Kd[i] * s.ed[i]
+            if s.law != _ADAPTIVE:
+                torque += s.k_f[i] * s.felt[i] - s.K[i] * s.e[i]
         if s.law == _ADAPTIVE:
             torque -= s.Kp[i] * s.r[i]
         else:
-            torque += s.k_f[i] * s.felt[i] - s.K[i] * s.e[i] - s.d[i] * s.qd[i]
+            torque -= s.d[i] * s.qd[i]
         s.tau[i] = limit_torque(torque, s.tau_limit[i])
 
 
@@ -103,6 +133,8 @@ def update_external_torque(
     s.wall_n = max(held_n, now_n)
     for i in range(chain.shape[0]):
         s.on_arm[i] += s.held[i]
+    if s.task:
+        update_wrench(s)
 
 
 @leaf

@@ -156,7 +156,8 @@ def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
     if stale and (site.mode == _RUN or site.mode == _RETURN):
         braking = site.on_stale == _ACT_BRAKE
         for i in range(site.q_held.shape[0]):
-            site.q_held[i] = site.q[i] if braking else site.q_followed[i]
+            here = site.x[i] if site.task else site.q[i]
+            site.q_held[i] = here if braking else site.q_followed[i]
         site.mode = _BRAKE if braking else _HOLD
         site.return_from_ns = 0
     elif not stale and (site.mode == _HOLD or site.mode == _BRAKE):
@@ -192,4 +193,3 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
             qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
             felt -= link.alpha * link.tau_x[i]
         site.q_des[i], site.qd_des[i], site.felt[i] = q_des, qd_des, felt
-    update_stale_mode(t_ns, site, links)

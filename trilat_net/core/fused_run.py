@@ -74,13 +74,16 @@ def _receive(
 ) -> int:
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
     n, m = peer.joints, peer.shared
-    tau_x = 3 * n + 2 * m
+    q, qd, tau_x = 0, n, 3 * n + 2 * m
+    if peer.task:
+        q = 4 * n + 2 * m + peer.parameters
+        qd, tau_x = q + m, q + 2 * m
     while next_sample < made:
         record: Row = sent[next_sample & (sent.shape[0] - 1)]
         if record.t_ns >= t_ns:
             break
         row = record.row
-        accept_sample(k, rate_hz, next_sample, row, row[n:], row[tau_x:], link)
+        accept_sample(k, rate_hz, next_sample, row[q:], row[qd:], row[tau_x:], link)
         next_sample += 1
     return next_sample
 
@@ -92,12 +95,13 @@ def _update_peaks(
     """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
     error = 0.0
     bucket, joints = progress.bucket, peaks.shape[1] // 3
-    for i in range(s.joints):
-        e = row[i] - row[2 * s.joints + i]
+    for i in range(s.shared):
+        e = s.e[i] if s.task else row[i] - row[2 * s.joints + i]
         sums.errors[i] += e * e
         apart = abs(e)
         error = max(error, apart)
         peaks[bucket, i] = max(peaks[bucket, i], apart)
+    for i in range(s.joints):
         peaks[bucket, joints + i] = max(peaks[bucket, joints + i], abs(row[s.joints + i]))
         peaks[bucket, 2 * joints + i] = row[i]
     if error >= apart_rad:

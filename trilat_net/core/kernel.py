@@ -8,18 +8,29 @@ stages evaluates operators and environments, and what is held over the period is
 from math import isfinite
 
 from . import chain_stages, control, two_link_stages
-from .dominance import update_reference
+from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import LinkArrays, accept_sample, recall_sample, release_tick
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme
+from .task_space import POSE, update_orientation_reference
 from .ticks import Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector
 
 _DIVERGED = int(Mode.DIVERGED)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
+
+
+@leaf
+def _place_arm(s: Row, chain: RowArray | None, links: RowArray, refers: bool) -> None:
+    """Places the joints of a chain; if it refers to its peers anew, the orientation of its reference too."""
+    if chain is None:
+        return
+    chain_stages.place_arm(s, chain)
+    if refers and s.task and s.shared == POSE:
+        update_orientation_reference(s, links)
 
 
 @leaf
@@ -79,7 +90,14 @@ def _write_record(s: Row, row: Array) -> None:
     at += 2 * n
     for p in range(P):
         row[at + p] = s.theta_hat[p]
-    for i in range(at + P):
+    at += P
+    if s.task:
+        for i in range(m):
+            row[at + i] = s.x[i]
+            row[at + m + i] = s.xd[i]
+            row[at + 2 * m + i] = s.wrench[i]
+        at += 3 * m
+    for i in range(at):
         if not isfinite(row[i]):
             row[i] = 0.0
             s.mode = _DIVERGED
@@ -160,6 +178,8 @@ def reference_stages(
     """Stages 3 to 5 of a tick, with the samples that it releases in use."""
     s: Row = site[0]
     update_reference(t_ns, s, links, ramps)  # 3 reference
+    _place_arm(s, chain, links, True)
+    update_stale_mode(t_ns, s, links)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
 
@@ -230,6 +250,7 @@ def resume_stages(k: int, arrays: SiteArrays) -> None:
     """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
     s: Row = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
+    _place_arm(s, arrays.chain, arrays.links, False)
     _update_errors(s, arrays.chain)
     _update_external_torque(t_ns * 1e-9, s, arrays.chain, arrays.actors, arrays.table)
     if s.mode != _DIVERGED:

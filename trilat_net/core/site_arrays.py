@@ -23,7 +23,7 @@ from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
 _SETTINGS = ("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns")
-_COUNTS = ("joints", "shared", "parameters")
+_COUNTS = ("joints", "shared", "parameters", "task")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = ("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "r", "u")
@@ -31,7 +31,19 @@ _PER_COORDINATE = (
     *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),
 )
 _PER_PARAMETER = ("theta", "known", "Gamma", "low", "high", "theta_hat", "Yr", "Yr_before")
-_OF_CHAIN = ("v", "a", "zeros", "stage_q", "stage_qd", "stage_qdd", "stage_torque", "sum_qd", "sum_qdd")
+_OF_TASK = ("x", "xd", "wrench", "axes", "b", "y")
+_OF_CHAIN = (
+    "posture",
+    "v",
+    "a",
+    "zeros",
+    "stage_q",
+    "stage_qd",
+    "stage_qdd",
+    "stage_torque",
+    "sum_qd",
+    "sum_qdd",
+)
 
 
 @cache
@@ -43,11 +55,15 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
         (_PER_JOINT, layout.joints),
         (_PER_COORDINATE, layout.shared),
         (_PER_PARAMETER, layout.parameters),
+        (_OF_TASK, layout.shared),
     ):
         fields += [(name, "f8", (count,)) for name in names]
     if layout.chain:
         fields += [(name, "f8", (layout.joints,)) for name in _OF_CHAIN]
         fields += [("gravity", "f8", (3,)), ("tip", "f8", (3,))]
+        fields += [(name, "f8") for name in ("scale", "posture_rate", "singular_value")]
+        fields += [(name, "f8", (layout.shared, layout.joints)) for name in ("J", "Jd")]
+        fields += [("A", "f8", (layout.shared, layout.shared)), ("tip_back", "f8", (3, 3))]
     fields.append(("Y", "f8", (JOINTS, PARAMETERS)))  # the leaves of the planar arm are compiled for any
     return np.dtype((np.record, fields))
 
@@ -213,19 +229,30 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     s: Row = site[0]
     gains, rule, own = setup.gains, setup.on_stale, setup.layout
     s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
-    s.joints, s.shared, s.parameters = own.joints, own.shared, own.parameters
+    s.joints, s.shared, s.parameters, s.task = own.joints, own.shared, own.parameters, own.task
     s.external, s.ramps = int(setup.external), 1
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
     if setup.chain is None:
         s.g, s.lengths = setup.g_m_s2, setup.lengths_m
     else:
         s.gravity, s.tip = setup.chain.gravity_m_s2, setup.chain.tip_m
+        s.tip_back = np.transpose(setup.chain.tip_rotation)
+    if setup.chain is not None and setup.chain.task is not None:
+        task = setup.chain.task
+        s.scale, s.posture_rate, s.singular_value = task.scale, task.posture_rate, task.singular_value
+        s.axes[: own.shared] = task.axes
+        s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
     vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
     vectors |= {"q": setup.q0, "qd": setup.qd0}
     vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
+    lengths = {
+        **dict.fromkeys(_PER_JOINT, own.joints),
+        **dict.fromkeys(_PER_COORDINATE, own.shared),
+        **dict.fromkeys(_PER_PARAMETER, own.parameters),
+    }
     for name, value in vectors.items():
-        s[name][: own.parameters if name in _PER_PARAMETER else own.joints] = value
+        s[name][: lengths[name]] = value
     return site
 
 

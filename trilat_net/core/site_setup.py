@@ -8,7 +8,7 @@ from enum import IntEnum
 from itertools import accumulate
 from typing import NamedTuple
 
-from .chain import LINK_PARAMETERS, ChainJoint, Three
+from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
 from .exogenous import TorqueSource
 from .ticks import DominanceRamp
@@ -74,7 +74,7 @@ class LinkSetup(NamedTuple):
         peer: the peer's name.
         alpha: its dominance factor in this site's reference, Eq. (6), dimensionless.
         rate_hz: the peer's tick rate, Hz.
-        q0: the peer's start pose, rad, in use until its first sample is due (L7).
+        q0: the peer's start pose, rad, or its end effector's, in use until its first sample is due (L7).
         key: the key of the link's draws, see `link_key`.
         models: in the order of their first stamps; the first applies from stamp 0.
         traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
@@ -99,12 +99,14 @@ class Layout(NamedTuple):
         shared: one per coordinate that sites exchange.
         parameters: one per dynamic parameter of the arm.
         chain: true: the arm is a chain of joints, else the planar two-link arm.
+        task: true: the coordinates are those of the end effector, else the joint angles.
     """
 
     joints: int = JOINTS
     shared: int = JOINTS
     parameters: int = PARAMETERS
     chain: bool = False
+    task: bool = False
 
     @classmethod
     def of_arm(cls, chain: "ChainSetup | None") -> "Layout":
@@ -112,13 +114,16 @@ class Layout(NamedTuple):
         if chain is None:
             return cls()
         n = len(chain.joints)
-        return cls(n, n, LINK_PARAMETERS * n, True)
+        task = chain.task
+        shared = n if task is None else len(task.axes)
+        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None)
 
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
         n, m = self.joints, self.shared
         vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
-        return {**vectors, "theta_hat": self.parameters}
+        shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
+        return {**vectors, "theta_hat": self.parameters, **shared}
 
     def columns(self) -> dict[str, slice]:
         """Returns where the vectors of a record stand in its row of floats, in their order."""
@@ -131,7 +136,25 @@ class Layout(NamedTuple):
     @property
     def floats(self) -> int:
         """Length of a record's row of floats."""
-        return 4 * self.joints + 2 * self.shared + self.parameters
+        return 4 * self.joints + (5 if self.task else 2) * self.shared + self.parameters
+
+
+class TaskSetup(NamedTuple):
+    """How a site follows with its end effector.
+
+    Attributes:
+        axes: per coordinate 1: the site follows along it, 0: not. Three of them: a place; six: a pose.
+        scale: metres of the task per metre of this arm.
+        posture: joint angles that it moves towards as far as the task leaves it free, rad.
+        posture_rate: by how much of the way in a second, 1/s.
+        singular_value: least singular value of the Jacobian that needs no damping, m/rad.
+    """
+
+    axes: tuple[float, ...]
+    scale: float = 1.0
+    posture: tuple[float, ...] = ()
+    posture_rate: float = 0.0
+    singular_value: float = 0.05
 
 
 class ChainSetup(NamedTuple):
@@ -141,11 +164,15 @@ class ChainSetup(NamedTuple):
         joints: its joints, from the base on.
         gravity_m_s2: gravitational acceleration in the base's frame.
         tip_m: the end effector in the last link's frame.
+        tip_rotation: its orientation there.
+        task: how it follows with its end effector; None: it follows joint by joint.
     """
 
     joints: tuple[ChainJoint, ...]
     gravity_m_s2: Three = (0.0, 0.0, -9.81)
     tip_m: Three = (0.0, 0.0, 0.0)
+    tip_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    task: TaskSetup | None = None
 
 
 class Gains(NamedTuple):

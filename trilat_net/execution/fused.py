@@ -81,7 +81,7 @@ class FusedRun:
         setups = [scenario.setup(name) for name in scenario.names]
         self._tables = stack_site_arrays(setups)
         self._layouts = [setup.layout for setup in setups]
-        joints = max(layout.joints for layout in self._layouts)
+        joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         count = len(scenario.names)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]

@@ -7,26 +7,33 @@ compute with the same leaves; the planar arm is then written as a chain of two j
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
 from ..core.chain import (
     ChainJoint,
+    apply,
     build_chain,
     mass_matrix,
+    multiply,
     place_end_effector,
     place_joints,
 )
-from ..core.site_setup import ChainSetup
+from ..core.chain import (
+    Three as Vector3,
+)
+from ..core.rotation import rotation_matrix, turn_between
+from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, Vector
 from ..errors import ScenarioError
-from .fields import Frozen, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts, field_names
+from .fields import Frozen, Joints, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts, field_names
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
 Three = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
+TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
 STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
 STOP_EFFORT_NM = 100.0
@@ -55,6 +62,8 @@ class Arm(Frozen, frozen=True):
         known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
             formula. Only for an arm outside of the program.
         urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": it is the planar arm.
+        base_xyz_m: place of the base in the frame that the sites share; walls and operators are there too.
+        base_rpy_rad: its orientation there: about the fixed axes x, y, z, in this order.
         base: its base link; "": the root of the file.
         tip: its end link; "": the only one that nothing hangs on.
         down: direction of gravity in the base's frame; its length does not matter.
@@ -76,6 +85,8 @@ class Arm(Frozen, frozen=True):
     g_m_s2: NotNegative = 9.81
     known: bool = True
     urdf: str = ""
+    base_xyz_m: Three = (0.0, 0.0, 0.0)
+    base_rpy_rad: Three = (0.0, 0.0, 0.0)
     base: str = ""
     tip: str = ""
     down: Three = (0.0, 0.0, -1.0)
@@ -98,6 +109,41 @@ class Arm(Frozen, frozen=True):
 
 CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 """The keys of an arm that only a chain has."""
+
+
+class Task(Frozen, frozen=True, omit_defaults=True):
+    """What sites agree on: their joint angles, or their end effectors' places or poses.
+
+    Attributes:
+        space: "joints": angle by angle; "position": the end effectors' places; "pose": and orientations.
+        axes: along which the site follows, of x, y, z, rx, ry, rz; left out: along all.
+        scale: metres that the sites share per metre of this arm.
+        posture_rad: joint angles that the arm keeps near as far as the task leaves it free; left out: its
+            start pose.
+        posture_rate_1_s: by how much of the way in a second.
+        singular_value: least singular value of the Jacobian that is not damped.
+    """
+
+    space: Literal["joints", "position", "pose"] = "joints"
+    axes: tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...] = ()
+    scale: Positive = 1.0
+    posture_rad: Joints = ()
+    posture_rate_1_s: NotNegative = 0.0
+    singular_value: Positive = 0.05
+
+    @property
+    def shared(self) -> int:
+        """How many coordinates the sites share; 0: as many as there are joints."""
+        return {"joints": 0, "position": 3, "pose": 6}[self.space]
+
+    @property
+    def setup(self) -> TaskSetup | None:
+        """The task as the core has it; None of joints."""
+        if not self.shared:
+            return None
+        axes = tuple(float(not self.axes or name in self.axes) for name in TASK_AXES[: self.shared])
+        posture = self.posture_rad
+        return TaskSetup(axes, self.scale, posture, self.posture_rate_1_s, self.singular_value)
 
 
 class ArmModel(NamedTuple):
@@ -145,6 +191,18 @@ class ArmModel(NamedTuple):
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return list(place_end_effector(rows, np.array(self.chain.tip_m)))
 
+    def shared_pose(self, q: Vector) -> tuple[float, ...]:
+        """Returns what a site shares of a pose: its joint angles, or its end effector's place or pose."""
+        if self.chain is None or self.chain.task is None:
+            return tuple(q)
+        rows = build_chain(self.chain.joints)
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        place = np.array(place_end_effector(rows, np.array(self.chain.tip_m))) * self.chain.task.scale
+        if self.counts.shared == len(place):
+            return tuple(place.tolist())
+        turned = turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
+        return (*place.tolist(), *turned)
+
     def inertia(self, q: Array) -> Array:
         """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""
         assert self.chain is not None
@@ -156,14 +214,14 @@ class ArmModel(NamedTuple):
         return M
 
 
-def build_arm(arm: Arm, urdf: Mapping[str, str], chains: bool) -> ArmModel:
-    """Returns the model of an arm; `chains`: some arm of the scenario is a chain.
+def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> ArmModel:
+    """Returns the model of an arm that follows in a task; `chains`: some arm of the scenario is a chain.
 
     Raises:
         ScenarioError: its file cannot be used; the path is that of a key below the arm's.
     """
     if arm.urdf:
-        return _chain_model(arm, read_arm(arm, urdf))
+        return _chain_model(arm, task, read_arm(arm, urdf))
     theta = arm.theta
     if not is_positive_definite(theta):
         raise ScenarioError(
@@ -178,8 +236,9 @@ def build_arm(arm: Arm, urdf: Mapping[str, str], chains: bool) -> ArmModel:
     ]
     upright, axis = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 1.0)
     joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, arm.l1_m))
-    chain = ChainSetup(joints, (0.0, -arm.g_m_s2, 0.0), (arm.l2_m, 0.0, 0.0))
-    counts = VectorCounts.of_chain(2)
+    joints, gravity = _place_base(arm, joints, (0.0, -arm.g_m_s2, 0.0))
+    chain = ChainSetup(joints, gravity, (arm.l2_m, 0.0, 0.0), task=task.setup)
+    counts = VectorCounts.of_chain(2, task.shared)
     return ArmModel(np.concatenate(bodies), counts, names, bodies_moved, none, none, (0.0, 0.0), chain)
 
 
@@ -212,7 +271,23 @@ def _read_cached(text: str, base: str, tip: str, payload: UrdfPayload | None) ->
     return read_urdf(text, base, tip, payload)
 
 
-def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
+def _place_base(
+    arm: Arm, joints: tuple[ChainJoint, ...], gravity: Vector3
+) -> tuple[tuple[ChainJoint, ...], Vector3]:
+    """Returns the joints of a chain, and gravity, in the frame that the sites share."""
+    if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
+        return joints, gravity
+    roll, pitch, yaw = arm.base_rpy_rad
+    tilted = multiply(rotation_matrix((0.0, pitch, 0.0)), rotation_matrix((roll, 0.0, 0.0)))
+    base = multiply(rotation_matrix((0.0, 0.0, yaw)), tilted)
+    first, (x, y, z) = joints[0], arm.base_xyz_m
+    turned = apply(base, first.origin_m)
+    origin = (turned[0] + x, turned[1] + y, turned[2] + z)
+    first = first._replace(rotation=multiply(base, first.rotation), origin_m=origin)
+    return (first, *joints[1:]), apply(base, gravity)
+
+
+def _chain_model(arm: Arm, task: Task, read: UrdfChain) -> ArmModel:
     if len(arm.armature_kg_m2) not in (1, len(read.joints)):
         problem = f"has {len(arm.armature_kg_m2)} numbers, and the arm has {len(read.joints)} joints"
         raise ScenarioError(problem, path="armature_kg_m2")
@@ -230,17 +305,18 @@ def _chain_model(arm: Arm, read: UrdfChain) -> ArmModel:
         )
         for joint, inertia in zip(read.joints, armature, strict=True)
     )
-    length = math.sqrt(arm.down[0] * arm.down[0] + arm.down[1] * arm.down[1] + arm.down[2] * arm.down[2])
-    down = np.array(arm.down) / length
+    x, y, z = arm.down
+    size = arm.g_m_s2 / math.sqrt(x * x + y * y + z * z)
+    joints, gravity = _place_base(arm, joints, (size * x, size * y, size * z))
     return ArmModel(
         theta=np.concatenate([joint.inertia for joint in read.joints]),
-        counts=VectorCounts.of_chain(len(joints)),
+        counts=VectorCounts.of_chain(len(joints), task.shared),
         joint_names=tuple(joint.name for joint in read.joints),
         link_names=tuple(joint.link for joint in read.joints),
         efforts=tuple(joint.effort_limit for joint in read.joints),
         speeds=tuple(joint.velocity_limit for joint in read.joints),
         lengths_m=(0.0, 0.0),
-        chain=ChainSetup(joints, tuple((arm.g_m_s2 * down).tolist()), read.tip_origin_m),
+        chain=ChainSetup(joints, gravity, read.tip_origin_m, read.tip_rotation, task.setup),
     )
 
 

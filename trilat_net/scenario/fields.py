@@ -29,12 +29,15 @@ NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
 _PER_JOINT = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"})
 _PER_PARAMETER = Meta(min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"})
+_PER_COORDINATE = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "shared"})
 _PER_AXIS = Meta(min_length=2, max_length=3, extra={"per": "axes"})
 Joints = Annotated[tuple[Real, ...], _PER_JOINT]
 PositiveJoints = Annotated[tuple[Positive, ...], _PER_JOINT]
 NotNegativeJoints = Annotated[tuple[NotNegative, ...], _PER_JOINT]
 Parameters = Annotated[tuple[Real, ...], _PER_PARAMETER]
 NotNegativeParameters = Annotated[tuple[NotNegative, ...], _PER_PARAMETER]
+PositiveCoordinates = Annotated[tuple[Positive, ...], _PER_COORDINATE]
+NotNegativeCoordinates = Annotated[tuple[NotNegative, ...], _PER_COORDINATE]
 NotNegativeAxes = Annotated[tuple[NotNegative, ...], _PER_AXIS]
 Point = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=3, extra={"point": "axes"})]
 RateHz = Annotated[int, Meta(ge=1, le=20_000)]
@@ -44,16 +47,17 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """How many numbers the vectors of a site have: one per joint, per parameter, per axis of its space."""
+    """How many numbers the vectors of a site have: per joint, parameter, axis, shared coordinate."""
 
     joints: int = JOINTS
     parameters: int = PARAMETERS
     axes: int = 2
+    shared: int = JOINTS
 
     @classmethod
-    def of_chain(cls, joints: int) -> "VectorCounts":
-        """Returns those of a chain of so many joints."""
-        return cls(joints, LINK_PARAMETERS * joints, 3)
+    def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
+        """Returns those of a chain of so many joints, which shares them or so many coordinates."""
+        return cls(joints, LINK_PARAMETERS * joints, 3, shared or joints)
 
 
 class KeyProblem(NamedTuple):
@@ -94,12 +98,19 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
     return {**defaults, **written}
 
 
+_OWNERS = {
+    **dict.fromkeys(("joints", "parameters"), "the arm has"),
+    "axes": "its space has",
+    "shared": "sites share",
+}
+
+
 def find_count_problem(table: TomlTable, kind: StructType, counts: VectorCounts) -> KeyProblem | None:
     """Returns the first vector of a table that has too few or too many numbers, or None."""
     for key, per in {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}.items():
         wanted, value = getattr(counts, per), table.get(key)
         if isinstance(value, list) and len(value) != wanted:
-            owner = f"the arm has {wanted} {per}" if per != "axes" else f"its space has {wanted} axes"
+            owner = f"{_OWNERS[per]} {wanted} {per if per != 'shared' else 'coordinates'}"
             return KeyProblem(key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}")
     return None
 

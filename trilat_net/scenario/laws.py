@@ -29,9 +29,11 @@ from .fields import (
     MAX_QUANTITY,
     Frozen,
     NotNegative,
+    NotNegativeCoordinates,
     NotNegativeJoints,
     NotNegativeParameters,
     Parameters,
+    PositiveCoordinates,
     PositiveJoints,
 )
 
@@ -220,9 +222,9 @@ class AdaptiveGains(Frozen, frozen=True):
         theta_hat0: first estimate of theta, Eq. (24).
     """
 
-    Lambda: PositiveJoints = (1.0,)
+    Lambda: PositiveCoordinates = (1.0,)
     Kp: PositiveJoints = (1.0,)
-    Kd: NotNegativeJoints = (3.0,)
+    Kd: NotNegativeCoordinates = (3.0,)
     Gamma: NotNegativeParameters = (1.0,)
     theta_hat0: Parameters = (0.0,)
 
@@ -296,7 +298,7 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveJoints = (10.0,)
+    K: PositiveCoordinates = (10.0,)
     d: NotNegativeJoints = (3.0,)
     gravity: NotNegative = 1.0
 
@@ -313,8 +315,8 @@ class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", t
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveJoints = (10.0,)
-    Kd: NotNegativeJoints = (3.0,)
+    K: PositiveCoordinates = (10.0,)
+    Kd: NotNegativeCoordinates = (3.0,)
     d: NotNegativeJoints = (5.0,)
     gravity: NotNegative = 1.0
 
@@ -334,9 +336,9 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: NotNegativeJoints = (0.0,)
+    K: NotNegativeCoordinates = (0.0,)
     d: NotNegativeJoints = (5.0,)
-    k_f: NotNegativeJoints = (0.0,)
+    k_f: NotNegativeCoordinates = (0.0,)
     gravity: NotNegative = 1.0
 
 

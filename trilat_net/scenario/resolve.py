@@ -18,7 +18,7 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
-from .arms import CHAIN_KEYS, Arm, ArmModel, build_arm
+from .arms import CHAIN_KEYS, Arm, ArmModel, Task, build_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
@@ -216,19 +216,22 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
         raise ScenarioError(
             f"an experiment has at least two sites, this one has {len(written)}", path="sites"
         )
-    chains = any(group["arm"].get("urdf") for group in groups.values())
+    chains = any(
+        group["arm"].get("urdf") or group["task"].get("space", "joints") != "joints"
+        for group in groups.values()
+    )
     return {
-        name: _resolve_site(name, {**table, **groups[name]}, tables, draws, urdf if chains else {})
+        name: _resolve_site(name, {**table, **groups[name]}, tables, draws, urdf, chains)
         for name, table in written.items()
     }
 
 
 def _resolve_site(
-    name: str, site: TomlTable, tables: TomlTable, draws: Draws, urdf: dict[str, str]
+    name: str, site: TomlTable, tables: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool
 ) -> TomlTable:
-    """Returns a site's tables, complete; `urdf` is not empty where the arms are chains."""
+    """Returns a site's tables, complete; `chains`: the arms of the scenario are chains."""
     path = f"sites.{name}"
-    site["arm"], model = _resolve_arm(site["arm"], draws, urdf, f"{path}.arm")
+    site["arm"], model = _resolve_arm(site, draws, urdf, chains, f"{path}.arm")
     counts = model.counts if model is not None else VectorCounts()
     site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
     site["control"] = _resolve_control(
@@ -253,25 +256,27 @@ def _resolve_site(
 
 
 def _resolve_arm(
-    table: TomlTable, draws: Draws, urdf: dict[str, str], path: str
+    site: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool, path: str
 ) -> tuple[TomlTable, ArmModel | None]:
     """Returns an arm's table with all numbers drawn, and its model, see `_model_arm`."""
-    table = dict(table)
+    table, task = dict(site["arm"]), site["task"]
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
     table = draws.draw_numbers(table, path)
-    model = _model_arm(table, urdf, path)
+    model = _model_arm(table, task, urdf, chains, path)
     if not armature or model is None:
         return {**table, **armature}, model
     if not table.get("urdf"):
         raise ScenarioError(_OF_A_CHAIN, path=f"{path}.armature_kg_m2")
     table |= draws.draw_numbers(expand_vectors(armature, Arm, model.counts), path)
-    return table, _model_arm(table, urdf, path)
+    return table, _model_arm(table, task, urdf, chains, path)
 
 
 _OF_A_CHAIN = "belongs to an arm with a urdf, and this one is planar"
 
 
-def _model_arm(table: TomlTable, urdf: dict[str, str], path: str) -> ArmModel | None:
+def _model_arm(
+    table: TomlTable, task_table: TomlTable, urdf: dict[str, str], chains: bool, path: str
+) -> ArmModel | None:
     """Returns the model of an arm; None where the table of a planar arm is refused later, at its own key."""
     try:
         arm = msgspec.convert(table, Arm)
@@ -287,7 +292,11 @@ def _model_arm(table: TomlTable, urdf: dict[str, str], path: str) -> ArmModel | 
     if sum(abs(x) for x in arm.down) < 1e-6:
         raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
     try:
-        return build_arm(arm, urdf, bool(urdf))
+        task = msgspec.convert(task_table, Task)
+    except msgspec.ValidationError:
+        return None
+    try:
+        return build_arm(arm, task, urdf, chains)
     except ScenarioError as error:
         if not arm.urdf:
             return None
@@ -307,7 +316,7 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
     """Refuses vectors of a site that do not fit its arm."""
     law = site["control"].get("law", "adaptive")
     tables: list[tuple[TomlTable, type[Frozen], str]]
-    tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm")]
+    tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm"), (site["task"], Task, f"{path}.task")]
     tables += [(site["control"], LAWS[law], f"{path}.control")] if law in LAWS else []
     for table, kind, place in tables:
         if found := find_count_problem(table, kind, counts):

@@ -24,7 +24,7 @@ from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
 from ..errors import ScenarioError
-from .arms import Arm, ArmModel, build_arm
+from .arms import Arm, ArmModel, Task, build_arm
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
@@ -83,6 +83,7 @@ class SiteSpec(Frozen, frozen=True):
         control: its law and gains.
         limits: its limits.
         on_stale: its rule for a peer whose samples are too old.
+        task: what it follows: joints, or its end effector.
         hands: its operators.
         environment: its environment.
         plant: "simulated"; or "external": an arm outside of the program, whose state is measured.
@@ -96,12 +97,13 @@ class SiteSpec(Frozen, frozen=True):
     control: ControlLaw
     limits: Limits
     on_stale: OnStale = OnStale()
+    task: Task = Task()
     hands: tuple[Operator, ...] = ()
     environment: tuple[Environment, ...] = ()
     plant: Literal["simulated", "external"] = "simulated"
 
 
-SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale}
+SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale, "task": Task}
 """Tables that a scenario may have for all sites, and each site for itself."""
 
 
@@ -151,6 +153,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     "drawn": ({},),
     "urdf": ({},),
     "on_stale": ({},),
+    "task": ({},),
     "environment": ((), []),
     "plant": ("simulated",),
 }
@@ -216,11 +219,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         Raises:
             ScenarioError: an arm's file cannot be used.
         """
-        chains = any(spec.arm.urdf for spec in self.sites.values())
+        chains = any(spec.arm.urdf or spec.task.shared for spec in self.sites.values())
         models = {}
         for name, spec in self.sites.items():
             try:
-                models[name] = build_arm(spec.arm, self.urdf, chains)
+                models[name] = build_arm(spec.arm, spec.task, self.urdf, chains)
             except ScenarioError as error:
                 path = f"sites.{name}.arm" + (f".{error.path}" if error.path else "")
                 raise ScenarioError(error.problem, path=path) from None
@@ -334,7 +337,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             peer=peer,
             alpha=self.dominance[site].get(peer, 0.0),
             rate_hz=self.sites[peer].rate_hz,
-            q0=self.sites[peer].q0_rad,
+            q0=self.arms[peer].shared_pose(self.sites[peer].q0_rad),
             key=link_key(self.seed, name),
             models=tuple(link.core(from_ns) for from_ns, link in models),
             traces=tuple(link.points for _, link in models),

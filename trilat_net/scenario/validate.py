@@ -147,7 +147,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _check_joint_space(scenario: Scenario) -> None:
-    """Refuses arms of different numbers of joints, and gains that a light joint cannot take at its tick rate.
+    """Refuses arms that share different coordinates, and gains that a light joint cannot take.
 
     A torque -K qd that is held over a period h makes a single joint of inertia M swing from tick to tick from
     K h / M = 1 on (of the second-order scheme, 2 of the digital one); of several joints the largest
@@ -155,11 +155,17 @@ def _check_joint_space(scenario: Scenario) -> None:
     """
     counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     first = scenario.names[0]
+    spaces = {name: site.task.space for name, site in scenario.sites.items()}
     for name, joints in counts.items():
-        if joints != counts[first]:
+        if spaces[name] != spaces[first]:
+            raise ScenarioError(
+                f"is {spaces[name]!r}, and that of {first} is {spaces[first]!r}: all sites share one space",
+                path=f"sites.{name}.task.space",
+            )
+        if spaces[name] == "joints" and joints != counts[first]:
             raise ScenarioError(
                 f"its arm has {joints} joints, and that of {first} has {counts[first]}: joint angles are "
-                "compared one by one, so all arms need as many joints",
+                "compared one by one, so all arms need as many joints, or a task (task.space)",
                 path=f"sites.{name}.arm",
             )
     for name, model in scenario.arms.items():
@@ -167,7 +173,8 @@ def _check_joint_space(scenario: Scenario) -> None:
         if model.chain is None or isinstance(site.control, ImportedLaw):
             continue
         gains = site.control.gains(model.theta)
-        damping = np.zeros(counts[name]) + gains.Kp + gains.Kd + gains.d
+        damping = np.zeros(counts[name]) + gains.Kp + gains.d
+        damping += gains.Kd if spaces[name] == "joints" else 0.0
         scaled = np.sqrt(damping)
         spread, modes = np.linalg.eigh(
             scaled * np.linalg.inv(model.inertia(np.array(site.q0_rad))) * scaled[:, None]

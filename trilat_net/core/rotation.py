@@ -1,0 +1,106 @@
+"""Rotations as vectors: axis times angle, rad, by plain arithmetic with the same bits on every machine.
+
+Invariant: a rotation vector is at most half a turn long; `rotation_matrix` and `rotation_vector` undo each
+other. The arc tangent is that of S. Moshier's Cephes library.
+"""
+
+import math
+
+from .chain import Matrix, Three, scale
+from .jit import leaf
+from .sincos import sincos
+from .vectors import Array
+
+_SMALL = 1e-8
+"""Below this, a sine is its angle to the last bit."""
+
+
+@leaf
+def arctan(x: float) -> float:
+    """Returns the arc tangent of a number from 0 to 1, rad."""
+    turned = 0.0
+    if x > 0.66:
+        turned, x = 0.25 * math.pi, (x - 1.0) / (x + 1.0)
+    z = x * x
+    P = -8.750608600031904122785e-1
+    P = P * z - 1.615753718733365076637e1
+    P = P * z - 7.500855792314704667340e1
+    P = P * z - 1.228866684490136173410e2
+    P = P * z - 6.485021904942025371773e1
+    Q = z + 2.485846490142306297962e1
+    Q = Q * z + 1.650270098316988542046e2
+    Q = Q * z + 4.328810604912902668951e2
+    Q = Q * z + 4.853903996359136964868e2
+    Q = Q * z + 1.945506571482613964425e2
+    return turned + (x + x * (z * P / Q))
+
+
+@leaf
+def rotation_matrix(vector: Three) -> Matrix:
+    """Returns the rotation by a vector, three rows (Rodrigues)."""
+    angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    s, c = sincos(angle)
+    by_sine, by_cosine = 1.0, 0.5
+    if angle > _SMALL:
+        by_sine, by_cosine = s / angle, (1.0 - c) / (angle * angle)
+    x, y, z = vector
+    xx, yy, zz = by_cosine * x * x, by_cosine * y * y, by_cosine * z * z
+    xy, xz, yz = by_cosine * x * y, by_cosine * x * z, by_cosine * y * z
+    sx, sy, sz = by_sine * x, by_sine * y, by_sine * z
+    return (
+        (1.0 - yy - zz, xy - sz, xz + sy),
+        (xy + sz, 1.0 - xx - zz, yz - sx),
+        (xz - sy, yz + sx, 1.0 - xx - yy),
+    )
+
+
+@leaf
+def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
+    """Returns the quaternion of a rotation with w >= 0, from its largest part (Shepperd, 1978)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R[0], R[1], R[2]
+    trace = xx + yy + zz
+    if trace >= max(xx, yy, zz):
+        w, v = 1.0 + trace, (zy - yz, xz - zx, yx - xy)
+    elif xx >= yy and xx >= zz:
+        w, v = zy - yz, (1.0 + xx - yy - zz, xy + yx, xz + zx)
+    elif yy >= zz:
+        w, v = xz - zx, (xy + yx, 1.0 + yy - xx - zz, yz + zy)
+    else:
+        w, v = yx - xy, (xz + zx, yz + zy, 1.0 + zz - xx - yy)
+    length = math.sqrt(w * w + v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if w < 0.0:
+        length = -length
+    return w / length, scale(1.0 / length, v)
+
+
+@leaf
+def rotation_vector(R: Array | Matrix) -> Three:
+    """Returns the vector of a rotation matrix (rows)."""
+    w, v = _quaternion(R)
+    n = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if n < _SMALL:
+        return scale(2.0 / w, v)
+    angle = 2.0 * (arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n))
+    return scale(angle / n, v)
+
+
+@leaf
+def turn_between(R: Array | Matrix, other: Array | Matrix) -> Three:
+    """Returns the vector of R other': the turn from the other orientation to this one, in base axes."""
+    a, b, c = other[0], other[1], other[2]
+    rows = (
+        _times_rows(R[0], a, b, c),
+        _times_rows(R[1], a, b, c),
+        _times_rows(R[2], a, b, c),
+    )
+    return rotation_vector(rows)
+
+
+@leaf
+def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
+    """Returns the products of a row with three rows."""
+    return (
+        row[0] * a[0] + row[1] * a[1] + row[2] * a[2],
+        row[0] * b[0] + row[1] * b[1] + row[2] * b[2],
+        row[0] * c[0] + row[1] * c[1] + row[2] * c[2],
+    )
