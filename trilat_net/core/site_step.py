@@ -106,7 +106,7 @@ class Site:
             a = self._arrays
             act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
-        q, qd, q_des, qd_des, tau, tau_x, theta_hat = self._columns
+        q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
         mode = self._site["mode"].item()
         return TickRecord(
             tick.k,
@@ -123,6 +123,7 @@ class Site:
             self._crc(packed, count),
             [command.text for command in tick.commands],
             [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
+            *(row[column] for column in task),
         )
 
     def _call_user_law(self, law: UserLaw, k: int) -> list[float]:

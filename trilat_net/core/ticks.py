@@ -146,6 +146,9 @@ class TickRecord(NamedTuple):
         mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it holds, rad, and
             the time at which it began to return, ns since the epoch (0 before). A site with a user's law
             always has these, and the law's memory after them.
+        x: in task space what the site shares of its end effector: its place, m, and orientation; else empty.
+        xd: its derivative, m/s and rad/s.
+        wrench: what tau_x amounts to there, N and N m.
     """
 
     tick: int
@@ -162,6 +165,9 @@ class TickRecord(NamedTuple):
     rx_crc: int
     cmd: list[str]
     mem: list[float]
+    x: Sequence[float] = ()
+    xd: Sequence[float] = ()
+    wrench: Sequence[float] = ()
 
 
 class LinkCounts(NamedTuple):
