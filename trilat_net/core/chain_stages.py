@@ -29,7 +29,7 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 
 @leaf
-def place_arm(s: Row, chain: RowArray) -> None:
+def place_chain(s: Row, chain: RowArray) -> None:
     """Places the joints, and in task space the end effector."""
     place_joints(chain, s.q)
     if s.task:

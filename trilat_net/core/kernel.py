@@ -28,7 +28,7 @@ def _place_arm(s: Row, chain: RowArray | None, links: RowArray, refers: bool) ->
     """Places the joints of a chain; if it refers to its peers anew, the orientation of its reference too."""
     if chain is None:
         return
-    chain_stages.place_arm(s, chain)
+    chain_stages.place_chain(s, chain)
     if refers and s.task and s.shared == POSE:
         update_orientation_reference(s, links)
 

@@ -178,7 +178,7 @@ class ChainSetup(NamedTuple):
 class Gains(NamedTuple):
     """A control law and its gains, diagonal ones as vectors; those of other laws have no effect.
 
-    One number stands for a vector whose entries are all that number.
+    A vector of one number stands for one whose entries are all that number.
 
     Attributes:
         law: the law.
@@ -196,17 +196,17 @@ class Gains(NamedTuple):
     """
 
     law: Law
-    Lambda: Vector = 1.0
-    Kp: Vector = 0.0
-    Kd: Vector = 0.0
-    Gamma: Vector = 0.0
-    theta_hat0: Vector = 0.0
-    low: Vector = -math.inf
-    high: Vector = math.inf
-    known: Vector = 0.0
-    K: Vector = 0.0
-    d: Vector = 0.0
-    k_f: Vector = 0.0
+    Lambda: Vector = (1.0,)
+    Kp: Vector = (0.0,)
+    Kd: Vector = (0.0,)
+    Gamma: Vector = (0.0,)
+    theta_hat0: Vector = (0.0,)
+    low: Vector = (-math.inf,)
+    high: Vector = (math.inf,)
+    known: Vector = (0.0,)
+    K: Vector = (0.0,)
+    d: Vector = (0.0,)
+    k_f: Vector = (0.0,)
 
 
 class SiteSetup(NamedTuple):
