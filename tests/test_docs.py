@@ -15,7 +15,7 @@ from recorder import backfill, record_process, session_recording
 from recorder.play import pace
 from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
 from tests.cli.running import parses
-from trilat_net.analysis import run_end, site_signals
+from trilat_net.analysis import arm_rows, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
@@ -95,7 +95,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("recording.md", "synced once a second", 1, log_file.SYNC_PERIOD_NS / 1e9),
     ("definitions.md", "by 0.05 rad or more", 0.05, run_end.DRIFT_RAD),
     ("definitions.md", "differ by more than 0.02 rad", 0.02, run_end.AGREEMENT_RAD),
-    ("definitions.md", "within 0.3 rad of straight down", 0.3, run_end.HANGING_RAD),
+    ("definitions.md", "within 0.3 rad of straight down", 0.3, arm_rows.HANGING_RAD),
     ("definitions.md", "lets the run go for 2 s or more", 2, run_end.LEAST_JUDGED_S),
     ("certificate.md", "they let go 1 s and five times", 1, premises.MIN_FREE_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),

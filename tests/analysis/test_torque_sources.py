@@ -50,8 +50,7 @@ def test_every_actor_does_what_the_core_says(
 def test_hands_and_environment_are_told_apart_and_make_up_the_record() -> None:
     log = runs.run("rich").log
     for site, track in align_records(log).items():
-        spec = log.scenario.sites[site]
-        by = attribute_torque(track, spec)
+        by = attribute_torque(track, log.scenario)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
         assert (site == "s") == by.environment_now.any() == by.environment.any()
         assert (site == "m1") == (np.abs(by.operator_held).max() > 1e-9)
@@ -63,7 +62,7 @@ def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
     log = runs.run("rich").log
     track = align_records(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
-    assert attribute_torque(other, log.scenario.sites["m2"]).script is None
+    assert attribute_torque(other, log.scenario).script is None
 
 
 @pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])

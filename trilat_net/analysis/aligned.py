@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ticks import NS_PER_S
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
@@ -34,11 +33,11 @@ class AlignedRecords(NamedTuple):
         first: the tick of row 0.
         known: True if there is a record of that tick.
         follows: True if the site followed its peers then: no hold, no brake, no return.
-        q, qd: joint angles, shape (K, 2), rad, and velocities, rad/s.
+        q, qd: joint angles, shape (K, n), rad, and velocities, rad/s.
         q_des, qd_des: the same of the reference.
-        tau: control torque, shape (K, 2), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
-        theta_hat: estimate, shape (K, 5).
+        tau: control torque, shape (K, n), N m.
+        tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
+        theta_hat: estimate, shape (K, P).
         used: per peer the tick of the sample in use; -1 before the first.
     """
 
@@ -74,7 +73,7 @@ class AlignedRecords(NamedTuple):
 
     @property
     def e(self) -> Array:
-        """Position error, Eq. (9), shape (K, 2), rad."""
+        """Position error, Eq. (9), shape (K, n), rad."""
         return self.q - self.q_des
 
     @property
@@ -83,7 +82,7 @@ class AlignedRecords(NamedTuple):
         return self.known[:-1] & self.known[1:]
 
     def held_torque(self, limit_nm: Array | float, *, digital: bool) -> Array:
-        """Returns the torque that the controller holds over every period, shape (K - 1, 2), N m.
+        """Returns the torque that the controller holds over every period, shape (K - 1, n), N m.
 
         tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit.
         """
@@ -148,8 +147,8 @@ class PeerMotion(NamedTuple):
     """Motion of a peer at K times.
 
     Attributes:
-        q, qd: shape (K, 2), rad and rad/s.
-        squares: integral of qd squared since row 0, per joint, shape (K, 2), rad^2/s.
+        q, qd: shape (K, n), rad and rad/s.
+        squares: integral of qd squared since row 0, per joint, shape (K, n), rad^2/s.
         known: True if it follows from records.
     """
 
@@ -166,7 +165,7 @@ class PeerTrajectory:
         self.records = records
         squares = records.qd**2
         steps = 0.5 * records.h_s * (squares[1:] + squares[:-1])
-        self._squares: Array = np.vstack([np.zeros(JOINTS), np.cumsum(steps, axis=0)])
+        self._squares: Array = np.vstack([np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)])
 
     def at(self, t_s: Array) -> PeerMotion:
         """Returns the site at times, s since the epoch; on its ticks these are its records.

@@ -1,15 +1,41 @@
-"""Inertia, regressor and end effector of the arm, over all rows of a log at once.
+"""Inertia, torque, energy and end effector of an arm, over all rows of a log at once.
 
-Invariant: written from Section IV and Eq. (12) of the paper, independently of the core that ran the log; the
-tests compare the two.
+Invariant: of the planar arm written from Section IV and Eq. (12) of the paper, independently of the core that
+ran the log; of a chain by the core's leaves, which the tests compare with Pinocchio: a kinetic term or a
+gradient is one recursion. Both have the same functions, and hardly anything else asks which arm it is.
 """
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..core.chain import (
+    COULOMB_SPEED,
+    LINK_PARAMETERS,
+    MAX_JOINTS,
+    build_chain,
+    dot,
+    inverse_dynamics,
+    parameter_gradient,
+    place_end_effector,
+    place_joints,
+    propagate_motion,
+    rotate,
+    three,
+)
+from ..core.jit import leaf
+from ..core.site_setup import ChainSetup
 from ..core.two_link_arm import JOINTS
-from ..core.vectors import Array
+from ..core.vectors import Array, Row, RowArray
+from ..scenario import Scenario
+
+HANGING_RAD = 0.3
+"""A link within this of straight down hangs."""
+_NO_WEIGHT_J = 1e-6
+"""An arm whose energy in the field of gravity varies by less cannot hang."""
+_ENERGY_SWEEPS = 20
 
 
 def inertia_product_rows(theta: Array, q: Array, x: Array) -> Array:
@@ -40,10 +66,10 @@ def regressor_rows(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
 
 
 class EndEffectorRows(NamedTuple):
-    """Position and velocity of the end effector, shape (K, 2), m and m/s.
+    """Position and velocity of the end effector, shape (K, 2), m and m/s; in space (K, 3).
 
     Attributes:
-        J: its Jacobian, shape (K, 2, 2), m/rad: rows x and y, columns the joints.
+        J: its Jacobian, shape (K, 2, n), m/rad: rows x and y (and z), columns the joints.
     """
 
     at: Array
@@ -61,3 +87,253 @@ def compute_end_effector(lengths: tuple[float, float], q: Array, qd: Array) -> E
     J[:, 0, 0], J[:, 1, 0] = -at[:, 1], at[:, 0]
     J[:, 0, 1], J[:, 1, 1] = -reach[:, 1], reach[:, 0]
     return EndEffectorRows(at, np.einsum("kij,kj->ki", J, qd), J)
+
+
+class PlanarArmRows(NamedTuple):
+    """The planar two-link arm over rows; `ChainArmRows` has the same functions.
+
+    Attributes:
+        theta: its true parameters, Eq. (24), shape (5,).
+        g: gravitational acceleration, m/s^2.
+        lengths_m: of its two links.
+    """
+
+    theta: Array
+    g: float
+    lengths_m: tuple[float, float]
+
+    @property
+    def gravity_parameters(self) -> NDArray[np.bool_]:
+        """True for each parameter that the torque of gravity consists of: theta_4 and theta_5."""
+        return np.arange(5) >= 3
+
+    def weightless(self) -> "PlanarArmRows":
+        """Returns the same arm without gravity: its torque is linear in v and a."""
+        return self._replace(g=0.0)
+
+    def multiply_inertia(self, q: Array, x: Array) -> Array:
+        """Returns M(q) x, shape (K, 2)."""
+        return inertia_product_rows(self.theta, q, x)
+
+    def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
+        """Returns Y(q, qd, v, a) theta_hat of estimates of every row, shape (K, 5), as (K, 2), N m."""
+        found: Array = np.einsum("kij,kj->ki", regressor_rows(self.g, q, qd, v, a), theta_hat)
+        return found
+
+    def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
+        """Returns Y'r of r = qd - v, shape (K, 5)."""
+        found: Array = np.einsum("kij,ki->kj", regressor_rows(self.g, q, qd, v, a), r)
+        return found
+
+    def gravity_torque(self, q: Array) -> Array:
+        """Returns G(q), shape (K, 2), N m."""
+        inner, outer = self.g * self.theta[3:, np.newaxis] * np.cos(np.cumsum(q, axis=1).T)
+        return np.array([inner + outer, outer]).T
+
+    def potential_energy(self, q: Array) -> Array:
+        """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), J."""
+        height = self.theta[3] * np.sin(q[:, 0]) + self.theta[4] * np.sin(q[:, 0] + q[:, 1])
+        energy: Array = self.g * height
+        return energy
+
+    def friction(self, speed: Array) -> Array:
+        """Returns the torque that friction takes at joint speeds, shape (K, 2), N m: none."""
+        return np.zeros_like(speed)
+
+    def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
+        """Returns the torque of its stops ON the joints, shape (K, 2), N m: it has none."""
+        return np.zeros_like(q)
+
+    def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
+        """Returns the end effector in the plane."""
+        return compute_end_effector(self.lengths_m, q, qd)
+
+    def hangs(self, q: Array) -> bool:
+        """True if both links hang, in one pose, shape (2,)."""
+        return all(
+            abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q)
+        )
+
+
+@leaf
+def _put_torques(
+    chain: RowArray, theta: Array, gravity: Array, q: Array, qd: Array, v: Array, a: Array, torque: Array
+) -> None:
+    """Writes M a + C(q, qd) v + G + armature a + friction(v) of every row, shape (K, n).
+
+    Parameters theta of shape (K, 10 n), or (1, 10 n) for all rows.
+    """
+    for k in range(q.shape[0]):
+        place_joints(chain, q[k])
+        propagate_motion(chain, gravity, qd[k], v[k], a[k])
+        inverse_dynamics(chain, theta[min(k, theta.shape[0] - 1)], v[k], a[k], torque[k])
+
+
+@leaf
+def _put_gradients(
+    chain: RowArray, gravity: Array, q: Array, qd: Array, v: Array, a: Array, gradient: Array
+) -> None:
+    """Writes Y'r of every row, r = qd - v, shape (K, 10 n)."""
+    for k in range(q.shape[0]):
+        place_joints(chain, q[k])
+        propagate_motion(chain, gravity, qd[k], v[k], a[k])
+        parameter_gradient(chain, gradient[k])
+
+
+@leaf
+def _put_end_effectors(
+    chain: RowArray, theta: Array, gravity: Array, tip: Array, q: Array, at: Array, J: Array, energy: Array
+) -> None:
+    """Writes place, (K, 3), and Jacobian, (K, 3, n), of every row, and the links' potential energy, (K,), J.
+
+    That energy is -g'(m p + R mc) of every link, p and R its place and orientation in the base's frame.
+    """
+    n = chain.shape[0]
+    for k in range(q.shape[0]):
+        place_joints(chain, q[k])
+        at[k, 0], at[k, 1], at[k, 2] = place_end_effector(chain, tip)
+        p_x, p_y, p_z = 0.0, 0.0, 0.0
+        energy[k] = 0.0
+        for i in range(n):
+            row: Row = chain[i]
+            step = three(row.p) if i == 0 else rotate(chain[i - 1].R_base, three(row.p))
+            p_x, p_y, p_z = p_x + step[0], p_y + step[1], p_z + step[2]
+            first = LINK_PARAMETERS * i
+            mc = rotate(row.R_base, (theta[first + 1], theta[first + 2], theta[first + 3]))
+            energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(three(gravity), mc)
+            for j in range(3):
+                J[k, j, i] = row.J_lin[j]
+
+
+class ChainArmRows(NamedTuple):
+    """A chain of n joints over rows, by the core's recursions: what M, C and G are made of is theta.
+
+    The inertia of its drives counts in M. The law knows friction and drives, so that its torque has them.
+
+    Attributes:
+        theta: its true parameters, shape (10 n,).
+        chain: its joints, gravity and end effector.
+    """
+
+    theta: Array
+    chain: ChainSetup
+
+    @property
+    def gravity_parameters(self) -> NDArray[np.bool_]:
+        """True for each parameter that the torque of gravity may consist of: m and m c of every link."""
+        return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
+
+    @property
+    def _rows(self) -> RowArray:
+        """Its rows, of one layout for all chains: the loops are compiled once."""
+        return build_chain(self.chain.joints, MAX_JOINTS)
+
+    def _column(self, name: str) -> Array:
+        return np.array([getattr(joint, name) for joint in self.chain.joints])
+
+    def _of_joints(self, **values: Any) -> "ChainArmRows":
+        """Returns the same with one value of every joint replaced."""
+        joints = tuple(joint._replace(**values) for joint in self.chain.joints)
+        return self._replace(chain=self.chain._replace(joints=joints))
+
+    def weightless(self) -> "ChainArmRows":
+        """Returns the same chain without gravity and Coulomb friction: its torque is linear in v and a."""
+        bare = self._of_joints(coulomb=0.0)
+        return bare._replace(chain=bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0)))
+
+    def without_drives(self) -> "ChainArmRows":
+        """Returns the same chain without armature and friction: its torque is linear in theta."""
+        return self._of_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
+
+    def multiply_inertia(self, q: Array, x: Array) -> Array:
+        """Returns (M(q) + armature) x, shape (K, n): one recursion without speed and gravity."""
+        still = np.zeros_like(q)
+        return self.weightless().law_torque(self.theta[np.newaxis], q, still, still, x)
+
+    def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
+        """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), N m.
+
+        Estimates of every row, shape (K, 10 n), or one for all, (1, 10 n).
+        """
+        torque = np.zeros_like(q)
+        theta_hat, q, qd, v, a = map(np.ascontiguousarray, (theta_hat, q, qd, v, a))
+        _put_torques(self._rows, theta_hat, np.array(self.chain.gravity_m_s2), q, qd, v, a, torque)
+        return torque
+
+    def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:  # noqa: ARG002
+        """Returns Y'r of r = qd - v, shape (K, 10 n)."""
+        found = np.zeros((len(q), len(self.theta)))
+        q, qd, v, a = map(np.ascontiguousarray, (q, qd, v, a))
+        _put_gradients(self._rows, np.array(self.chain.gravity_m_s2), q, qd, v, a, found)
+        return found
+
+    def gravity_torque(self, q: Array) -> Array:
+        """Returns G(q), shape (K, n), N m."""
+        still = np.zeros_like(q)
+        return self.law_torque(self.theta[np.newaxis], q, still, still, still)
+
+    def _place(self, q: Array) -> tuple[Array, Array, Array]:
+        """Returns place and Jacobian of the end effector, and the potential energy."""
+        found = np.zeros((len(q), 3)), np.zeros((len(q), 3, q.shape[1])), np.zeros(len(q))
+        gravity, tip = np.array(self.chain.gravity_m_s2), np.array(self.chain.tip_m)
+        _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)
+        return found
+
+    def potential_energy(self, q: Array) -> Array:
+        """Returns the links' energy in the field of gravity, shape (K,), J; zero in the base's origin."""
+        return self._place(q)[2]
+
+    def friction(self, speed: Array) -> Array:
+        """Returns the torque that friction takes at joint speeds, shape (K, n), N m."""
+        x = speed / COULOMB_SPEED
+        torque: Array = self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
+        return torque
+
+    def stop_torque(self, q: Array, qd: Array) -> Array:
+        """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that never pull."""
+        stiffness, damping = self._column("stop_stiffness"), self._column("stop_damping")
+        under, over = self._column("lower") - q, q - self._column("upper")
+        up = np.where(under > 0.0, np.maximum(stiffness * under - damping * qd, 0.0), 0.0)
+        down = np.where(over > 0.0, np.maximum(stiffness * over + damping * qd, 0.0), 0.0)
+        torque: Array = up - down
+        return torque
+
+    def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
+        """Returns the end effector in space, in the base's frame."""
+        at, J, _ = self._place(q)
+        return EndEffectorRows(at, np.einsum("kij,kj->ki", J, qd), J)
+
+    def hangs(self, q: Array) -> bool:
+        """True if a pose, shape (n,), stores hardly more energy than any: as a pendulum within `HANGING_RAD`.
+
+        The least and the largest energy are looked for from this pose on, joint by joint; stops do not count.
+        """
+        low, high = self._find_extreme_energy(q, 1.0), self._find_extreme_energy(q, -1.0)
+        above = float(self.potential_energy(q[np.newaxis])[0]) - low
+        return high - low > _NO_WEIGHT_J and above < 0.5 * (1.0 - math.cos(HANGING_RAD)) * (high - low)
+
+    def _find_extreme_energy(self, q: Array, sign: float) -> float:
+        """Returns the least energy (sign 1) or the largest (-1), by turns of one revolute joint at a time.
+
+        As a function of one joint's angle it is a + b cos q + c sin q, which three angles give.
+        """
+        q = q.copy()
+        revolute = np.flatnonzero(~self._column("prismatic").astype(bool))
+        for joint in np.tile(revolute, _ENERGY_SWEEPS):
+            poses = np.tile(q, (3, 1))
+            poses[:, joint] = (0.0, 0.5 * np.pi, np.pi)
+            at_0, at_90, at_180 = self.potential_energy(poses).tolist()
+            middle = 0.5 * (at_0 + at_180)
+            q[joint] = math.atan2(-sign * (at_90 - middle), -sign * (at_0 - middle))
+        return float(self.potential_energy(q[np.newaxis])[0])
+
+
+ArmRows = PlanarArmRows | ChainArmRows
+
+
+def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
+    """Returns the arm of a site, for computations over rows."""
+    model = scenario.arms[site]
+    if model.chain is None:
+        return PlanarArmRows(model.theta, scenario.sites[site].arm.g_m_s2, model.lengths_m)
+    return ChainArmRows(model.theta, model.chain)

@@ -34,14 +34,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import PEAK_COLUMNS
 from ..core.ticks import BUCKETS_PER_S
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
+from .arm_rows import build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD
 from .timeline import first_divergence_s
 from .torque_sources import compute_operator_script
@@ -61,9 +60,6 @@ FLOOR_RAD = 1e-6
 
 AGREEMENT_RAD = 2e-2
 """Sites whose angles of a joint differ by more do not agree, rad."""
-
-HANGING_RAD = 0.3
-"""A link within this of straight down hangs."""
 
 THROWN_RAD = 0.5 * math.pi
 """Arms that nobody pushed and that end further from every start pose were thrown there, rad."""
@@ -224,9 +220,10 @@ class RunTrace(NamedTuple):
     """What the judgement of a run rests on, per site in scenario order.
 
     Attributes:
-        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch its `PEAK_COLUMNS`, shape (K, 6);
-            -1 if it has no record. A site's last one may be incomplete: it enters no trend.
-        tau_x: the torque of operator and environment at its last record, shape (2,), N m.
+        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch the largest |e| and |qd| and the last
+            q of every joint, shape (K, 3 n); -1 if it has no record. There may be columns for more joints
+            than the site has. A site's last bucket may be incomplete: it enters no trend.
+        tau_x: the torque of operator and environment at its last record, shape (n,), N m.
         diverged_at_s: when the first site left its limits, or None.
         pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for never.
     """
@@ -237,7 +234,7 @@ class RunTrace(NamedTuple):
     pushed_until_s: float = 0.0
 
 
-NO_BUCKETS = np.zeros((0, PEAK_COLUMNS))
+NO_BUCKETS = np.zeros((0, 3))
 """The buckets of a site without records."""
 
 
@@ -245,14 +242,17 @@ def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) 
     """Returns buckets with some more records of a site, which follow those in it; there may be spare rows."""
     if not len(bucket):
         return into
+    joints = q.shape[1]
+    if not len(into):
+        into = np.zeros((0, 3 * joints))
     lacking = int(bucket[-1]) + 1 - len(into)
     if lacking > 0:  # by half as much again: a long run is not copied for every batch
-        into = np.vstack([into, np.full((lacking + len(into) // 2, PEAK_COLUMNS), -1.0)])
+        into = np.vstack([into, np.full((lacking + len(into) // 2, 3 * joints), -1.0)])
     starts = np.flatnonzero(np.diff(bucket, prepend=-1))
     rows = bucket[starts]
     peaks = np.maximum.reduceat(np.abs(np.hstack([e, qd])), starts, axis=0)
-    into[rows, : 2 * JOINTS] = np.maximum(into[rows, : 2 * JOINTS], peaks)
-    into[rows, 2 * JOINTS :] = q[np.append(starts[1:], len(q)) - 1]
+    into[rows, : 2 * joints] = np.maximum(into[rows, : 2 * joints], peaks)
+    into[rows, 2 * joints :] = q[np.append(starts[1:], len(q)) - 1]
     return into
 
 
@@ -266,7 +266,7 @@ def trace_log(log: Log) -> RunTrace:
             reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, NO_BUCKETS)
             for part in parts
         ],
-        [part.tau_x[-1] if len(part) else np.zeros(JOINTS) for part in parts],
+        [part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
         first_divergence_s(log),
         max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
     )
@@ -281,22 +281,31 @@ def classify_log_end(log: Log) -> RunEnd:
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     """Returns the end of a run from its trace."""
-    count = max(min(map(len, trace.buckets)) - 1, 0)
-    columns = np.array([values[:count] for values in trace.buckets])
-    kept = np.flatnonzero((columns[:, :, 0] >= 0.0).all(axis=0))
+    sites = _split_buckets(scenario, trace.buckets)
+    count = max(min(map(len, sites)) - 1, 0)
+    kept = np.flatnonzero(np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0))
     acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, count / BUCKETS_PER_S))
     first, acts = _choose_judged_part(kept / BUCKETS_PER_S, acted_s)
     kept = kept[first:]
-    t_s, columns = np.asarray(kept / BUCKETS_PER_S), columns[:, kept]
-    missing = tuple(name for name, site in zip(scenario.names, trace.buckets, strict=True) if not len(site))
-    end = _find_worst_joint(scenario, t_s, columns, trace.buckets)._replace(missing_sites=missing)
+    t_s, columns = np.asarray(kept / BUCKETS_PER_S), [site[kept] for site in sites]
+    missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
+    end = _find_worst_joint(scenario, t_s, columns, sites)._replace(missing_sites=missing)
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
-        reasons = (*_find_disagreement(scenario, trace, t_s, columns), *_find_odd_pose(scenario, trace))
+        reasons = (*_find_disagreement(scenario, trace, t_s, columns), *_find_odd_pose(scenario, sites))
         return end._replace(reasons=reasons)
     why = f"an operator acts until {acted_s:.4g} s, within the judged part"
     return end._replace(operator_acts=True, reasons=(why,)) if acts else end
+
+
+def _split_buckets(scenario: Scenario, buckets: Sequence[Array]) -> list[Array]:
+    """Returns the buckets of each site by kind and joint, shape (K, 3, n): |e|, |qd| and q."""
+    joints = [len(spec.q0_rad) for spec in scenario.sites.values()]
+    return [
+        site.reshape(len(site), 3, -1)[:, :, :n] if len(site) else np.zeros((0, 3, n))
+        for n, site in zip(joints, buckets, strict=True)
+    ]
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
@@ -311,24 +320,27 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     return int(np.searchsorted(t_s, 2.0 * acted_s - t_s[-1])), False
 
 
-def _find_worst_joint(scenario: Scenario, t_s: Array, columns: Array, buckets: Sequence[Array]) -> RunEnd:
+def _find_worst_joint(
+    scenario: Scenario, t_s: Array, columns: Sequence[Array], sites: Sequence[Array]
+) -> RunEnd:
     """Returns the end of the joint of the worst class, the fastest of those; the maxima are of all."""
-    signals = columns[:, :, : 2 * JOINTS].transpose(1, 0, 2).reshape(len(t_s), 2 * JOINTS * len(buckets))
-    fits = fit_envelopes(t_s, signals)
+    signals = [site[:, kind] for site in columns for kind in (0, 1)]
+    fits = iter(fit_envelopes(t_s, np.hstack(signals)))
     joints = []
-    for n, (name, site) in enumerate(zip(scenario.names, buckets, strict=True)):
-        ends = site[-BUCKETS_PER_S:, : 2 * JOINTS].max(axis=0, initial=0.0).tolist()
-        for joint in range(JOINTS):
-            error, speed = (fits[(2 * n + kind) * JOINTS + joint] for kind in (0, 1))
-            end_error, end_speed = ends[joint], ends[JOINTS + joint]
+    for name, judged, site in zip(scenario.names, columns, sites, strict=True):
+        ends = site[-BUCKETS_PER_S:, :2].max(axis=0, initial=0.0).tolist()
+        trends = [[next(fits) for _ in kind] for kind in ends]
+        for joint, (end_error, end_speed) in enumerate(zip(*ends, strict=True)):
+            error, speed = (kind[joint] for kind in trends)
             behaviour = _classify_joint(error, speed, end_error, end_speed)
             if behaviour in (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED):
-                q, fastest = columns[n][:, 2 * JOINTS + joint], columns[n][:, JOINTS + joint]
-                behaviour = _name_motion(behaviour, q, fastest, t_s)
+                behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s)
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
             joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
-    for n in [fed for group in find_coupled_sites(scenario) for fed in _find_fed_joints(joints, group)]:
-        joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
+    owners = np.repeat(np.arange(len(sites)), [site.shape[2] for site in sites])
+    for group in find_coupled_sites(scenario):
+        for n in _find_fed_joints(joints, owners, group):
+            joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
     worst = max(joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s))
     return worst._replace(
         end_error_rad=max(one.end_error_rad for one in joints),
@@ -336,12 +348,12 @@ def _find_worst_joint(scenario: Scenario, t_s: Array, columns: Array, buckets: S
     )
 
 
-def _find_fed_joints(joints: Sequence[RunEnd], group: Sequence[int]) -> list[int]:
+def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
     """Returns the bounded joints of coupled sites of which a faster joint falls: they may live on that.
 
     Modes that decay at several frequencies beat, and hand their energy on: some joint is steady for a while.
     """
-    own = [JOINTS * n + joint for n in group for joint in range(JOINTS)]
+    own = np.flatnonzero(np.isin(owners, group)).tolist()
     falling = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
     fastest = max((joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling), default=0.0)
     bounded = [n for n in own if joints[n].behaviour is EndBehaviour.BOUNDED]
@@ -413,12 +425,16 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in joined}]
 
 
-def _find_disagreement(scenario: Scenario, trace: RunTrace, t_s: Array, columns: Array) -> Iterable[str]:
+def _find_disagreement(
+    scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
+) -> Iterable[str]:
     """Yields what is said of sites that do not agree, do not come closer, and are held apart by no force."""
     for group in find_coupled_sites(scenario):
         if len(group) < 2 or max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM:
             continue
-        q = columns[group][:, :, 2 * JOINTS :]
+        if len({columns[n].shape[2] for n in group}) > 1:  # their joints are not each other's
+            continue
+        q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)
         joint = int(apart[-1].argmax())
         nearer = fit_envelope(t_s, apart.max(axis=1)).trend is EnvelopeTrend.DECAYS
@@ -427,23 +443,26 @@ def _find_disagreement(scenario: Scenario, trace: RunTrace, t_s: Array, columns:
             yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
 
 
-def points_down(q: Array) -> bool:
-    """True if both links of an arm hang."""
-    return all(abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q))
-
-
-def _find_odd_pose(scenario: Scenario, trace: RunTrace) -> Iterable[str]:
+def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
-    starts = np.array([spec.q0_rad for spec in scenario.sites.values()])
-    ends = np.array([site[-1, 2 * JOINTS :] for site in trace.buckets])
-    poses = zip(scenario.names, starts, ends, strict=True)
-    hanging = [name for name, start, end in poses if points_down(end) and not points_down(start)]
-    away = np.maximum(starts.min(axis=0) - ends, ends - starts.max(axis=0)).max(axis=1)
-    n = int(away.argmax())
+    starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
+    ends = [site[-1, 2] for site in sites]
+    hanging = [
+        name
+        for name, start, end in zip(scenario.names, starts, ends, strict=True)
+        if (arm := build_arm_rows(scenario, name)).hangs(end) and not arm.hangs(start)
+    ]
+    away = [_distance_rad(end, [q for q in starts if len(q) == len(end)]) for end in ends]
+    n = int(np.argmax(away))
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
     elif away[n] > THROWN_RAD and not (scenario.external or any(s.hands for s in scenario.sites.values())):
         yield f"{scenario.names[n]} ends {away[n]:.3g} rad away from every start pose, and nobody pushed"
+
+
+def _distance_rad(q: Array, starts: Sequence[Array]) -> float:
+    """Returns by how much the joint that is furthest from where any start pose has it is."""
+    return float(np.maximum(np.min(starts, axis=0) - q, q - np.max(starts, axis=0)).max())
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
@@ -452,7 +471,7 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     last_s = 0.0
     for spec in scenario.sites.values():
         for source in (hand.actor for hand in spec.hands):
-            script = compute_operator_script(source, t_s, np.eye(JOINTS))
+            script = compute_operator_script(source, t_s, np.eye(len(source.a)))
             changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
             edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
             last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))

@@ -6,7 +6,6 @@ Invariant: keys end in their unit; a quantity that the log does not determine is
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.two_link_arm import JOINTS
 from ..log.log_reader import Log
 from ..scenario.expect import END_WINDOW_S
 from . import health
@@ -55,7 +54,7 @@ def _describe_scenario(log: Log) -> JsonObject:
 def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
     part, spec = log[name], log.scenario.sites[name]
     end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
-    moved = operator_displacement(log, twin, name)[2] if twin is not None else np.zeros((0, JOINTS))
+    moved = operator_displacement(log, twin, name)[2] if twin is not None else part.q[:0]
     made, expected = health.made_ticks(log, name), log.scenario.ticks(name)
     late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, health.PERCENTILES
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm

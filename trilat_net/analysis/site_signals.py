@@ -21,24 +21,24 @@ SETTLED_ERROR_RAD = 1e-2
 Signal = Callable[[SiteLog], Array]
 """A column over the K records of a site."""
 joint_angles: Signal = attrgetter("q")
-"""q, shape (K, 2), rad."""
+"""q, shape (K, n), rad."""
 reference_angles: Signal = attrgetter("q_des")
-"""q_des, Eq. (6), shape (K, 2), rad."""
+"""q_des, Eq. (6), shape (K, n), rad."""
 joint_errors: Signal = attrgetter("e")
-"""e = q - q_des, Eq. (9), shape (K, 2), rad."""
+"""e = q - q_des, Eq. (9), shape (K, n), rad."""
 controller_torques: Signal = attrgetter("tau")
-"""tau, Eq. (13), shape (K, 2), N m."""
+"""tau, Eq. (13), shape (K, n), N m."""
 parameter_estimates: Signal = attrgetter("theta_hat")
-"""theta_hat, Eq. (15), shape (K, 5), kg m^2 and kg m."""
+"""theta_hat, Eq. (15), shape (K, P); P = 5 of the planar arm, kg m^2 and kg m, 10 n of a chain."""
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns qd - qd_des, Eq. (18), shape (K, 2), rad/s."""
+    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s."""
     return part.qd - part.qd_des
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of operator and environment ON the arm, shape (K, 2), N m: the negative of tau_x."""
+    """Returns the torque of operator and environment ON the arm, shape (K, n), N m: the negative of tau_x."""
     return 0.0 - part.tau_x  # 0 - 0 is 0, where -0 would print as such
 
 
@@ -71,7 +71,7 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far operators moved a site: q of the log minus q of its twin without them, (K, 2), rad.
+    """Returns how far operators moved a site: q of the log minus q of its twin without them, (K, n), rad.
 
     Before it stand the ticks that both logs have, and their times, s.
     """

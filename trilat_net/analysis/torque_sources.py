@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
-from ..scenario import SiteSpec
+from ..scenario import Scenario, SiteSpec
 from ..scenario.operators import ActorBase
 from .aligned import AlignedRecords
-from .arm_rows import EndEffectorRows, compute_end_effector
+from .arm_rows import EndEffectorRows, build_arm_rows
 
 SCRIPT_TORQUE_TOLERANCE = 1e-8
 """Relative difference up to which a torque is the scenario's."""
@@ -54,7 +53,7 @@ def _target_progress(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
 
 
 def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Array) -> Array:
-    """Returns K (target - at) + B (its velocity - speed), per joint or axis, shape (K, 2)."""
+    """Returns K (target - at) + B (its velocity - speed), per joint or axis, shape (K, n)."""
     share, rate = _target_progress(source, t_s)
     a, way = np.array(source.a), np.array(source.b) - np.array(source.a)
     pull = np.array(source.K) * (a + share[:, None] * way - at)
@@ -65,7 +64,7 @@ def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Ar
 def compute_source_torque(
     source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a spring, damper or wall ON the arm, shape (K, 2), N m.
+    """Returns the torque of a spring, damper or wall ON the arm, shape (K, n), N m.
 
     Raises:
         ValueError: it is another source: a scripted torque is no function of the state.
@@ -87,7 +86,7 @@ def compute_source_torque(
 
 
 class TorqueSplit(NamedTuple):
-    """The torque ON an arm over its rows, shape (K, 2) each, N m.
+    """The torque ON an arm over its rows, shape (K, n) each, N m; its stops are part of the arm.
 
     Attributes:
         end_effector: its position, speed and Jacobian.
@@ -106,19 +105,19 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """Of the operator in all, shape (K, 2), N m."""
+        """Of the operator in all, shape (K, n), N m."""
         return self.operator_now + self.operator_held
 
     @property
     def environment(self) -> Array:
-        """Of the environment in all, shape (K, 2), N m."""
+        """Of the environment in all, shape (K, n), N m."""
         return self.environment_now + self.environment_held
 
 
-def split_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
-    """Returns the torque on an arm by its sources, held and not; without the script."""
-    end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), records.q, records.qd)
-    t_s = records.nominal_s
+def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
+    """Returns the torque on a site's arm by its sources, held and not; without the script."""
+    spec, t_s = scenario.sites[records.site], records.nominal_s
+    end_effector = build_arm_rows(scenario, records.site).place_end_effector(records.q, records.qd)
 
     def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
         total = np.zeros_like(records.q)
@@ -133,11 +132,11 @@ def split_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
 
 
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
-    """Returns the intention of an operator, which does not depend on the arm's motion, shape (K, 2), N m.
+    """Returns the intention of an operator, which does not depend on the arm's motion, shape (K, n), N m.
 
     A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the displacement of its
-    target and B times the target's speed, of one in the plane by the Jacobian J of one pose, shape (2, 2). It
-    moves if and only if the operator does.
+    target and B times the target's speed, of one of the end effector by the Jacobian J of one pose, shape
+    (2, 2) or (3, n). It moves if and only if the operator does.
     """
     if source.acts is TorqueKind.PULSE:
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
@@ -155,19 +154,19 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         turns = np.outer(t_s - source.start_s, source.table[:, 0]) + source.table[:, 1]
         intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
     else:
-        origin = np.zeros((len(t_s), JOINTS))
+        origin = np.zeros((len(t_s), len(source.a)))
         pull = compute_spring_effort(source, t_s, origin, origin)
         intent = pull @ J if source.acts is TorqueKind.TASK_HAND else pull
     acting = (t_s >= source.start_s) & (t_s < source.end_s)
     return np.where(acting[:, None], intent, 0.0)
 
 
-def attribute_torque(records: AlignedRecords, spec: SiteSpec) -> TorqueSplit:
-    """Returns the torque on an arm by its sources, with the operator's script.
+def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
+    """Returns the torque on a site's arm by its sources, with the operator's script.
 
     Without an operator in the scenario, the operator's torque is exactly zero where only rounding is left.
     """
-    split, t_s = split_torque(records, spec), records.nominal_s
+    split, t_s, spec = split_torque(records, scenario), records.nominal_s, scenario.sites[records.site]
     expected, scripts = np.zeros_like(records.q), np.zeros_like(records.q)
     for source in (one.actor for one in spec.hands):
         script = compute_operator_script(source, t_s, split.end_effector.J[0])

@@ -48,9 +48,6 @@ def sums_dtype(joints: int) -> np.dtype[np.void]:
     return np.dtype((np.record, fields + [(name, "f8", (joints,)) for name in names]))
 
 
-PEAK_COLUMNS = 6
-"""Columns of the buckets of `run_until` for arms of two joints."""
-
 _DIVERGED = int(Mode.DIVERGED)
 
 

@@ -14,7 +14,6 @@ from .. import process
 from ..analysis.run_end import NO_BUCKETS, reduce_to_buckets
 from ..core.site_step import Site
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
-from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array
 from ..execution import virtual
 from ..log.record_columns import Ints
@@ -29,11 +28,11 @@ class RecordBatch(NamedTuple):
 
     Attributes:
         t_ns: nominal time, shape (K,), ns.
-        q: joint angles, shape (K, 2), rad.
-        qd: joint velocities, shape (K, 2), rad/s.
-        q_des: reference, Eq. (6), shape (K, 2), rad.
-        tau: control torque, shape (K, 2), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), shape (K, 2), N m.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
+        q_des: reference, Eq. (6), shape (K, n), rad.
+        tau: control torque, shape (K, n), N m.
+        tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
         used: tick of the sample in use, -1 before the first, shape (K, P).
     """
 
@@ -80,17 +79,16 @@ class _PendingRecords:
     def __init__(self, take: Callable[[RecordBatch], None]) -> None:
         self._take = take
         self._t_ns, self._used, self._floats = array("q"), array("q"), array("d")
+        self._lengths: tuple[int, ...] = ()
 
     def add(self, output: TickRecord) -> None:
         """Takes one record."""
         self._t_ns.append(output.t_ns)
         self._used.extend(output.used)
-        floats = self._floats
-        floats.extend(output.q)
-        floats.extend(output.qd)
-        floats.extend(output.q_des)
-        floats.extend(output.tau)
-        floats.extend(output.tau_x)
+        vectors = (output.q, output.qd, output.q_des, output.tau, output.tau_x)
+        for vector in vectors:
+            self._floats.extend(vector)
+        self._lengths = tuple(map(len, vectors))
         if len(self._t_ns) >= BATCH_RECORDS:
             self.flush()
 
@@ -100,8 +98,9 @@ class _PendingRecords:
             return
         t_ns = np.array(self._t_ns, dtype=np.int64)
         used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), -1)
-        vectors = np.array(self._floats).reshape(len(t_ns), 5, JOINTS).transpose(1, 0, 2)
-        self._take(RecordBatch._make((t_ns, *vectors, used)))
+        rows = np.array(self._floats).reshape(len(t_ns), -1)
+        vectors = np.split(rows, np.cumsum(self._lengths)[:-1], axis=1)
+        self._take(RecordBatch._make((t_ns, *map(np.ascontiguousarray, vectors), used)))
         for column in (self._t_ns, self._used, self._floats):
             del column[:]
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
-from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.arm_rows import PlanarArmRows, compute_end_effector
 from trilat_net.analysis.certificate.energy_terms import (
     SiteConstants,
     SiteMotion,
@@ -24,8 +24,7 @@ ROWS = 40
 NOW = 30
 RATE_HZ = 100
 EQ = SiteConstants(
-    theta=np.array([3.0, 1.0, 1.0, 2.0, 1.0]),
-    g=9.81,
+    arm=PlanarArmRows(np.array([3.0, 1.0, 1.0, 2.0, 1.0]), 9.81, (1.0, 1.0)),
     Lambda=np.array([1.0, 2.5]),
     Kp=np.array([0.5, 2.0]),
     Kd=np.array([3.0, 0.7]),

@@ -221,8 +221,8 @@ def rows(seed: int) -> RecordBatch:
 
 
 def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
-    spec = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100}).sites["s"]
-    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), spec)
+    scenario = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100})
+    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s")
     for first, last in pairwise([0, *sorted(cuts), RECORDS]):
         if first < last:
             made.add(RecordBatch(*(column[first:last] for column in records)))

@@ -25,8 +25,8 @@ MIN_PERIODS = 10
 """Fewer show nothing of what happens within them."""
 ZERO_ENERGY_J = 1e-12
 """What rounding may leave of no energy at all."""
-EXTERNAL_SOURCES = ("hands", "walls")
-"""The sources of work that are outside of the loop: operator and environment."""
+EXTERNAL_SOURCES = ("hands", "walls", "stops")
+"""The sources of work that are outside of the loop: operator, environment, and stops of joints."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +112,12 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     pasts = {site: PeerTrajectory(own) for site, own in records.items()}
     energies = {}
     for site, own in records.items():
-        spec = log.scenario.sites[site]
         motion = SiteMotion(
             own,
-            energy_terms.derive_site_constants(spec),
+            energy_terms.derive_site_constants(log.scenario, site),
             trace_dominance(log, site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
-            split_torque(own, spec),
+            split_torque(own, log.scenario),
             Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL,
         )
         views = enumerate(motion.peers.values())
@@ -198,12 +197,12 @@ class EnergyBalance:
     @property
     def external_work(self) -> Array:
         """The work of operator and environment until then, shape (T,), J."""
-        return self.work["hands"] + self.work["walls"]
+        return _sum({name: self.work[name] for name in EXTERNAL_SOURCES if name in self.work})
 
     @property
     def external_sources(self) -> list[str]:
-        """The sources of external work: hands, walls, both or none."""
-        return [name for name in EXTERNAL_SOURCES if self.work[name].any()]
+        """The sources of external work: hands, walls and stops, or some of them."""
+        return [name for name in EXTERNAL_SOURCES if name in self.work and self.work[name].any()]
 
     @cached_property
     def scale(self) -> float:

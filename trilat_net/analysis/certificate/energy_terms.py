@@ -22,20 +22,19 @@ import numpy as np
 
 from ...core.vectors import Array
 from ...log.record_columns import Ints
-from ...scenario import SiteSpec
+from ...scenario import Scenario, SiteSpec
 from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
-from ..arm_rows import inertia_product_rows, regressor_rows
+from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
 from ..torque_sources import TorqueSplit
 
 
 class SiteConstants(NamedTuple):
-    """Constants of a site; vectors per joint have shape (2,), per parameter (5,).
+    """Constants of a site; vectors per joint have shape (n,), per parameter (P,).
 
     Attributes:
-        theta: the arm's true parameters.
-        g: gravitational acceleration, m/s^2.
+        arm: the arm, of true parameters.
         Lambda, Kp, Kd: gains, 1/s and N m s/rad.
         Gamma: adaptation gain.
         low, high: limits of the estimates.
@@ -43,8 +42,7 @@ class SiteConstants(NamedTuple):
         outside: True if the arm is outside of the program: theta is then what its author states.
     """
 
-    theta: Array
-    g: float
+    arm: ArmRows
     Lambda: Array
     Kp: Array
     Kd: Array
@@ -55,18 +53,23 @@ class SiteConstants(NamedTuple):
     outside: bool = False
 
     @property
+    def theta(self) -> Array:
+        """The arm's true parameters, shape (P,)."""
+        return self.arm.theta
+
+    @property
     def adapts(self) -> Bools:
-        """True for each parameter that the law adapts, shape (5,)."""
+        """True for each parameter that the law adapts, shape (P,)."""
         return self.Gamma > 0.0
 
 
-def derive_site_constants(spec: SiteSpec) -> SiteConstants:
+def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
-    gains = spec.control.gains(spec.arm.theta)
+    spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
+    gains = spec.control.gains(arm.theta)
     names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high")
     return SiteConstants(
-        theta=spec.arm.theta,
-        g=spec.arm.g_m_s2,
+        arm=arm,
         tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
         outside=spec.plant == "external",
         **{name: np.array(getattr(gains, name)) for name in names},
@@ -84,11 +87,11 @@ def explain_missing_functional(spec: SiteSpec) -> str:
 
 
 class PeriodEnds(NamedTuple):
-    """The ends of every period, shape (K - 1, 2); `right` is before the jump, `middle` half-way through it.
+    """The ends of every period, shape (K - 1, n); `right` is before the jump, `middle` half-way through it.
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: per peer the jump of e by the age of its sample, shape (P, K - 1, 2), rad.
+        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad.
         dominance: the jump of e by a step of dominance factors, rad.
         rule: the jump of e by the rule for stale peers, rad.
         r_left, r_right, r_middle: r = qd + Lambda e, rad/s.
@@ -127,25 +130,28 @@ class SiteMotion:
 
     @cached_property
     def r(self) -> Array:
-        """The sliding variable qd + Lambda e, Eq. (10), shape (K, 2), rad/s."""
+        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s."""
         return self.records.qd + self.constants.Lambda * self.records.e
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r of Eq. (15), shape (K, 5)."""
-        Yr: Array = np.einsum("kij,ki->kj", self.regressor(), self.r)
-        return Yr
+        """Y'r of Eq. (15), shape (K, P)."""
+        at, c = self.records, self.constants
+        v, a = -c.Lambda * at.e, -c.Lambda * (at.qd - at.qd_des)
+        return c.arm.gradient(at.q, at.qd, v, a, self.r)
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r with which the scheme advances the estimate over a period, shape (K - 1, 5)."""
+        """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
         return self.Yr[:-1] if self.digital else 0.5 * (self.Yr[:-1] + self.Yr[1:])
 
-    def regressor(self, rows: slice | Ints = slice(None)) -> Array:
-        """Returns Y of Eq. (13) in some rows, shape (K, 2, 5)."""
-        at, c = self.records, self.constants
+    def law_torque(self, rows: Ints) -> Array:
+        """Returns tau of Eq. (13), without its limit, in some rows, shape (K, n), N m."""
+        at = self.records
         ed = (at.qd - at.qd_des)[rows]
-        return regressor_rows(c.g, at.q[rows], at.qd[rows], -c.Lambda * at.e[rows], -c.Lambda * ed)
+        return _control_torque(
+            self.constants, at.theta_hat[rows], (at.q[rows], at.qd[rows], at.e[rows], ed), self.r[rows]
+        )
 
     @cached_property
     def ends(self) -> PeriodEnds:
@@ -202,7 +208,7 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     off = (at.theta_hat - c.theta)[:, c.adapts]
     in_transit = [_energy_in_transit(c, view) for view in site.peers.values()]
     return FunctionalParts(
-        kinetic=0.5 * (r * inertia_product_rows(c.theta, at.q, r)).sum(axis=1),
+        kinetic=0.5 * (r * c.arm.multiply_inertia(at.q, r)).sum(axis=1),
         parameter=0.5 * (off**2 / c.Gamma[c.adapts]).sum(axis=1),
         position=0.5 * (c.Lambda * c.Kd * at.e**2).sum(axis=1),
         delay=np.sum([a * x for a, x in zip(site.dominance.alpha.T, in_transit, strict=True)], axis=0),
@@ -242,14 +248,22 @@ def _nothing(site: SiteMotion) -> Increment:
 
 
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
-    """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2."""
+    """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2.
+
+    And r'(friction(qd) - friction(qd - r)) of joints with friction, which the law knows.
+    """
     at, c, ends, alpha = site.records, site.constants, site.ends, site.dominance
     left = right = np.zeros(len(at.known) - 1)
     for j, view in enumerate(site.peers.values()):
         left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, at.qd[:-1] - view.seen.qd[:-1])
         right = right + 0.5 * alpha.before[:, j] * _norm(c, at.qd[1:] - view.kept.qd)
     damping = ((c.Kp * r**2).sum(axis=1) for r in (ends.r_left, ends.r_right))
-    return {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
+    found = {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
+    friction = [
+        (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
+        for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
+    ]
+    return {**found, "friction": _trapezoid(site, *friction)} if np.any(friction) else found
 
 
 def compute_transfer(site: SiteMotion) -> Increment:
@@ -270,10 +284,12 @@ def _norm(c: SiteConstants, x: Array) -> Array:
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
     """Returns the work done on a site, by its source: all that may raise V_i besides transfer."""
-    torque = site.torque
+    torque, at = site.torque, site.records
+    stops = site.constants.arm.stop_torque(at.q, at.qd)
     return {
         "hands": torque_work(site, torque.operator_now, torque.operator_held),
         "walls": torque_work(site, torque.environment_now, torque.environment_held),
+        **({"stops": torque_work(site, stops, np.zeros_like(stops))} if stops.any() else {}),
         **{f"{peer}->{site.records.site}": link_work(site, j) for j, peer in enumerate(site.peers)},
         "shares": dominance_change_work(site),
         "rule": stale_rule_work(site),
@@ -283,7 +299,7 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held, (K, 2), N m."""
+    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held, (K, n), N m."""
     left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
     return _trapezoid(site, left, (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
 
@@ -345,20 +361,17 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     cut = np.flatnonzero((np.abs(at.tau) >= c.tau_limit).any(axis=1))
     power = np.zeros(len(at.known))
     if len(cut):
-        r, ed = site.r[cut], (at.qd - at.qd_des)[cut]
-        law = _control_torque(c, site.regressor(cut), at.theta_hat[cut], r, ed)
-        power[cut] = (r * (at.tau[cut] - law)).sum(axis=1)
+        power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
     """Returns by how much recorded torques differ from Eq. (13) within its limit, shape (K,), N m.
 
-    The larger of both joints; 0 where there is no record.
+    The largest of all joints; 0 where there is no record.
     """
     at, c = site.records, site.constants
-    every = np.arange(len(at.known))
-    law = _control_torque(c, site.regressor(every), at.theta_hat, site.r, at.qd - at.qd_des)
+    law = site.law_torque(np.arange(len(at.known)))
     error: Array = np.abs(at.tau - np.clip(law, -c.tau_limit, c.tau_limit)).max(axis=1)
     return np.where(at.known, error, 0.0)
 
@@ -411,16 +424,19 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     moved = np.abs(e - at.e[1:]) + np.abs(ends.qd_des_right - at.qd_des[1:]) > JUMP_TOLERANCE
     rows = np.flatnonzero(moved.any(axis=1))
     e, ed, r = e[rows], (qd - ends.qd_des_right)[rows], ends.r_right[rows]
-    Y = regressor_rows(c.g, q[rows], qd[rows], -c.Lambda * e, -c.Lambda * ed)
-    Yr[rows] = np.einsum("kij,ki->kj", Y, r)
-    law = _control_torque(c, Y, at.theta_hat[1:][rows], r, ed)
+    Yr[rows] = c.arm.gradient(q[rows], qd[rows], -c.Lambda * e, -c.Lambda * ed, r)
+    law = _control_torque(c, at.theta_hat[1:][rows], (q[rows], qd[rows], e, ed), r)
     tau[rows] = np.clip(law, -c.tau_limit, c.tau_limit)
     return tau, Yr
 
 
-def _control_torque(c: SiteConstants, Y: Array, theta_hat: Array, r: Array, ed: Array) -> Array:
-    """Returns tau of Eq. (13), without its limit, shape (K, 2), N m."""
-    found: Array = np.einsum("kij,kj->ki", Y, theta_hat) - c.Kp * r - c.Kd * ed
+def _control_torque(
+    c: SiteConstants, theta_hat: Array, at: tuple[Array, Array, Array, Array], r: Array
+) -> Array:
+    """Returns tau of Eq. (13) at q, qd, e and ed, without its limit, shape (K, n), N m."""
+    q, qd, e, ed = at
+    model = c.arm.law_torque(theta_hat, q, qd, -c.Lambda * e, -c.Lambda * ed)
+    found: Array = model - c.Kp * r - c.Kd * ed
     return found
 
 
@@ -432,6 +448,6 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
     c, ends = site.constants, site.ends
     if not de.any():
         return np.zeros(len(de))
-    gradient = inertia_product_rows(c.theta, site.records.q[1:], ends.r_middle) + c.Kd * ends.e_middle
+    gradient = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle) + c.Kd * ends.e_middle
     change: Array = (gradient * c.Lambda * de).sum(axis=1)
     return change

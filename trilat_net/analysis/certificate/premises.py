@@ -14,6 +14,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
+from ..aligned import Bools
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
 from ..timeline import find_mode_intervals
 from .energy_balance import ZERO_ENERGY_J, EnergyBalance, SiteEnergy
@@ -51,7 +52,7 @@ def check_scenario_premises(scenario: Scenario) -> list[Premise]:
     if lacking:
         return [Premise("law", False, "; ".join(lacking))]
     law = Premise("law", True, "adaptive at every site, of arms whose theta is known")
-    constants = {site: derive_site_constants(spec) for site, spec in scenario.sites.items()}
+    constants = {site: derive_site_constants(scenario, site) for site in scenario.names}
     return [law, _check_parameters(scenario, constants), _check_gains(constants)]
 
 
@@ -61,7 +62,8 @@ def check_run_premises(log: Log, energies: Mapping[str, SiteEnergy], balance: En
         _check_dominance(log, energies),
         _check_delays(energies),
         _check_following(log),
-        _check_torque_limits(energies),
+        _check_torque_limits(log.scenario, energies),
+        *_check_stops(log.scenario, energies),
         _check_operators(energies, balance),
         _check_records(balance),
     ]
@@ -146,13 +148,38 @@ def _check_following(log: Log) -> Premise:
     return Premise("following", not away, text)
 
 
-def _check_torque_limits(energies: Mapping[str, SiteEnergy]) -> Premise:
+def _check_torque_limits(scenario: Scenario, energies: Mapping[str, SiteEnergy]) -> Premise:
+    """No torque is cut off; of a chain the joints are named at which one is."""
     ticks = []
     for site, energy in energies.items():
         at_limit = np.abs(energy.motion.records.tau) >= energy.motion.constants.tau_limit
         if at_limit.any():
-            ticks.append(f"{site} at {np.count_nonzero(at_limit.any(axis=1))} ticks")
+            which = _name_joints(scenario, site, at_limit)
+            ticks.append(f"{site}{which} at {np.count_nonzero(at_limit.any(axis=1))} ticks")
     return Premise("torque", not ticks, f"cut off: {_list(ticks)}" if ticks else "never cut off")
+
+
+def _name_joints(scenario: Scenario, site: str, rows: Bools) -> str:
+    """Returns the joints of a chain for which some row is True, in brackets; "" of the planar arm."""
+    model = scenario.arms[site]
+    names = [model.joint_names[n] for n in np.flatnonzero(rows.any(axis=0))]
+    return "" if model.chain is None else f" ({_list(names)})"
+
+
+def _check_stops(scenario: Scenario, energies: Mapping[str, SiteEnergy]) -> list[Premise]:
+    """No stop is touched: they are passive with respect to qd, and not to r; [] if no joint has any."""
+    chains = [model.chain for model in scenario.arms.values() if model.chain is not None]
+    if not any(joint.stop_stiffness for chain in chains for joint in chain.joints):
+        return []
+    touched = []
+    for site, energy in energies.items():
+        records = energy.motion.records
+        pushed = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
+        if pushed.any():
+            first_s = records.t_s[int(np.argmax(pushed.any(axis=1)))]
+            touched.append(f"{site}{_name_joints(scenario, site, pushed)} from {first_s:.4g} s on")
+    text = f"the arm runs into stops of its joints: {_list(touched)}" if touched else "no stop is touched"
+    return [Premise("stops", not touched, text)]
 
 
 def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> Premise:

@@ -16,7 +16,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import SiteSpec
 from ..aligned import AlignedRecords, align_records
-from ..arm_rows import EndEffectorRows, compute_end_effector
+from ..arm_rows import EndEffectorRows, build_arm_rows
 from ..torque_sources import list_walls, wall_depth, wall_force
 from .premises import Premise, rise_above_minimum
 
@@ -59,7 +59,7 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
     found = []
     for site, records in align_records(log).items():
         spec = log.scenario.sites[site]
-        end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), records.q, records.qd)
+        end_effector = build_arm_rows(log.scenario, site).place_end_effector(records.q, records.qd)
         for wall in _list_sampled_walls(spec):
             force = wall_force(wall, records.nominal_s, end_effector)
             if (force > 0.0).any():
@@ -94,7 +94,7 @@ def _find_own_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) 
     actors = [one.actor for one in spec.environment]
     lasting = [one for one in actors if one.start_s <= t_s[0] and one.end_s > t_s[-1]]
     viscous = [one.B for one in lasting if one.acts is TorqueKind.VISCOUS and not one.sampled]
-    D = np.sum(viscous, axis=0) if viscous else np.zeros(2)
+    D = np.sum(viscous, axis=0) if viscous else np.zeros(J.shape[2])
     arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         compliance = np.where(arms > 0.0, arms / D, 0.0).sum(axis=1)

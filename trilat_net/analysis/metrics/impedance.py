@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ..aligned import Bools, find_latest_rows
 from .metric_catalogue import SiteRun
@@ -172,7 +171,7 @@ def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Itera
     records, by_source, _ = runs[site]
     script, usable = by_source.script, _find_still_rows(runs, site, alone=not wall)
     rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)
-    for joint in range(JOINTS):
+    for joint in range(records.qd.shape[1]):
         found = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
         if script is not None and usable is not None:
             usable, operator = usable & records.known, by_source.operator[:, joint]

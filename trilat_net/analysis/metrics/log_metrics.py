@@ -131,10 +131,11 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 def _measure(log: Log) -> LogMetrics:
     scenario, specs = log.scenario, log.scenario.sites
     runs = {
-        site: SiteRun(own, attribute_torque(own, specs[site]), trace_dominance(log, site, own.t_s))
+        site: SiteRun(own, attribute_torque(own, scenario), trace_dominance(log, site, own.t_s))
         for site, own in align_records(log).items()
     }
     absent = [site for site in log.sites if site not in runs]
+    estimates = {site: motion.read_parameter_estimates(scenario, run.records) for site, run in runs.items()}
     windows = [] if absent else static_windows.find_static_windows(runs)
     loads = static_windows.find_joint_loads(scenario, windows)
     ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
@@ -143,7 +144,7 @@ def _measure(log: Log) -> LogMetrics:
             **motion.measure_spread(log, runs),
             **static_windows.measure_force_sharing(absent, windows, ratios),
         },
-        {site: _measure_site(log, site, runs.get(site)) for site in log.sites},
+        {site: _measure_site(log, site, runs.get(site), estimates.get(site)) for site in log.sites},
         {
             use.name: {
                 **motion.measure_following(log, runs, use.peer, use.site),
@@ -157,7 +158,7 @@ def _measure(log: Log) -> LogMetrics:
             for site in log.sites
             for n, wall in enumerate(list_walls(specs[site]), 1)
         },
-        {site: motion.read_parameter_estimates(specs[site], run.records) for site, run in runs.items()},
+        estimates,
         static_windows.count_static_windows(absent, windows),
         loads,
         ratios,
@@ -166,13 +167,15 @@ def _measure(log: Log) -> LogMetrics:
     )
 
 
-def _measure_site(log: Log, site: str, run: SiteRun | None) -> MetricValues:
+def _measure_site(
+    log: Log, site: str, run: SiteRun | None, estimates: ParameterEstimates | None
+) -> MetricValues:
     none = unavailable(ENERGY, f"no records of {site}", of="site")
     return {
         **motion.measure_tracking(log, site),
         **motion.measure_effort(log, site),
         **(measure_port_energy(log.scenario, run) if run else none),
-        **motion.measure_parameter_error(log.scenario.sites[site], run.records if run else None),
+        **motion.measure_parameter_error(log.scenario, site, estimates),
         **measure_loop(log, site),
     }
 
@@ -195,7 +198,7 @@ def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
         "complete": log.complete,
         "run": _values(metrics.run),
         **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
-        "parameters": {site: estimates._asdict() for site, estimates in metrics.estimates.items()},
+        "parameters": {site: estimates.to_json() for site, estimates in metrics.estimates.items()},
         "windows_at_rest": None if windows is None else int(windows),
         **_details_to_json(metrics),
         "unknown": {

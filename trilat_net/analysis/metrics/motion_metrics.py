@@ -14,11 +14,15 @@ import numpy as np
 
 from ...core.exogenous import TorqueSource
 from ...core.site_setup import Law
+from ...core.vectors import Array
 from ...log.log_reader import Log
-from ...scenario import SiteSpec
+from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
-from ..aligned import AlignedRecords, find_latest_rows
+from ..aligned import AlignedRecords, Bools, find_latest_rows
+from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
+from ..base_parameters import find_base_parameters, find_consistent_links
+from ..json_values import JsonObject
 from ..torque_sources import wall_depth, wall_force
 from .metric_catalogue import (
     CONTACT,
@@ -27,6 +31,7 @@ from .metric_catalogue import (
     LEARNING,
     SPREAD,
     TRACKING,
+    Metric,
     MetricValues,
     SiteRun,
     metric,
@@ -62,6 +67,8 @@ def measure_spread(log: Log, runs: Mapping[str, SiteRun]) -> MetricValues:
     absent = [site for site in log.sites if site not in runs]
     if absent:
         return unavailable(SPREAD, f"no records of {', '.join(absent)}")
+    if len({run.records.q.shape[1] for run in runs.values()}) > 1:
+        return unavailable(SPREAD, "its arms have different joints", applies=False)
     first = runs[log.sites[0]].records
     known, poses = first.known.copy(), []
     for records in (run.records for run in runs.values()):
@@ -93,6 +100,8 @@ def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: st
     if absent:
         return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
     master, slave = runs[peer].records, runs[site].records
+    if master.q.shape[1] != slave.q.shape[1]:
+        return unavailable(FOLLOWING, "its arms have different joints", applies=False)
     row = slave.used[peer] - master.first
     inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
     row = np.clip(row, 0, len(master.known) - 1)
@@ -148,14 +157,33 @@ def measure_wall_contact(wall: TorqueSource, run: SiteRun | None) -> MetricValue
     return {key: metrics[key] for key in unavailable(CONTACT, "")}
 
 
+class BaseEstimates(NamedTuple):
+    """Estimates of a chain in the combinations of learnt parameters that torques determine, shape (B,) each.
+
+    Attributes:
+        parameter: the parameter that each is named after, by its place in theta, from 0.
+        theta: of the true parameters; None if unknown.
+        first, last: of the estimates of the first and the last record.
+        consistent_first, consistent_last: for each link, if some body has these estimates.
+    """
+
+    parameter: list[int]
+    theta: list[float] | None
+    first: list[float]
+    last: list[float]
+    consistent_first: list[bool]
+    consistent_last: list[bool]
+
+
 class ParameterEstimates(NamedTuple):
-    """Estimates of a site, shape (5,) each.
+    """Estimates of a site, shape (P,) each.
 
     Attributes:
         learnt: True for each that the law adapts.
         theta: the true parameters; None if unknown.
         first, last: the estimates of the first and the last record.
         slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two records.
+        base: the same of a chain, of whose parameters torques determine combinations alone; else None.
     """
 
     learnt: list[bool]
@@ -163,42 +191,80 @@ class ParameterEstimates(NamedTuple):
     first: list[float]
     last: list[float]
     slope_per_s: list[float] | None
+    base: BaseEstimates | None = None
+
+    def to_json(self) -> JsonObject:
+        """Returns the estimates, ready for JSON."""
+        content = self._asdict()
+        base = content.pop("base")
+        return content if base is None else {**content, "base": base._asdict()}
 
 
-def read_parameter_estimates(spec: SiteSpec, records: AlignedRecords) -> ParameterEstimates:
+def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
     """Returns the estimates of a site, and their least-squares slopes at the end."""
-    gains, theta_hat = spec.control.gains(spec.arm.theta), records.theta_hat
+    spec, arm = scenario.sites[records.site], build_arm_rows(scenario, records.site)
+    gains, theta_hat = spec.control.gains(arm.theta), records.theta_hat
     moved = (theta_hat != theta_hat[0]).any(axis=0)
     adapted = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
     rows, slope = records.known_at_end(LONG_END_S), None
     if np.count_nonzero(rows) >= 2:
         x = records.t_s[rows] - records.t_s[rows].mean()
         slope = (x @ theta_hat[rows] / (x @ x)).tolist()
-    theta = spec.arm.theta.tolist() if spec.arm.known else None
-    return ParameterEstimates(adapted.tolist(), theta, theta_hat[0].tolist(), theta_hat[-1].tolist(), slope)
+    theta = arm.theta.tolist() if spec.arm.known else None
+    base = None if isinstance(arm, PlanarArmRows) else _in_base(arm, adapted, theta, theta_hat)
+    ends = theta_hat[0].tolist(), theta_hat[-1].tolist()
+    return ParameterEstimates(adapted.tolist(), theta, *ends, slope, base)
 
 
-def measure_parameter_error(spec: SiteSpec, records: AlignedRecords | None) -> MetricValues:
-    """Returns the distance of the estimates from theta at both ends, and their rate of change at the end."""
-    if records is None:
+def _in_base(arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array) -> BaseEstimates:
+    base = find_base_parameters(arm, learnt)
+    first, last = (base.combination @ theta_hat[[0, -1]].T).T.tolist()
+    truth = None if theta is None else (base.combination @ np.array(theta)).tolist()
+    consistent = map(find_consistent_links, theta_hat[[0, -1]])
+    return BaseEstimates(base.kept.tolist(), truth, first, last, *consistent)
+
+
+def measure_parameter_error(
+    scenario: Scenario, site: str, estimates: ParameterEstimates | None
+) -> MetricValues:
+    """Returns the distance of the estimates from theta at both ends, and their rate of change at the end.
+
+    Distance and energy of a chain are those of the combinations that torques determine: what else its
+    estimates are off by stays as it is, and acts on nothing.
+    """
+    if estimates is None:
         return unavailable(LEARNING, "no records of the site")
-    estimates, gains = read_parameter_estimates(spec, records), spec.control.gains(spec.arm.theta)
-    rows = np.array(estimates.learnt)
+    arm = build_arm_rows(scenario, site)
+    gains, rows = scenario.sites[site].control.gains(arm.theta), np.array(estimates.learnt)
     if not rows.any():
         return unavailable(LEARNING, "nothing is learnt", applies=False)
-    slopes = estimates.slope_per_s
+    slopes, base = estimates.slope_per_s, estimates.base
     slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
+    metrics["odd_links"] = Metric(None, "it is no chain, of ten parameters a link", applies=False)
+    if base is not None:
+        metrics["odd_links"] = metric(base.consistent_last.count(False))
     if estimates.theta is None:
         return metrics
     off = np.array([estimates.first, estimates.last])[:, rows] - np.array(estimates.theta)[rows]
-    distance = np.linalg.norm(off, axis=1).tolist()
+    if base is not None:
+        off = np.array([base.first, base.last]) - np.array(base.theta)
     energy: list[float | None] = [None, None]
     if gains.law is Law.ADAPTIVE:
-        energy = (0.5 * (off**2 / np.array(gains.Gamma)[rows]).sum(axis=1)).tolist()
+        energy = _find_parameter_energy(arm, rows, np.array(gains.Gamma), off)
     why = "it is no finite number" if gains.law is Law.ADAPTIVE else "the gains of learning are not known"
-    for n, end in enumerate(("first", "last")):
-        metrics[f"theta_error_{end}"] = metric(distance[n])
-        metrics[f"theta_energy_{end}_j"] = metric(energy[n], why)
+    for end, distance, stored in zip(("first", "last"), np.linalg.norm(off, axis=1), energy, strict=True):
+        metrics[f"theta_error_{end}"] = metric(float(distance))
+        metrics[f"theta_energy_{end}_j"] = metric(stored, why)
     return metrics
+
+
+def _find_parameter_energy(arm: ArmRows, learnt: Bools, Gamma: Array, off: Array) -> list[float | None]:
+    """Returns the part of V of errors of base parameters, which learn with B Gamma B', shape (K, B), J."""
+    if isinstance(arm, PlanarArmRows):
+        energy = 0.5 * (off**2 / Gamma[learnt]).sum(axis=1)
+    else:
+        B = find_base_parameters(arm, learnt).combination
+        energy = 0.5 * (off * np.linalg.solve(B * Gamma @ B.T, off.T).T).sum(axis=1)
+    return list(energy.tolist())

@@ -16,25 +16,27 @@ import numpy as np
 from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
-from ...scenario import Scenario, SiteSpec
+from ...scenario import Scenario
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
-from ..arm_rows import inertia_product_rows, regressor_rows
+from ..arm_rows import ArmRows, build_arm_rows
 from .metric_catalogue import ENERGY, Metric, MetricValues, SiteRun, metric, unavailable
+
+_NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque held over every period, shape (K - 1, 2) or more, N m, per period, J."""
+    """Returns the work of a torque held over every period, shape (K - 1, n) or more, N m, per period, J."""
     work: Array = np.einsum("kj,kj->k", torque[: len(q) - 1], np.diff(q, axis=0))
     return work
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that follows the present, shape (K, 2), N m, per period, (K - 1,), J."""
+    """Returns the work of a torque that follows the present, shape (K, n), N m, per period, (K - 1,), J."""
     return held_work(0.5 * (torque[:-1] + torque[1:]), q)
 
 
 def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
-    """Returns the torque that the controller held over every period, shape (K - 1, 2), N m.
+    """Returns the torque that the controller held over every period, shape (K - 1, n), N m.
 
     The drives of an arm outside of the program got tau; their torque in between is unknown: the trapezoid.
     """
@@ -45,21 +47,23 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     return records.held_torque(np.asarray(spec.limits.tau_limit_nm), digital=digital)
 
 
-def mechanical_energy(spec: SiteSpec, records: AlignedRecords) -> Array:
-    """Returns the arm's kinetic and potential energy, shape (K,), J; of height zero when level.
+def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
+    """Returns the arm's kinetic and potential energy, shape (K,), J.
 
-    1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)).
+    1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)) of the planar arm: of height zero when level.
     """
-    theta, q = spec.arm.theta, records.q
-    kinetic = 0.5 * np.einsum("kj,kj->k", records.qd, inertia_product_rows(theta, q, records.qd))
-    height = theta[3] * np.sin(q[:, 0]) + theta[4] * np.sin(q[:, 0] + q[:, 1])
-    energy: Array = kinetic + spec.arm.g_m_s2 * height
+    kinetic = 0.5 * np.einsum("kj,kj->k", records.qd, arm.multiply_inertia(records.q, records.qd))
+    energy: Array = kinetic + arm.potential_energy(records.q)
     return energy
 
 
 def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
-    """Returns the energies of a site's ports, over the periods with both ends recorded."""
+    """Returns the energies of a site's ports, over the periods with both ends recorded.
+
+    Stops of joints count as environment; friction takes what the arm gains less.
+    """
     records, torque, _ = run
+    arm = build_arm_rows(scenario, records.site)
     spec, known, q = scenario.sites[records.site], records.known_periods, records.q
     if not known.any():
         return unavailable(ENERGY, "no two records in a row", of="site")
@@ -69,20 +73,24 @@ def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
 
     controller = total(held_work(held_control_torque(records, scenario), q))
     operator = total(trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q))
-    walls = total(trapezoid_work(torque.environment_now, q) + held_work(torque.environment_held, q))
+    stops, rubbed = arm.stop_torque(q, records.qd), arm.friction(records.qd)
+    walls = total(trapezoid_work(torque.environment_now + stops, q) + held_work(torque.environment_held, q))
+    friction = total(trapezoid_work(rubbed, q))
     no_walls = Metric(None, "the scenario has no environment here", applies=False)
+    bounded = bool(spec.environment) or stops.any()
     found = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(operator[-1]),
         "hands_most_j": metric(max(0.0, float(operator.max()))),
-        "walls_j": metric(walls[-1]) if spec.environment else no_walls,
-        "walls_most_j": metric(max(0.0, float(walls.max()))) if spec.environment else no_walls,
+        "walls_j": metric(walls[-1]) if bounded else no_walls,
+        "walls_most_j": metric(max(0.0, float(walls.max()))) if bounded else no_walls,
+        "friction_j": metric(friction[-1]) if rubbed.any() else _NO_FRICTION,
     }
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**found, "mechanical_j": unknown, "unaccounted_j": unknown}
-    change = total(np.diff(mechanical_energy(spec, records)))
-    unaccounted = np.abs(change - controller - operator - walls)
+    change = total(np.diff(mechanical_energy(arm, records)))
+    unaccounted = np.abs(change - controller - operator - walls + friction)
     return {**found, "mechanical_j": metric(change[-1]), "unaccounted_j": metric(float(unaccounted.max()))}
 
 
@@ -92,8 +100,8 @@ def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site:
     Over the periods that follow from records alone and in which the site follows its peers; of the torque
     that the law asks for, before its limit.
     """
-    spec = log.scenario.sites[site]
-    gains = spec.control.gains(spec.arm.theta)
+    arm = build_arm_rows(log.scenario, site)
+    gains = log.scenario.sites[site].control.gains(arm.theta)
     absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
@@ -108,31 +116,35 @@ def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site:
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
     j = list(records.used).index(peer)
-    torque = _delay_torque(gains, records, other, view, factors.alpha[:, [j]], factors.rate[:, [j]])
+    torque = _delay_torque(gains, arm, records, other, view, factors.alpha[:, [j]], factors.rate[:, [j]])
     injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
     return {"delay_j": metric(injected[-1]), "delay_most_j": metric(max(0.0, float(injected.max())))}
 
 
 def _delay_torque(
     gains: Gains,
+    arm: ArmRows,
     records: AlignedRecords,
     other: AlignedRecords,
     view: DelayedPeer,
     alpha: Array,
     rate: Array,
 ) -> Array:
-    """Returns the torque that the delay adds to that of the law, shape (K, 2), N m."""
+    """Returns the torque that the delay adds to that of the law, shape (K, n), N m.
+
+    Without what it does to the Coulomb friction that a law compensates.
+    """
     late = view.seen.q - view.now.q
     off = alpha * late
     off_rate = alpha * (view.seen.qd - view.now.qd) + rate * late
     if gains.law is Law.ADAPTIVE:
         Lambda = np.array(gains.Lambda)
-        Y = regressor_rows(0.0, records.q, records.qd, Lambda * off, Lambda * off_rate)
-        torque = np.einsum("kij,kj->ki", Y, records.theta_hat)
+        model = arm.weightless()
+        torque = model.law_torque(records.theta_hat, records.q, records.qd, Lambda * off, Lambda * off_rate)
         added: Array = torque + np.array(gains.Kp) * Lambda * off + np.array(gains.Kd) * off_rate
         return added
     added = np.array(gains.K) * off + np.array(gains.Kd) * off_rate
-    if any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
+    if np.any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
         used = records.used[other.site]
         row = np.clip(used - other.first, 0, len(other.known) - 1)
         came = np.where((used >= 0)[:, None], -other.tau_x[row], 0.0)

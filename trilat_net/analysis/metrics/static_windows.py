@@ -14,11 +14,11 @@ import numpy as np
 
 from ...core.exogenous import TorqueKind
 from ...core.site_setup import Law
-from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...log.record_columns import Ints
-from ...scenario import Scenario, SiteSpec
+from ...scenario import Scenario
 from ..aligned import find_latest_rows
+from ..arm_rows import build_arm_rows
 from ..lyapunov_weights import find_closed_groups, left_perron_vector
 from ..run_end import STATIC_SPEED_RAD_S
 from .metric_catalogue import Metric, MetricValues, SiteRun, metric
@@ -37,14 +37,12 @@ MIN_ANGLE_CHANGE_RAD = 1e-4
 """Least change of an angle, rad."""
 STILL_SCRIPT_NM = 1e-6
 """An operator whose script changed by no more between windows stood still, N m."""
-GRAVITY_THETA = (3, 4)
-"""The parameters of gravity, theta_4 and theta_5."""
 MIN_LOAD_SHARE = 0.02
 """A site with less than this share of the largest torque is not loaded."""
 
 
 class StaticWindow(NamedTuple):
-    """A static window, from its first tick to its last; per site means over it, shape (2,).
+    """A static window, from its first tick to its last; per site means over it, shape (n,).
 
     Attributes:
         torque, environment: of operator and environment ON the arm, and of the environment alone, N m.
@@ -134,7 +132,7 @@ def estimate_stiffness(windows: list[StaticWindow]) -> list[StiffnessEstimate]:
         site = moved[0]
         operator = [window.torque[site] - window.environment[site] for window in (before, after)]
         torques, angles = operator[1] - operator[0], after.q[site] - before.q[site]
-        for joint in range(JOINTS):
+        for joint in range(len(torques)):
             torque, angle = float(torques[joint]), float(angles[joint])
             if abs(torque) >= MIN_TORQUE_CHANGE_NM:
                 K = torque / angle if abs(angle) >= MIN_ANGLE_CHANGE_RAD else None
@@ -192,7 +190,7 @@ def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[Jo
     loads = []
     for window in windows:
         weights = _torque_weights(scenario, window.alpha)
-        for joint in range(JOINTS):
+        for joint in range(min(map(len, window.torque.values()))):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
             least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
             loaded = {site: value for site, value in torque.items() if abs(value) >= least}
@@ -271,32 +269,33 @@ def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, boo
 
 
 def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns pi_i / K_i per joint, shape (N, 2); or the reason why that does not weigh torques."""
+    """Returns pi_i / K_i per joint, shape (N, n); or the reason why that does not weigh torques."""
     if len(find_closed_groups(alpha)) > 1:
         return "two groups of sites follow nobody else: who feels whom is not unique"
     stiffness = []
-    for site, spec in scenario.sites.items():
-        K, why = _holding_stiffness(spec)
+    for site in scenario.names:
+        K, why = _holding_stiffness(scenario, site)
         if why:
             return f"{site}: {why}"
         stiffness.append(K)
     return left_perron_vector(alpha)[:, np.newaxis] / np.array(stiffness)
 
 
-def _holding_stiffness(spec: SiteSpec) -> tuple[Array, str]:
-    """Returns the stiffness that holds e at rest, shape (2,), N m/rad, and the reason why more acts."""
-    gains = spec.control.gains(spec.arm.theta)
+def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
+    """Returns the stiffness that holds e at rest, shape (n,), N m/rad, and the reason why more acts."""
+    spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
+    gains, none = spec.control.gains(arm.theta), np.zeros(len(spec.q0_rad))
     if gains.law is Law.OWN:
-        return np.zeros(JOINTS), "a law of somebody's own"
+        return none, "a law of somebody's own"
     if not spec.arm.known:
-        return np.zeros(JOINTS), "theta of the arm is not known"
-    if any(gains.k_f):
-        return np.zeros(JOINTS), "it reflects force: e is not all that its law goes by"
-    adaptive = gains.law is Law.ADAPTIVE
-    estimate, truth = gains.theta_hat0 if adaptive else gains.known, spec.arm.theta
-    if adaptive and any(gains.Gamma[n] > 0.0 for n in GRAVITY_THETA):
-        return np.zeros(JOINTS), "gravity is learnt: the estimates take up the load"
-    if any(estimate[n] != truth[n] for n in GRAVITY_THETA) and spec.arm.g_m_s2 > 0.0:
-        return np.zeros(JOINTS), "gravity is not known exactly"
+        return none, "theta of the arm is not known"
+    if np.any(gains.k_f):
+        return none, "it reflects force: e is not all that its law goes by"
+    adaptive, gravity = gains.law is Law.ADAPTIVE, arm.gravity_parameters
+    estimate = np.array(gains.theta_hat0 if adaptive else gains.known)
+    if adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
+        return none, "gravity is learnt: the estimates take up the load"
+    if np.any((estimate != arm.theta) & gravity) and spec.arm.g_m_s2 > 0.0:
+        return none, "gravity is not known exactly"
     K = np.array(gains.Kp) * np.array(gains.Lambda) if adaptive else np.array(gains.K)
     return K, "" if (K > 0.0).all() else "nothing holds its e"

@@ -57,6 +57,8 @@ def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Returns the condition in closed form that covers a scenario, or None."""
     if scenario.timeline or any(spec.on_stale.action != "use" for spec in scenario.sites.values()):
         return None
+    if any(model.chain is not None for model in scenario.arms.values()):  # they are of the planar arm
+        return None
     return _damped(scenario) or _sampled(scenario)
 
 

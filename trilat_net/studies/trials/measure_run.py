@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ...analysis.arm_rows import compute_end_effector
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.run_end import (
     NO_BUCKETS,
     RunEnd,
@@ -23,11 +23,10 @@ from ...analysis.run_end import (
 from ...analysis.timeline import first_divergence_s
 from ...analysis.torque_sources import list_walls, wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
-from ...core.two_link_arm import JOINTS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import find_absent_samples
 from ...log.log_reader import Log
-from ...scenario import Expect, Scenario, SiteSpec
+from ...scenario import Expect, Scenario
 from ...scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
 from ..record_batches import RecordBatch, join_batches, run_in_batches
 
@@ -42,10 +41,11 @@ class Range(NamedTuple):
 class WindowStats:
     """Statistics of one site within a window, so far."""
 
-    def __init__(self, window: ExpectWindow, spec: SiteSpec) -> None:
+    def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
+        spec = scenario.sites[site]
         self._from_ns, self._to_ns = (round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s))
         self._period_ns = NS_PER_S // spec.rate_hz + 1
-        self._spec = spec
+        self._arm = build_arm_rows(scenario, site)
         self._walls = list_walls(spec)
         self._seen_ns = -1
         self._records = 0
@@ -70,7 +70,7 @@ class WindowStats:
         self._q_most = np.maximum(self._q_most, inside.q.max(axis=0))
         self._push_sum -= inside.tau_x.sum(axis=0)
         if self._walls:
-            tip = compute_end_effector((self._spec.arm.l1_m, self._spec.arm.l2_m), inside.q, inside.qd)
+            tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
             self._add_force(np.sum([wall_force(wall, t_s, tip) for wall in self._walls], axis=0))
 
@@ -131,7 +131,7 @@ class SiteStats:
         self.age_max_ms = np.zeros(len(peer_rates))
         self._age_sum_ms = np.zeros(len(peer_rates))
         self._age_records = np.zeros(len(peer_rates), dtype=np.int64)
-        self._squares = np.zeros(JOINTS)
+        self._squares = np.zeros(1)
         self._buckets = NO_BUCKETS
         self._tail: list[RecordBatch] = []
 
@@ -145,7 +145,7 @@ class SiteStats:
         self.peak_error_rad = max(self.peak_error_rad, float(largest.max()))
         self.peak_torque_nm = max(self.peak_torque_nm, float(np.abs(rows.tau).max()))
         self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(np.abs(rows.qd).max()))
-        self._squares += (error * error).sum(axis=0)
+        self._squares = self._squares + (error * error).sum(axis=0)
         apart = np.flatnonzero(largest >= self._synchronised_rad)
         if len(apart):
             self.apart_ns = int(rows.t_ns[apart[-1]])
@@ -172,7 +172,7 @@ class SiteStats:
 
     @property
     def rms_error_rad(self) -> float:
-        """Root mean square of e of the worse joint, rad."""
+        """Root mean square of e of the worst joint, rad."""
         return float(np.sqrt(self._squares.max() / max(1, self.records)))
 
     @property
@@ -197,8 +197,8 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """The torque of operator and environment at the last record, shape (2,), N m."""
-        return self._tail[-1].tau_x[-1] if self._tail else np.zeros(JOINTS)
+        """The torque of operator and environment at the last record, shape (n,), N m."""
+        return self._tail[-1].tau_x[-1] if self._tail else np.zeros(1)
 
 
 class LinkAge(msgspec.Struct, frozen=True):
@@ -343,7 +343,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
 def _site_stats(scenario: Scenario, site: str) -> SiteStats:
     peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
     stretches = [
-        WindowStats(window, scenario.sites[site]) if window.site in ("", site) else None
+        WindowStats(window, scenario, site) if window.site in ("", site) else None
         for window in scenario.expect.windows
     ]
     return SiteStats(peer_rates, scenario.expect.synchronised_rad, stretches)

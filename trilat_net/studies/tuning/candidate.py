@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.run_end import RunEnd, RunTrace, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S
@@ -19,7 +20,6 @@ from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
-from ...scenario.scenario_types import SiteSpec
 from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
 from ..record_batches import RecordBatch, join_batches, run_in_batches
@@ -114,7 +114,10 @@ def _run(scenario: Scenario) -> _Run:
     end_rad, before_rad = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
     largest = np.abs(e).max(axis=(0, 2))
     apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
-    efforts, saturated = zip(*map(_effort, records, scenario.sites.values()), strict=True)
+    efforts, saturated = zip(
+        *(_effort(record, scenario, site) for record, site in zip(records, scenario.names, strict=True)),
+        strict=True,
+    )
     return _Run(
         end=classify_run_end(scenario, trace),
         fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
@@ -138,12 +141,10 @@ def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
     return at_ns / NS_PER_S, q, q - q_des
 
 
-def _effort(record: RecordBatch, site: SiteSpec) -> tuple[float, float]:
+def _effort(record: RecordBatch, scenario: Scenario, site: str) -> tuple[float, float]:
     """Returns the mean square of tau - G(q), (N m)^2, and the share of torques at the clamp."""
-    arm = site.arm
-    inner, outer = arm.g_m_s2 * arm.theta[3:, np.newaxis] * np.cos(np.cumsum(record.q, axis=1).T)
-    gravity = np.array([inner + outer, outer]).T
-    clamped = np.abs(record.tau) >= site.limits.tau_limit_nm
+    gravity = build_arm_rows(scenario, site).gravity_torque(record.q)
+    clamped = np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm
     return float(np.mean((record.tau - gravity) ** 2)), float(np.mean(clamped))
 
 

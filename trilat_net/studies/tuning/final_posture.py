@@ -19,9 +19,9 @@ from enum import StrEnum
 import msgspec
 import numpy as np
 
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
-from ...analysis.run_end import EndBehaviour, RunEnd, Stability, points_down
-from ...core.two_link_arm import JOINTS
+from ...analysis.run_end import EndBehaviour, RunEnd, Stability
 from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...log.log_reader import Log
@@ -84,9 +84,9 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     """Returns q*, the pose of a weightless consensus, shape (K, n), rad, at times of shape (K,), s."""
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
-    start = sum(weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items())
-    stiffness = np.zeros((len(t_s), JOINTS))
-    torque = np.zeros((len(t_s), JOINTS))
+    start = np.sum([weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()], axis=0)
+    stiffness = np.zeros((len(t_s), len(start)))
+    torque = np.zeros((len(t_s), len(start)))
     for name, hand in _springs(scenario):
         on, target = _target(hand, t_s)
         pull = weights[name] * np.array(hand.stiffness_nm_rad) * on
@@ -191,7 +191,8 @@ def check_final_posture(log: Log) -> list[str]:
     wanted_s = log.scenario.duration_s
     if last_s <= wanted_s - _SHORT_S:
         warnings.append(f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run")
-    hanging = [site for site, q in ends.items() if points_down(q) and not points_down(log[site].q[0])]
+    arms = {site: build_arm_rows(log.scenario, site) for site in parts}
+    hanging = [s for s, q in ends.items() if arms[s].hangs(q) and not arms[s].hangs(parts[s].q[0])]
     if not hanging:
         return [*warnings, *_warn_fallen(log, ends)]
     verb = "hangs" if len(hanging) == 1 else "hang"

@@ -10,13 +10,13 @@ parameters, the true ones times one share, and no inertia: a law that estimates 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ...core.two_link_arm import PARAMETERS
+import numpy as np
+
+from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
 from ...scenario.fields import MAX_QUANTITY, suggest_nearest
 
-GRAVITY_PARAMETERS = slice(3, PARAMETERS)
-"""Where the gravity parameters stand in theta, Eq. (24)."""
 MIN_BOX = 0.1
 """Least half width of a box of estimates, as a share of the given parameters."""
 
@@ -32,18 +32,20 @@ class ModelInformation(NamedTuple):
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the first estimate of theta, shape (5,): gravity as given, inertia unknown."""
-        theta = scenario.sites[site].arm.theta * self.gravity
-        theta[: GRAVITY_PARAMETERS.start] = 0.0
+        """Returns the first estimate of theta, shape (P,): gravity as given, inertia unknown."""
+        arm = build_arm_rows(scenario, site)
+        theta = np.where(arm.gravity_parameters, arm.theta * self.gravity, 0.0)
         return [float(f"{value:.12g}") for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the lower and the upper sides of the box, shape (5,) each."""
-        unknown = GRAVITY_PARAMETERS.start
-        gravity = self.prior(scenario, site)[GRAVITY_PARAMETERS]
+        """Returns the lower and the upper sides of the box, shape (P,) each: of inertia there is none."""
+        known = build_arm_rows(scenario, site).gravity_parameters.tolist()
+        given = list(zip(self.prior(scenario, site), known, strict=True))
         low, high = (
-            [sign * MAX_QUANTITY] * unknown
-            + [float(f"{value * (1.0 + sign * self.box):.12g}") for value in gravity]
+            [
+                float(f"{value + sign * self.box * abs(value):.12g}") if fixed else sign * MAX_QUANTITY
+                for value, fixed in given
+            ]
             for sign in (-1.0, 1.0)
         )
         return low, high
@@ -112,10 +114,11 @@ def _adaptive_box(scenario: Scenario, knowledge: ModelInformation, gains: GainVa
 
 
 def _known(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    inertia = slice(0, GRAVITY_PARAMETERS.start)
     controls = _adaptive(scenario, knowledge, {**gains, "Gamma": 0.0})
     for name, table in controls.items():
-        table["theta_hat0"][inertia] = scenario.sites[name].arm.theta[inertia].tolist()
+        arm = build_arm_rows(scenario, name)
+        theta = zip(arm.gravity_parameters, table["theta_hat0"], arm.theta.tolist(), strict=True)
+        table["theta_hat0"] = [told if gravity else truth for gravity, told, truth in theta]
     return controls
 
 
