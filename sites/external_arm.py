@@ -55,10 +55,14 @@ class ExternalArm:
             SessionError: none arrived in time.
         """
         say(f"waiting for its arm on {self._place}")
+        told: set[str] = set()
         while not stopped():
             self.poll()
             if self.newest is not None:
                 return True
+            for reason in [one for one in self._dropped if one.startswith("of ") and one not in told]:
+                told.add(reason)  # as in: of 6 joints; the scenario has 7
+                say(f"its arm sends measurements {reason}")
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
                 dropped = ", ".join(f"{count} {reason}" for reason, count in self._dropped.items())
@@ -118,5 +122,5 @@ class ExternalArm:
             self._dropped["missing measurement"] += message.n - self._n - 1
         self._counting = self._bound
         self._n = message.n
-        self.newest = PlantState(message.q, message.qd)
+        self.newest = PlantState(message.q, message.qd, message.tau_x)
         self.taken += 1

@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgpack
@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.external_arm import MEASUREMENTS_KEPT, SILENCE_LIMIT_NS, ExternalArm
+from tests.scenario.chains import six
 from trilat_net.core.site_step import Site
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
@@ -35,13 +36,13 @@ A_SECOND = 1_000_000_000
 
 
 class Pendulum:
-    """Two joints that do not feel each other, with friction: no arm of ours."""
+    """Joints that do not feel each other, with friction: no arm of ours."""
 
-    def __init__(self) -> None:
-        self.q, self.qd = [0.3, -0.1], [0.0, 0.0]
+    def __init__(self, q: Sequence[float]) -> None:
+        self.q, self.qd = list(q), [0.0] * len(q)
 
     def move(self, tau: tuple[float, ...] | None) -> None:
-        for i in range(2):
+        for i in range(len(self.q)):
             push = 0.0 if tau is None else tau[i] - 3.0 * math.sin(self.q[i])
             self.qd[i] += 1e-3 * (push - 2.0 * self.qd[i] - 0.5 * math.tanh(50.0 * self.qd[i]))
             self.q[i] += 1e-3 * self.qd[i]
@@ -50,16 +51,23 @@ class Pendulum:
 Act = Callable[[Bus, RelayClock], None]
 
 
-def driving(sent: list[list[float]], torques: list[tuple[float, ...]], until_ns: int = 2**62) -> Act:
+def driving(
+    sent: list[list[float]],
+    torques: list[tuple[float, ...]],
+    until_ns: int = 2**62,
+    start: tuple[float, ...] = (0.3, -0.1),
+    senses: bool = False,
+) -> Act:
     """The program of an arm, every millisecond, a quarter of one before the site's tick."""
 
     def drive(bus: Bus, clock: RelayClock) -> None:
-        arm = Pendulum()
+        arm = Pendulum(start)
         with ArmPort(bus, clock, SESSION, "s") as port:
             next_ns = clock.monotonic_ns()
             while not port.over and next_ns < until_ns:
-                port.send(arm.q, arm.qd)
-                sent.append([*arm.q, *arm.qd])
+                felt = [math.sin(7.0 * q) for q in arm.q] if senses else []
+                port.send(arm.q, arm.qd, felt)
+                sent.append([*arm.q, *arm.qd, *felt])
                 tau = port.torque()
                 torques.extend([] if tau is None else [tau])
                 arm.move(tau)
@@ -105,6 +113,38 @@ def whole(log: Log) -> None:
     assert verdict.whole_run
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
     assert compare_with_virtual(log).fed.identical == verdict.records
+
+
+def test_an_arm_of_six_joints_sends_the_torque_that_it_measures(tmp_path: Path) -> None:
+    """Its tau_x is the record's to the bit, goes to the peers, and is what the log executes again."""
+    changes = {"sites.s.plant": "external", "sites.s.arm.known": False, "duration_s": 0.3}
+    sent: list[list[float]] = []
+    session = Session.whole(six(**changes), tmp_path, ends={})
+    start = six().sites["s"].q0_rad
+    session.stranger(driving(sent, [], start=start, senses=True), at_ns=A_SECOND + 200_250_000)
+    log = session.run()
+    assert set(session.ends.values()) == {0}
+    records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
+    assert records in [sent[n : n + 300] for n, one in enumerate(sent) if one == records[0]]
+    assert abs(log["s"].tau_x).min(axis=0).max() > 0.0
+    whole(log)
+
+
+def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
+    scenario = six(**{"sites.s.plant": "external", "sites.s.arm.known": False})
+    session = Session(scenario, tmp_path / "run.mcap")
+    session.stranger(driving([], [], until_ns=3 * A_SECOND, start=(0.0,) * 7), at_ns=A_SECOND)
+
+    def alone(clock: RelayClock) -> None:
+        with pytest.raises(SessionError, match=r"dropped: \d+ of 7 joints; the scenario has 6"):
+            session.live("s", clock)
+
+    session.relay.add("s", alone)
+    session.play()
+    assert (
+        sum("its arm sends measurements of 7 joints; the scenario has 6" in line for line in session.said)
+        == 1
+    )
 
 
 def test_an_arm_that_falls_silent_ends_the_session_in_order_and_is_named(tmp_path: Path) -> None:
@@ -181,6 +221,8 @@ class Heard:
         (measurement(q=[1.0] * 13), "malformed"),
         (measurement(q=[1.0, math.nan]), "not finite"),
         (measurement(qd=[math.inf, 0.0]), "not finite"),
+        (measurement(tau_x=[1.0]), "malformed"),
+        (measurement(tau_x=[1.0, math.nan]), "malformed"),
         (measurement(n=-1), "malformed"),
         (measurement(more=1), "malformed"),
         (measurement(site="m"), "stranger"),
@@ -282,7 +324,7 @@ def test_a_site_that_is_gone_is_over() -> None:
 
 def test_the_example_of_a_message_is_one() -> None:
     message = ArmMeasurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
-    assert encode(message) == measurement()
+    assert encode(message) == measurement(tau_x=[])
 
 
 def test_the_page_names_every_field_of_a_message() -> None:

@@ -132,7 +132,7 @@ def update_external_torque(
     now_n = put_torque_on_chain(t_s, s.q, s.qd, s.tip, chain, actors, table, 0, s.on_arm)
     s.wall_n = max(held_n, now_n)
     for i in range(chain.shape[0]):
-        s.on_arm[i] += s.held[i]
+        s.on_arm[i] += s.held[i] + s.sensed[i]  # one of the two is zero
     if s.task:
         update_wrench(s)
 

@@ -26,7 +26,10 @@ _SETTINGS = ("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale
 _COUNTS = ("joints", "shared", "parameters", "task")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
 """Constant gains; the first estimate becomes `theta_hat`."""
-_PER_JOINT = ("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "r", "u")
+_PER_JOINT = (
+    *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
+    *("r", "u"),
+)
 _PER_COORDINATE = (
     *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),
 )

@@ -95,7 +95,8 @@ class Site:
             self.order(command)
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
-            s.q, s.qd = tick.measured
+            s.q, s.qd = tick.measured.q, tick.measured.qd
+            s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
         t_ns = tick.k * NS_PER_S // self.rate_hz
         memory: list[float] = []
         if self._user_law is None:

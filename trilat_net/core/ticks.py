@@ -102,10 +102,17 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Measured q, rad, and qd, rad/s, of an arm outside of the program."""
+    """What was measured of an arm outside of the program.
+
+    Attributes:
+        q: joint angles, rad.
+        qd: joint velocities, rad/s.
+        tau_x: torque of operator and environment, N m, in the sign of the record; empty: none is measured.
+    """
 
     q: Sequence[float]
     qd: Sequence[float]
+    tau_x: Sequence[float] = ()
 
 
 class TickInput(NamedTuple):

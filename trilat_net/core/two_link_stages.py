@@ -84,6 +84,9 @@ def update_external_torque(t_s: float, s: Row, actors: TorqueSourceRows, table: 
     put_pair(s.held, (held[0], held[1]))
     s.wall_n = max(held[2], now[2])
     put_pair(s.on_arm, (now[0] + held[0], now[1] + held[1]))
+    if s.external != 0:
+        for i in range(2):
+            s.on_arm[i] += s.sensed[i]
 
 
 @leaf

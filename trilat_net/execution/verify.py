@@ -213,7 +213,7 @@ class SiteVerifier:
             arrivals, missing = self._inputs.arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
-        plant = PlantState(state.q, state.qd) if self._external else None
+        plant = PlantState(state.q, state.qd, state.tau_x) if self._external else None
         output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)

@@ -151,7 +151,9 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
     states = {name: log[name].states for name in log.sites}
-    arms = {name: {s.tick: PlantState(s.q, s.qd) for s in states[name]} for name in log.scenario.external}
+    arms = {
+        name: {s.tick: PlantState(s.q, s.qd, s.tau_x) for s in states[name]} for name in log.scenario.external
+    }
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}
 

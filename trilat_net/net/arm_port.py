@@ -63,8 +63,18 @@ class ArmPort:
     def __exit__(self, *_: object) -> None:
         self._bus.close()
 
-    def send(self, q: Sequence[float], qd: Sequence[float]) -> None:
-        """Sends the position of the arm: joint angles, rad, and joint velocities, rad/s."""
+    def send(self, q: Sequence[float], qd: Sequence[float], tau_x: Sequence[float] = ()) -> None:
+        """Sends what was measured of the arm.
+
+        Args:
+            q: joint angles, rad.
+            qd: joint velocities, rad/s.
+            tau_x: torque of operator and environment, N m per joint, where the arm measures it; in the
+                paper's sign: the torque ON the arm is its negative.
+
+        Raises:
+            ValueError: tau_x is not as long as q, or not finite.
+        """
         message = ArmMeasurement(
             site=self._site,
             boot=self._boot,
@@ -72,6 +82,7 @@ class ArmPort:
             q=[float(angle) for angle in q],
             qd=[float(speed) for speed in qd],
             sent_ns=self._clock.monotonic_ns(),
+            tau_x=[float(torque) for torque in tau_x],
         )
         self._n += 1
         self._publish(encode(message))

@@ -5,11 +5,12 @@ itself, a measurement as q and qd of the record of the tick that used it. A site
 measurement at each tick.
 """
 
+import math
 from typing import Any, Literal
 
 import msgspec
 
-from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber
+from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64
 BACKFILL_BYTES = 40_000
@@ -92,6 +93,8 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     Attributes:
         boot: the start of the arm's program, random: a site listens to one of them.
         n: number of the measurement of that start, from 0.
+        tau_x: torque of operator and environment, as a record has it: the torque ON the arm is its negative;
+            empty where it is not measured.
         sent_ns: time of sending, ns of the program's own monotonic clock.
     """
 
@@ -101,3 +104,9 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     q: Angles
     qd: Speeds
     sent_ns: Instant
+    tau_x: Torques = []
+
+    def __post_init__(self) -> None:
+        """Refuses a torque that is not one finite number per joint."""
+        if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
+            raise ValueError(f"tau_x must be {len(self.q)} finite numbers, as q is")

@@ -5,6 +5,7 @@ are entries as a whole. Names, titles and expectations describe an experiment an
 differences.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import msgspec
 import numpy as np
 
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
+from .arms import read_arm
 from .laws import Adaptive, AdaptiveBox, ControlLaw, ProportionalDamped, ProportionalDerivativeDamped
 from .scenario_types import Scenario
 
@@ -55,6 +57,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
+        *_describe_arms(scenario),
         *(f"assumed: {text}" for text in scenario.assumed),
         *(
             f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
@@ -62,6 +65,32 @@ def describe_scenario(scenario: Scenario) -> list[str]:
             if one.normal or one.uniform
         ),
     ]
+
+
+def _describe_arms(scenario: Scenario) -> list[str]:
+    """Returns the facts of the arms that come from files: their joints, what these move, and their limits."""
+    lines: list[str] = []
+    for arm in dict.fromkeys(spec.arm for spec in scenario.sites.values() if spec.arm.urdf):
+        owners = [name for name, spec in scenario.sites.items() if spec.arm == arm]
+        chain, model = read_arm(arm, scenario.urdf), scenario.arms[owners[0]]
+        mass = sum(joint.inertia[0] for joint in chain.joints)
+        lines.append(
+            f"arm of {', '.join(owners)}: {arm.urdf}, {len(chain.joints)} joints from {chain.base} to "
+            f"{chain.tip}, {mass:.4g} kg move"
+        )
+        assert model.chain is not None
+        for joint, drive in zip(chain.joints, model.chain.joints, strict=True):
+            unit, effort, inertia = ("m", "N", "kg") if drive.prismatic else ("rad", "N m", "kg m^2")
+            facts = [
+                f"{joint.lower:.4g} to {joint.upper:.4g} {unit}" * (joint.lower > -math.inf),
+                f"{joint.effort_limit:.4g} {effort}" * (joint.effort_limit < math.inf),
+                f"{joint.velocity_limit:.4g} {unit}/s" * (joint.velocity_limit < math.inf),
+                f"drive {drive.armature_kg_m2:.4g} {inertia}" * (drive.armature_kg_m2 > 0.0),
+            ]
+            moved = f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"
+            lines.append("; ".join([moved, *filter(None, facts)]))
+        lines += [f"  note: {note}" for note in chain.notes]
+    return lines
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")

@@ -170,7 +170,7 @@ def _check_joint_space(scenario: Scenario) -> None:
             )
     for name, model in scenario.arms.items():
         site = scenario.sites[name]
-        if model.chain is None or isinstance(site.control, ImportedLaw):
+        if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
         gains = site.control.gains(model.theta)
         damping = np.zeros(counts[name]) + gains.Kp + gains.d
