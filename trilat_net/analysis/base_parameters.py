@@ -66,6 +66,7 @@ def _find_base_parameters(chain: ChainSetup, learnt: tuple[bool, ...]) -> BasePa
     factors = np.linalg.lstsq(W[:, kept], W, rcond=None)[0]
     combination = np.zeros((len(kept), len(learnt)))
     combination[:, places] = np.where(np.abs(factors) > DEPENDENT_SHARE, factors, 0.0)
+    combination[:, places[kept]] = np.eye(len(kept))
     return BaseParameters(places[kept], combination)
 
 

@@ -129,7 +129,7 @@ QUANTITIES = (
     Quantity("theta_energy_first_j", "site", LEARNING, "theta~' Gamma^-1 theta~ / 2 at first", "J"),
     Quantity("theta_energy_last_j", "site", LEARNING, "the same at last", "J"),
     Quantity("theta_slope_per_s", "site", LEARNING, "|theta_hat'|, last 5 s", "1/s"),
-    Quantity("odd_links", "site", LEARNING, "links as no body is, at last", "", "sum"),
+    Quantity("unphysical_links", "site", LEARNING, "unphysical links, at last", "", "sum"),
     Quantity("age_mean_ms", "link", NETWORK, "effective delay, mean", "ms"),
     Quantity("age_p99_ms", "link", NETWORK, "effective delay, p99", "ms"),
     Quantity("age_max_ms", "link", NETWORK, "effective delay, largest", "ms"),

@@ -242,9 +242,9 @@ def measure_parameter_error(
     slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
-    metrics["odd_links"] = Metric(None, "it is no chain, of ten parameters a link", applies=False)
+    metrics["unphysical_links"] = Metric(None, "it is no chain, of ten parameters a link", applies=False)
     if base is not None:
-        metrics["odd_links"] = metric(base.consistent_last.count(False))
+        metrics["unphysical_links"] = metric(base.consistent_last.count(False))
     if estimates.theta is None:
         return metrics
     off = np.array([estimates.first, estimates.last])[:, rows] - np.array(estimates.theta)[rows]
