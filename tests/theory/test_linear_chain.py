@@ -27,9 +27,11 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.reporting.port_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
-from trilat_net.theory import LinearLoop, find_equilibrium
+from trilat_net.studies.sweep.stability_map import evaluate_criterion
+from trilat_net.theory import LinearLoop, find_equilibrium, find_linear_edge
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
+from trilat_net.theory.equilibrium import predict_equilibrium
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
@@ -269,3 +271,28 @@ def test_the_law_is_passive_in_r_for_six_joints_as_its_theorem_says() -> None:
 def test_a_pose_has_an_angle_for_each_joint() -> None:
     with pytest.raises(UsageError, match="6 angles in rad, one per joint"):
         find_equilibrium(six("p_d").scenario, (0.1, 0.3))
+
+
+def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
+    """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
+
+    def damped(d: float, **overrides: Any) -> Linear:
+        return six("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
+
+    found = evaluate_criterion(damped(1.05).scenario)
+    assert found is not None
+    assert found.excess == pytest.approx(0.1)
+    assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
+    edge = find_linear_edge(damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4)
+    assert edge is not None
+    assert 0.8 < edge.value < 1.0
+    assert evaluate_criterion(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario) is None
+
+
+def test_a_run_that_diverges_has_the_rest_that_its_start_predicts() -> None:
+    """Of alike arms with alike gains it is near the mean of the start poses."""
+    case = six("adaptive", 0.3 * OFF)
+    found = predict_equilibrium(case.scenario)
+    assert found.residual <= 1e-10
+    assert np.ptp(found.q, axis=0).max() <= 1e-9
+    assert found.q[0] == pytest.approx(np.add(POSE, 0.15 * (OFF[0] + OFF[1])), abs=0.05)

@@ -19,6 +19,7 @@ from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.operators import Chirp, Multisine
+from .characteristic_roots import limit_blas_threads
 from .linear_loop import LinearLoop, find_loop_states, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import describe_switching_points, has_estimate, lay_out_arguments
@@ -115,6 +116,7 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     return states[find_loop_states(conditions)]
 
 
+@limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
     """Returns the equilibrium nearest to a pose: Gauss-Newton steps of least norm from there."""
     residual = compute_equilibrium_residual(conditions, rest)
@@ -157,7 +159,10 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     """
     q = np.array([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
-    rest = find_nearest_equilibrium(conditions, start)
+    # ten estimates a link lead steps from afar astray; about a shared pose they are true
+    chains = conditions.sites[0].chain is not None
+    about = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1))) if chains else start
+    rest = find_nearest_equilibrium(conditions, about)
     for _ in range(3):
         moved = np.hstack([start.q - rest.q, np.zeros_like(rest.q), start.theta_hat - rest.theta_hat])
         deviation = moved[find_loop_states(conditions)]

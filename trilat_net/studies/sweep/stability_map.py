@@ -20,6 +20,7 @@ from ...core.dominance import find_balancing_weights
 from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...scenario import Scenario, SiteSpec
+from ...scenario.arms import ArmModel
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.fields import is_number
 from ...scenario.laws import Adaptive, ProportionalDamped
@@ -74,7 +75,7 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
     if delays_s is None or len(K) < len(gains) or len(rates_hz) > 1 or scenario.scheme != "second_order":
         return None
     rate_hz = rates_hz.pop()
-    if max(d) / rate_hz >= min(_least_inertia(spec.arm.theta) for spec in scenario.sites.values()):
+    if max(d) / rate_hz >= min(map(_least_inertia, scenario.arms.values())):
         return None
     ticks = [max(1, math.ceil(delay_s * rate_hz - _ROUNDING)) for delay_s in delays_s]
     source = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
@@ -93,7 +94,7 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
-    """Returns K and d of P+d with known gravity, if they are alike at both joints, which the arm couples."""
+    """Returns K and d of P+d with known gravity, if they are alike at all joints, which the arm couples."""
     law = spec.control
     if not isinstance(law, ProportionalDamped) or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
         return None
@@ -130,8 +131,14 @@ def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float)
     return float(2.0 * np.min(np.sqrt(first * second) - math.sqrt(K[0] * K[1]) * across))
 
 
-def _least_inertia(theta: Array) -> float:
-    """Returns the least eigenvalue of M(q) over all poses, kg m^2: it lies at cos q2 = 1 or -1."""
+def _least_inertia(arm: ArmModel) -> float:
+    """Returns what the least eigenvalue of M(q) exceeds in all poses, kg m^2.
+
+    Of the planar arm it lies at cos q2 = 1 or -1; a chain has at least the inertia of its drives.
+    """
+    if arm.chain is not None:
+        return min(joint.armature_kg_m2 for joint in arm.chain.joints)
+    theta = arm.theta
     ends = [
         [[theta[0] + 2.0 * c * theta[1], theta[2] + c * theta[1]], [theta[2] + c * theta[1], theta[2]]]
         for c in (-1.0, 1.0)
@@ -142,7 +149,8 @@ def _least_inertia(theta: Array) -> float:
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:
     """The adaptive law as `digital` computes it, without delay: it rests where Gamma g^2 h < Kp, about."""
     delays_s = _delays_s(scenario)
-    if scenario.scheme != "digital" or delays_s is None:
+    chains = any(arm.chain is not None for arm in scenario.arms.values())
+    if scenario.scheme != "digital" or delays_s is None or chains:
         return None
     excess = []
     for spec in scenario.sites.values():
