@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from trilat_net.net.clock import Clock
 
-CAPACITY = 200_000
-"""Capacity in messages: a minute of three sites at 1 kHz."""
+CAPACITY = 60_000
+"""Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""
 KEYS = 1_000
 """Keys whose losses are counted separately."""
 

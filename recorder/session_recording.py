@@ -17,7 +17,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, RecorderStats
-from trilat_net.net.wire import decode, encode
+from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
@@ -67,6 +67,7 @@ class Recording:
             for name, site in self._sites.items()
             for channel in site.accounts
         }
+        self._blocks = {key for key, (_, channel) in self._channels.items() if channel == topics.STATE}
         self._own = {
             topics.key(session, topics.RECORDER, channel): Account()
             for channel in (topics.EVENT, topics.STATS)
@@ -119,7 +120,11 @@ class Recording:
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
         for arrived in queue.drain(until_ns):
             try:
-                self._take(arrived)
+                if arrived.key not in self._blocks:
+                    self._take(arrived)
+                    continue
+                for payload in split_states(arrived.payload):  # one that is none drops those after it
+                    self._take(arrived._replace(payload=payload))
             except WireError as error:
                 self.dropped[error.reason] += 1
 

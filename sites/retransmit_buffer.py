@@ -6,6 +6,7 @@ answers in the slack of its ticks.
 
 from array import array
 
+from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
 from trilat_net.net.loop_stats import STATS_PER_SECOND
@@ -16,7 +17,8 @@ KEPT_S = 60
 RECORDS_KEPT = 120_000
 """Capacity in records: a minute up to 2 kHz, less above."""
 RECORD_BYTES = 640
-"""Largest mean size of a record at which a minute of them is kept."""
+"""Largest mean size of a record of two joints at which a minute of them is kept."""
+FLOAT_BYTES = 9
 STATISTICS_BYTES = 4_096
 EVENTS_KEPT, EVENTS_BYTES = 4_096, 4_000_000
 
@@ -71,11 +73,19 @@ class ChannelBuffer:
 class RetransmitBuffer:
     """The recently published messages of a site, by channel."""
 
-    def __init__(self, site: str, boot: int, rate_hz: int, queries: QueryInbox) -> None:
+    def __init__(
+        self,
+        site: str,
+        boot: int,
+        rate_hz: int,
+        queries: QueryInbox,
+        layout: Layout = Layout(),  # noqa: B008
+    ) -> None:
         self._site, self._boot, self._queries = site, boot, queries
         records, statistics = min(KEPT_S * rate_hz, RECORDS_KEPT), KEPT_S * STATS_PER_SECOND
+        record_bytes = RECORD_BYTES + FLOAT_BYTES * (layout.floats - Layout().floats)
         self.channels = {
-            topics.STATE: ChannelBuffer(records, max(records * RECORD_BYTES, EVENTS_BYTES)),
+            topics.STATE: ChannelBuffer(records, max(records * record_bytes, EVENTS_BYTES)),
             topics.LINK: ChannelBuffer(statistics, statistics * STATISTICS_BYTES),
             topics.EVENT: ChannelBuffer(EVENTS_KEPT, EVENTS_BYTES),
         }

@@ -7,8 +7,8 @@ their arrival, not of their draining.
 """
 
 from collections import Counter
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.site_setup import Layout
@@ -20,7 +20,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, SiteTiming
-from trilat_net.net.wire import decode, encode, encode_state
+from trilat_net.net.wire import decode, encode, encode_sample, encode_state
 
 
 class PeerInbox:
@@ -74,6 +74,51 @@ class PeerInbox:
         return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x)
 
 
+BLOCKS_PER_S = 100
+"""Recorders get the records of 10 ms together."""
+
+
+class StateBlock:
+    """The records of a site's latest ticks, which recorders get together, and after peers have their samples.
+
+    Args:
+        site: the site.
+        boot: its process start.
+        send: publishes the payloads of some records.
+        turn: the site's place among those of the scenario, so that sites of one processor take turns.
+        single: True if every record is sent with its tick, for the program of an external arm.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        boot: int,
+        send: Callable[[list[bytes]], None],
+        turn: int = 0,
+        *,
+        single: bool = False,
+    ) -> None:
+        self._site, self._boot, self._send = site, boot, send
+        self._ticks = 1 if single else max(1, site.rate_hz // BLOCKS_PER_S)
+        self._turn = 3 * turn % self._ticks
+        self._records: list[tuple[Any, ...]] = []
+
+    def add(self, output: TickRecord, *stamps: Any) -> None:
+        """Adds a record, with the further arguments of `encode_state`."""
+        self._records.append((output, *stamps))
+
+    def due(self, k: int) -> bool:
+        """True at the ticks after which a block is sent."""
+        return (k + 1) % self._ticks == self._turn
+
+    def flush(self) -> None:
+        """Sends the records so far."""
+        site, records = self._site, self._records
+        if records:
+            self._records = []
+            self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
+
+
 class LoopIO(Protocol):
     """The loop's connection to everything outside of its ticks."""
 
@@ -83,8 +128,8 @@ class LoopIO(Protocol):
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Steps the site; None if its law failed, which ends the run."""
 
-    def publish_state(self, payload: bytes) -> None:
-        """Publishes a record."""
+    def publish_sample(self, payload: bytes) -> None:
+        """Publishes what peers need of a tick."""
 
     def publish_link(self, payload: bytes) -> None:
         """Publishes statistics."""
@@ -107,6 +152,7 @@ def run_loop(
     inbox: PeerInbox,
     timing: SiteTiming,
     stats: LoopStats,
+    states: StateBlock,
     io: LoopIO,
 ) -> TickRecord | None:
     """Runs a site in real time, from tick 0, and returns its last record; None without a tick."""
@@ -125,10 +171,11 @@ def run_loop(
             break
         last = output
         sent_ns, echo = timing.sent(k, clock.monotonic_ns()), timing.echo()
-        io.publish_state(
-            encode_state(site.name, boot, site.peers, output, arrivals, late_us, busy_us, sent_ns, echo)
-        )
+        io.publish_sample(encode_sample(site.name, boot, output, sent_ns, echo))
+        states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
         stats.tick(late_us, busy_us)
+        if states.due(k) or stats.due(k):  # statistics say that these records exist
+            states.flush()
         if stats.due(k):
             io.publish_link(encode(stats.take(output, timing.measured(woke_ns))))
             io.attend(k, output.t_ns)
@@ -140,4 +187,5 @@ def run_loop(
         if timing.schedule.deadline(k + 1) - clock.monotonic_ns() > quarter_ns:
             io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000
+    states.flush()
     return last

@@ -19,7 +19,7 @@ from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, OffsetLimit
-from trilat_net.net.wire import decode, encode_state
+from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.laws import ImportedLaw
@@ -29,6 +29,7 @@ from .external_arm import MEASUREMENTS_KEPT, ExternalArm
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
+from .site_loop import StateBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,8 @@ class SiteParts:
         rings: the peers' records as they arrive.
         watchdog: steps the site under a user's law; None without one.
         arm: measurements of its external arm; None without one.
-        publish_state: publishes a record, and keeps it in the buffer.
+        publish_sample: publishes what peers need of a tick.
+        states: the records that recorders have still to get.
         publish_link: publishes statistics, and keeps them.
     """
 
@@ -85,7 +87,7 @@ class SiteParts:
         law = scenario.sites[name].control
         self.watchdog = LawWatchdog(self.site, law.code, clock) if isinstance(law, ImportedLaw) else None
         self.rings = [
-            bus.stamped(topics.key(session, peer, topics.STATE), clock.monotonic_ns) for peer in peers
+            bus.stamped(topics.key(session, peer, topics.SAMPLE), clock.monotonic_ns) for peer in peers
         ]
         self.arm: ExternalArm | None = None
         if name in scenario.external:
@@ -94,12 +96,26 @@ class SiteParts:
             place = " at ".join([key, *map(str, options.connection.places[:1])])
             self.arm = ExternalArm(self.site, ring, clock, self.stats.dropped, place)
         queries = bus.questions(topics.key(session, name, topics.PAST))
-        self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries)
-        self.publish_state = self._keeping_publisher(topics.STATE)
+        self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
+        self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
+        turn, single = scenario.names.index(name), self.arm is not None
+        self.states = StateBlock(self.site, self.boot, self._states_publisher(), turn, single=single)
         self.publish_link = self._keeping_publisher(topics.LINK)
         self.monitor = PeerMonitor(bus, session, name, peers)
         self.changes = ChangeServer(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
         warm_up(scenario, name, clock)
+
+    def _states_publisher(self) -> Callable[[list[bytes]], None]:
+        keep = self.buffer.channels[topics.STATE].keep
+        publish = self.bus.publisher(topics.key(self.options.session, self.name, topics.STATE))
+
+        def keep_and_publish(payloads: list[bytes]) -> None:
+            for payload in payloads:
+                keep(payload)
+            for block in join_states(payloads):
+                publish(block)
+
+        return keep_and_publish
 
     def _keeping_publisher(self, channel: str) -> Callable[[bytes], None]:
         keep = self.buffer.channels[channel].keep
@@ -143,10 +159,7 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
         ]
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
-        decode(
-            encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo),
-            PeerSample,
-            layout=site.layout,
-        )
+        decode(encode_sample(setup.name, 0, output, k, echo), PeerSample, layout=site.layout)
+        encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo)
         estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
         estimator.estimate(k)

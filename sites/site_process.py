@@ -116,7 +116,7 @@ class RunningSite:
         self._failure: RunFailed | None = None
         self._mode = Mode.RUN
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
-        self.publish_state, self.publish_link = parts.publish_state, parts.publish_link
+        self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.admit(epoch.boots)
         peers = [
@@ -145,9 +145,8 @@ class RunningSite:
         self._publish_setup()
         with parts.watchdog or nullcontext():
             ticks = parts.scenario.ticks(parts.name)
-            output = run_loop(
-                parts.site, parts.boot, ticks, parts.clock, self._inbox, self._timing, parts.stats, self
-            )
+            timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
+            output = run_loop(parts.site, parts.boot, *timed, parts.states, self)
         return LeavingSite(parts, self._publisher, self._epoch.boots, output, self._failure)
 
     def _publish_setup(self) -> None:

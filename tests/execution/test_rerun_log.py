@@ -13,6 +13,7 @@ from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
+from trilat_net.net.messages import VERSION
 
 from .deliveries import SITES, TICKS
 from .logs import without_records
@@ -88,7 +89,7 @@ def test_an_older_log_becomes_one_of_this_version() -> None:
     again = rerun(GOLDEN, ["m2"])
     for name in again.before.sites:
         for ours, theirs in zip(again.after[name].states, again.before[name].states, strict=True):
-            assert (ours.v, theirs.v) == (3, 2)
+            assert (ours.v, theirs.v) == (VERSION, 2)
             assert (ours.rx, ours.cmd) == (theirs.rx, theirs.cmd)
             for mine, old in ((ours.q, theirs.q), (ours.tau, theirs.tau)):  # its sines were another library's
                 assert mine == (pytest.approx(old, abs=1e-9) if name == "m2" else old)

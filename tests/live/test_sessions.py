@@ -49,7 +49,7 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
         publishers = [
             bus.publisher(topics.key("t", member, channel))
             for member in (*PAPER, "recorder", "nobody")
-            for channel in (topics.STATE, topics.EVENT, topics.LINK)
+            for channel in (topics.SAMPLE, topics.STATE, topics.EVENT, topics.LINK)
         ]
 
         def shouted() -> bool:

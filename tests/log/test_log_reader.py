@@ -18,6 +18,7 @@ from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.net.messages import VERSION
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -226,7 +227,7 @@ def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
         opened(edited(recorded("paper"), scenario=scenario))
 
 
-@pytest.mark.parametrize("change", [{"v": 4}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
+@pytest.mark.parametrize("change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
 def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) -> None:
     data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
     with pytest.raises(LogError, match="record of m1"):

@@ -16,6 +16,7 @@ from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.messages import (
     READABLE,
+    TASK_VECTORS,
     VERSION,
     Event,
     Info,
@@ -24,8 +25,17 @@ from trilat_net.net.messages import (
     State,
     json_schema,
 )
-from trilat_net.net.requests import ChangeReply, ChangeRequest, Pong
-from trilat_net.net.wire import MAX_BYTES, MAX_INFO_BYTES, decode, encode, encode_state
+from trilat_net.net.requests import BACKFILL_BYTES, ChangeReply, ChangeRequest, Pong
+from trilat_net.net.wire import (
+    MAX_BYTES,
+    MAX_INFO_BYTES,
+    decode,
+    encode,
+    encode_sample,
+    encode_state,
+    join_states,
+    split_states,
+)
 
 from .parties import told
 
@@ -53,6 +63,7 @@ outputs = st.builds(
     rx_crc=st.integers(0, 2**32 - 1),
     cmd=st.lists(st.text(max_size=20), max_size=2),
     mem=st.lists(finite, max_size=3),
+    **dict.fromkeys(TASK_VECTORS, st.just(())),
     **{name: row(length) for name, length in STATE_VECTORS.items()},
 )
 arrivals = st.lists(
@@ -75,25 +86,30 @@ def payload(**changes: Any) -> bytes:
     return msgpack.packb({**record, **changes})
 
 
+def sample(**changes: Any) -> bytes:
+    """The sample of that record, changed."""
+    record = decode(payload(), State)
+    fields = {name: getattr(record, name) for name in PeerSample.__struct_fields__}
+    return msgpack.packb({**fields, **changes})
+
+
 @settings(max_examples=40)
 @given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
 def test_a_record_comes_back_bit_for_bit(
     output: TickRecord, came: list[Arrival], boot: int, late_us: int
 ) -> None:
     data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
-    state, sample = decode(data, State), decode(data, PeerSample)
+    state = decode(data, State)
     plain = msgpack.unpackb(data)
     for name in STATE_VECTORS:
         wanted = bits(getattr(output, name))
         assert bits(getattr(state, name)) == wanted
         assert bits(plain[name]) == wanted
-    assert bits(sample.q) + bits(sample.qd) == bits(output.q) + bits(output.qd)
     assert (state.tick, state.t_ns, state.boot) == (output.tick, output.t_ns, boot)
     assert state.mode == output.mode.name.lower() == plain["mode"]
     assert state.used == dict(zip(PEERS, output.used, strict=True)) == plain["used"]
     assert state.rx == [[a.peer, a.tick, a.latency_us] for a in came] == plain["rx"]
     assert (state.rx_crc, state.late_us, state.busy_us) == (output.rx_crc, late_us, 12)
-    assert (sample.site, sample.boot, sample.tick) == ("m1", boot, output.tick)
 
 
 instants = st.integers(-(2**59), 2**59 - 1)
@@ -104,11 +120,9 @@ instants = st.integers(-(2**59), 2**59 - 1)
 def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
     output: TickRecord, sent_ns: int, echo: list[tuple[int, int, int]]
 ) -> None:
-    data = encode_state("m1", 1, PEERS, output, [], 0, 0, sent_ns, echo)
-    for kind in (State, PeerSample):
-        message = decode(data, kind)
-        assert message.sent_ns == sent_ns
-        assert [tuple(entry) for entry in message.echo] == echo
+    message = decode(encode_state("m1", 1, PEERS, output, [], 0, 0, sent_ns, echo), State)
+    assert message.sent_ns == sent_ns
+    assert [tuple(entry) for entry in message.echo] == echo
     virtual = decode(encode_state("m1", 1, PEERS, output, [], 0, 0), State)
     assert (virtual.sent_ns, virtual.echo) == (output.t_ns, [])
 
@@ -121,6 +135,50 @@ def test_a_record_of_the_first_version_is_read_in_files_and_refused_live() -> No
         decode(first, State)
     assert refused.value.reason == "version"
     assert VERSION in READABLE
+
+
+pose = st.one_of(st.just(()), row(3))
+
+
+@settings(max_examples=40)
+@given(output=outputs, task=st.tuples(pose, row(3), row(3)), echo=st.lists(st.tuples(ticks, ticks, instants)))
+def test_each_field_of_a_sample_is_bit_for_bit_one_of_the_record_of_its_tick(
+    output: TickRecord, task: tuple[list[float], list[float], list[float]], echo: list[tuple[int, int, int]]
+) -> None:
+    if task[0]:
+        output = output._replace(x=task[0], xd=task[1], wrench=task[2])
+    small = decode(encode_sample("m1", 3, output, 77, echo), PeerSample)
+    state = decode(encode_state("m1", 3, PEERS, output, [], 0, 0, 77, echo), State)
+    for name in PeerSample.__struct_fields__:
+        of_state = {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
+        ours, theirs = getattr(small, name), getattr(state, of_state)
+        assert ours == theirs
+        assert name not in ("q", "qd", "tau_x") or bits(ours) == bits(theirs)
+    assert b"wrench" in encode_state("m1", 3, PEERS, output, [], 0, 0) or not task[0]
+
+
+@given(st.lists(st.integers(0, 20_000), min_size=1, max_size=12))
+def test_blocks_hold_records_in_order_and_as_they_were(sizes: list[int]) -> None:
+    records = [payload(tick=n, cmd=["x" * size]) for n, size in enumerate(sizes)]
+    blocks = list(join_states(records))
+    assert [one for block in blocks for one in split_states(block)] == records
+    assert all(len(block) <= max(BACKFILL_BYTES, *map(len, records)) for block in blocks)
+    assert list(split_states(records[0])) == [records[0]]
+
+
+@given(st.integers(1, 3), st.integers(1, 200))
+def test_of_a_block_that_is_cut_the_records_before_are_there(whole: int, cut: int) -> None:
+    records = [payload(tick=n) for n in range(whole)]
+    came = split_states(b"".join([*records, payload()[:cut]]))
+    assert [next(came) for _ in records] == records
+    with pytest.raises(WireError, match="malformed"):
+        next(came)
+
+
+@pytest.mark.parametrize("block", [b"", bytes(MAX_BYTES + 1), b"\xc1", b"\x91" * 10_000])
+def test_what_is_no_block_is_refused(block: bytes) -> None:
+    with pytest.raises(WireError):
+        list(split_states(block))
 
 
 @settings(max_examples=30)
@@ -145,9 +203,15 @@ def test_what_is_not_finite_is_refused_at_both_ends(
     assert refused.value.reason == "not finite"
     record = msgpack.unpackb(encode_state("m1", 1, PEERS, output, [], 0, 0))
     data = msgpack.packb({**record, name: numbers})
-    for kind in (State, PeerSample) if name in ("q", "qd") else (State,):
+    small = {field: record[field] for field in PeerSample.__struct_fields__}
+    kinds = {State: data} | ({PeerSample: msgpack.packb({**small, name: numbers})} if name in small else {})
+    for kind, bad in kinds.items():
         with pytest.raises(WireError) as refused:
-            decode(data, kind)
+            decode(bad, kind)
+        assert refused.value.reason == "not finite"
+    if name in small:
+        with pytest.raises(WireError) as refused:
+            encode_sample("m1", 1, output._replace(**{name: numbers}), 0, [])
         assert refused.value.reason == "not finite"
 
 
@@ -181,9 +245,10 @@ def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
     ],
 )
 def test_what_is_no_record_of_ours_is_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
-    for kind in (State, PeerSample) if changes.keys() <= set(PeerSample.__struct_fields__) else (State,):
+    of_both = changes.keys() <= {*PeerSample.__struct_fields__, "stranger"}
+    for kind, data in ((State, payload(**changes)), (PeerSample, sample(**changes)))[: 1 + of_both]:
         with pytest.raises(WireError) as refused:
-            decode(payload(**changes), kind)
+            decode(data, kind)
         assert refused.value.reason == reason
 
 
@@ -240,7 +305,7 @@ def test_any_other_messagepack_raises_wire_errors_only(value: Any) -> None:
 @pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1q", b"\xdc\x00\x01"])
 def test_deep_nesting_is_refused(opening: bytes) -> None:
     only_wire_errors(opening * (MAX_BYTES // len(opening)))
-    data = payload(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
+    data = sample(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
     only_wire_errors(data)
     with pytest.raises(WireError):
         decode(data, PeerSample)

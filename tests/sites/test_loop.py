@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sites.site_loop import PeerInbox, run_loop
+from sites.site_loop import PeerInbox, StateBlock, run_loop
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
@@ -17,7 +17,7 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.loop_stats import LoopStats
-from trilat_net.net.messages import LinkStats, State
+from trilat_net.net.messages import LinkStats, PeerSample, State
 from trilat_net.net.timing import SiteTiming
 from trilat_net.net.wire import decode
 from trilat_net.scenario import load_scenario
@@ -50,6 +50,7 @@ class Alone:
         self.site = Site(scenario.setup("m"))
         self.stats = LoopStats(self.site, 1, [scenario.sites["s"].rate_hz])
         self.states: list[State] = []
+        self.samples: list[PeerSample] = []
         self.links: list[LinkStats] = []
         self.slack: list[tuple[int, int]] = []
         self.stopped: Callable[[], bool] = lambda: False
@@ -58,7 +59,8 @@ class Alone:
     def run(self) -> object:
         inbox = PeerInbox((), (), (), (), (), self.stats.dropped, self.site.layout)
         timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
-        return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, self)
+        states = StateBlock(self.site, 1, self.publish_states, 0, single=True)
+        return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, states, self)
 
     def should_stop(self) -> bool:
         return self.stopped()
@@ -66,8 +68,11 @@ class Alone:
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
         return self.site.step(TickInput(k, arrivals))
 
-    def publish_state(self, payload: bytes) -> None:
-        self.states.append(decode(payload, State))
+    def publish_sample(self, payload: bytes) -> None:
+        self.samples.append(decode(payload, PeerSample))
+
+    def publish_states(self, payloads: list[bytes]) -> None:
+        self.states += [decode(payload, State) for payload in payloads]
 
     def publish_link(self, payload: bytes) -> None:
         self.links.append(decode(payload, LinkStats))
@@ -184,7 +189,7 @@ def shout(bus: Bus, clock: RelayClock) -> None:
     targets = [
         bus.publisher(topics.key(SESSION, member, channel))
         for member in ("m1", "m2", "s", "recorder", "nobody")
-        for channel in (topics.STATE, topics.EVENT, topics.LINK, "more")
+        for channel in (topics.SAMPLE, topics.STATE, topics.EVENT, topics.LINK, "more")
     ]
     for n in range(100):
         for publish in targets:

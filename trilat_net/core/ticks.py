@@ -176,6 +176,10 @@ class TickRecord(NamedTuple):
     xd: Sequence[float] = ()
     wrench: Sequence[float] = ()
 
+    def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Returns the motion and the exogenous torque that peers get, in the coordinates that sites share."""
+        return (self.x, self.xd, self.wrench) if self.x else (self.q, self.qd, self.tau_x)
+
 
 class LinkCounts(NamedTuple):
     """Counts of one link since the start.

@@ -54,7 +54,9 @@ def _equal_lists(a: Sequence[float], b: Sequence[float], equal: NumberEquality) 
 
 
 def _pack(a: State | TickRecord) -> bytes:
-    return array("d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat]).tobytes()
+    return array(
+        "d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat, *a.x, *a.xd, *a.wrench]
+    ).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:

@@ -22,7 +22,7 @@ from ..net.wire import encode_state
 from ..scenario import Scenario
 from .difference import RecordDifference, equal_bits, equal_record, find_first_difference
 from .rerun_request import RerunRequest
-from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, read_output
+from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, make_arrival, read_output
 from .verify import PROGRESS_EVERY
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
@@ -213,7 +213,7 @@ class RerunExecution:
             t_ns, _, site = pending.pop(place)
             made = site.advance()
             output, recent = site.output, self._recent[site.name]
-            recent[output.tick] = Arrival(0, output.tick, output.q, output.qd, 0, output.tau_x)
+            recent[output.tick] = make_arrival(0, output.tick, output)
             if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
                 del recent[next(iter(recent))]
             yield made

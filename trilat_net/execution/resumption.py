@@ -46,7 +46,17 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
         state.rx_crc,
         state.cmd,
         state.mem if len(state.mem) > len(state.q_des) else [],
+        state.x,
+        state.xd,
+        state.wrench,
     )
+
+
+def make_arrival(peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0) -> Arrival:
+    """Returns the arrival of a peer's sample, whose numbers are those of its record."""
+    if isinstance(sample, Arrival) or not sample.x:
+        return Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x)
+    return Arrival(peer, tick, sample.x, sample.xd, latency_us, sample.wrench)
 
 
 class RecordedInputs(Generic[Change]):
@@ -90,7 +100,7 @@ class RecordedInputs(Generic[Change]):
             if sample is None:
                 missing.append(entry)
             else:
-                arrivals.append(Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x))
+                arrivals.append(make_arrival(peer, tick, sample, latency_us))
         return arrivals, missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
@@ -114,7 +124,7 @@ class RecordedInputs(Generic[Change]):
         waiting: list[Arrival] = []
         for j, used in enumerate(last.used):
             sample = self.samples[j].get(used)
-            in_use.append(None if sample is None else Arrival(j, used, sample.q, sample.qd, 0, sample.tau_x))
+            in_use.append(None if sample is None else make_arrival(j, used, sample))
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))

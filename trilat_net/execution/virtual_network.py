@@ -17,7 +17,7 @@ import numpy as np
 from ..core.ticks import NS_PER_S, Arrival, TickRecord
 from ..errors import LogError
 from ..log.site_log import SiteLog
-from .resumption import ArrivalEntry
+from .resumption import ArrivalEntry, make_arrival
 
 
 class Network(Protocol):
@@ -60,7 +60,7 @@ class PromptNetwork:
             while queue and queue[0].t_ns < now_ns:
                 sample = queue.popleft()
                 latency_us = (now_ns - sample.t_ns) // 1000
-                arrivals.append(Arrival(index, sample.tick, sample.q, sample.qd, latency_us, sample.tau_x))
+                arrivals.append(make_arrival(index, sample.tick, sample, latency_us))
         return arrivals
 
 
@@ -91,7 +91,7 @@ class RecordedNetwork:
         for j, tick, latency_us in self._schedule[receiver].get(k, ()):
             sample = self._sent.get((self._peers[receiver][j], tick))
             if sample is not None:
-                arrivals.append(Arrival(j, tick, sample.q, sample.qd, latency_us, sample.tau_x))
+                arrivals.append(make_arrival(j, tick, sample, latency_us))
         return arrivals
 
 

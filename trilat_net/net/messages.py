@@ -64,6 +64,9 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         sent_ns: when it was sent: the sender's clock as it runs, never slewed, ns since the epoch on it.
         echo: of each peer the newest sample that this tick took in: index of the peer, its tick, and its
             arrival on the same clock as `sent_ns`.
+        x: in task space the coordinates that the sites exchange; in joint space these are left out.
+        xd: their derivatives.
+        wrench: exogenous torque in those coordinates.
     """
 
     v: int
@@ -88,10 +91,16 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     busy_us: Annotated[int, _unit("us", "computing time of the tick before")]
     sent_ns: Annotated[Instant, _unit("ns", "when it was sent, on the sender's clock since the epoch")] = 0
     echo: list[Stamp] = []
+    x: list[float] = []
+    xd: list[float] = []
+    wrench: list[float] = []
 
 
-class PeerSample(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of a `State` that a peer reads."""
+class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What peers need of a tick, sent at every tick; each field is bit for bit that of the tick's `State`.
+
+    In task space its q, qd and tau_x are x, xd and wrench of the `State`.
+    """
 
     v: int
     site: str
@@ -292,7 +301,8 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     boots: dict[str, int] = {}
 
 
-STATE_VECTORS = tuple(Layout().lengths())
+TASK_VECTORS = ("x", "xd", "wrench")
+STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS)
 """The vectors of a record; their lengths are those of the site's `Layout`."""
 
 

@@ -8,6 +8,7 @@ from .bus import PresenceInbox
 ROOT = "trilat"
 RECORDER = "recorder"
 STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
+SAMPLE = "sample"
 PAST, STATS = "past", "stats"
 MEASURED = "measured"
 

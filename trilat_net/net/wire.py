@@ -3,12 +3,11 @@
 Invariant: decoding never trusts its input. A payload yields a message of this schema version with finite
 numbers in range, or a `WireError` whose reason is counted; encoding refuses what decoding would.
 
-Payloads are MessagePack maps with string keys and plain lists, encoded by `msgpack` and decoded by
-`msgspec` straight into the types of `messages` and `requests`.
+Payloads are MessagePack maps with string keys and plain lists, as the types of `messages` and `requests`.
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cache
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -18,9 +17,10 @@ import msgspec
 
 from ..core.chain import MAX_JOINTS
 from ..core.site_setup import Layout
-from ..core.ticks import Arrival, TickRecord
+from ..core.ticks import Arrival, Mode, TickRecord
 from ..errors import WireError
 from .messages import (
+    TASK_VECTORS,
     VERSION,
     Event,
     Info,
@@ -29,7 +29,7 @@ from .messages import (
     RecorderStats,
     State,
 )
-from .requests import ArmMeasurement, Backfill, Request
+from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, Request
 
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
@@ -37,18 +37,19 @@ MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
 
 _Sent = LinkStats | Event | Info | RecorderStats | Request
-_pack = msgpack.Packer().pack
 _KINDS: list[type[msgspec.Struct]] = [State, PeerSample, LinkStats, Event, Info, RecorderStats]
 _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.__subclasses__()]}
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
+_encode = msgspec.msgpack.Encoder().encode
+_MODE_NAMES = {mode: mode.name.lower() for mode in Mode}
 
 
 @cache
 def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
     """Returns the lengths of a message's vectors."""
     if kind is State:
-        return layout.lengths()
+        return layout.lengths() | ({} if layout.task else dict.fromkeys(TASK_VECTORS, 0))
     if kind is PeerSample:
         return dict.fromkeys(("q", "qd", "tau_x"), layout.shared)
     return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
@@ -79,44 +80,103 @@ def encode_state(
     Raises:
         WireError: a number is not finite.
     """
-    (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *_) = output
-    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem]
+    (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *task) = output
+    x, xd, wrench = task
+    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench]
     # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
     if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
-    packed: bytes = _pack(
+    fields = {
+        "v": VERSION,
+        "site": site,
+        "boot": boot,
+        "tick": tick,
+        "t_ns": t_ns,
+        "mode": _MODE_NAMES[mode],
+        "q": q,
+        "qd": qd,
+        "q_des": q_des,
+        "qd_des": qd_des,
+        "tau": tau,
+        "tau_x": tau_x,
+        "theta_hat": theta_hat,
+        "used": dict(zip(peers, used, strict=True)),
+        "rx": [(a.peer, a.tick, a.latency_us) for a in arrivals],
+        "rx_crc": rx_crc,
+        "cmd": cmd,
+        "mem": mem,
+        "late_us": late_us,
+        "busy_us": busy_us,
+        "sent_ns": t_ns if sent_ns is None else sent_ns,
+        "echo": echo,
+    }
+    return _encode(fields | {"x": x, "xd": xd, "wrench": wrench} if x else fields)
+
+
+def encode_sample(
+    site: str, boot: int, output: TickRecord, sent_ns: int, echo: Sequence[Sequence[int]]
+) -> bytes:
+    """Returns the payload of a tick's `PeerSample`; the arguments are those of `encode_state`.
+
+    Raises:
+        WireError: a number is not finite.
+    """
+    q, qd, tau_x = output.shared()
+    if not _isfinite(sum(q) + sum(qd) + sum(tau_x)) and not all(map(_isfinite, [*q, *qd, *tau_x])):
+        raise WireError("not finite", f"{site} at tick {output.tick}")
+    return _encode(
         {
             "v": VERSION,
             "site": site,
             "boot": boot,
-            "tick": tick,
-            "t_ns": t_ns,
-            "mode": mode.name.lower(),
+            "tick": output.tick,
             "q": q,
             "qd": qd,
-            "q_des": q_des,
-            "qd_des": qd_des,
-            "tau": tau,
             "tau_x": tau_x,
-            "theta_hat": theta_hat,
-            "used": dict(zip(peers, used, strict=True)),
-            "rx": [(a.peer, a.tick, a.latency_us) for a in arrivals],
-            "rx_crc": rx_crc,
-            "cmd": cmd,
-            "mem": mem,
-            "late_us": late_us,
-            "busy_us": busy_us,
-            "sent_ns": t_ns if sent_ns is None else sent_ns,
+            "sent_ns": sent_ns,
             "echo": echo,
         }
     )
-    return packed
+
+
+def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
+    """Yields blocks of records, one record behind the other, no longer than an answer of a site's buffer."""
+    block: list[bytes] = []
+    size = 0
+    for payload in payloads:
+        if block and size + len(payload) > BACKFILL_BYTES:
+            yield b"".join(block)
+            block, size = [], 0
+        block.append(payload)
+        size += len(payload)
+    if block:
+        yield b"".join(block)
+
+
+def split_states(block: bytes) -> Iterator[bytes]:
+    """Yields the payloads of a block, which are not yet checked.
+
+    Raises:
+        WireError: the block is oversized, or ends in the middle of a record.
+    """
+    if len(block) > MAX_BYTES:
+        raise WireError("oversized", f"{len(block)} bytes, at most {MAX_BYTES}")
+    unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
+    unpacker.feed(block)
+    start = 0
+    while start < len(block) or not block:
+        try:
+            unpacker.skip()
+        except (msgpack.UnpackException, ValueError) as error:
+            raise WireError("malformed", f"a block of records: {error}") from None
+        end = unpacker.tell()
+        yield block[start:end]
+        start = end
 
 
 def encode(message: _Sent) -> bytes:
     """Returns the payload of any message but a `State`."""
-    packed: bytes = _pack(msgspec.structs.asdict(message))
-    return packed
+    return _encode(message)
 
 
 M = TypeVar("M", bound=msgspec.Struct)

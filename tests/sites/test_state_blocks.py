@@ -1,0 +1,105 @@
+"""Samples go to peers at every tick, records to recorders in blocks: the two say the same."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.chains import six_joints
+from trilat_net.execution.verify import verify
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, Inbox
+from trilat_net.net.messages import PeerSample, State
+from trilat_net.net.wire import decode, split_states
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.scenario_reader import parse_scenario
+
+from .relay import RelayClock
+from .sessions import SESSION, Session, in_log, in_virtual_time
+
+A_SECOND = 1_000_000_000
+
+
+def taken(inbox: Inbox) -> list[bytes]:
+    return [message[1] for message in iter(inbox.poll, None)]
+
+
+def heard(session: Session, sites: Sequence[str]) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
+    """What others hear of every site until the session is over: its samples, its blocks."""
+    samples: dict[str, list[bytes]] = {}
+    blocks: dict[str, list[bytes]] = {}
+
+    def listen(bus: Bus, clock: RelayClock) -> None:
+        keys = [(name, channel) for name in sites for channel in (topics.SAMPLE, topics.STATE)]
+        rings = {key: bus.inbox(topics.key(SESSION, *key)) for key in keys}
+        clock.sleep_until(clock.monotonic_ns() + 8 * A_SECOND)
+        for (name, channel), ring in rings.items():
+            (samples if channel == topics.SAMPLE else blocks)[name] = taken(ring)
+
+    session.stranger(listen)
+    return samples, blocks
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        load_scenario("two_sites", {"duration_s": 0.25, "sites.m.rate_hz": 333}),
+        load_scenario("two_sites", {"duration_s": 0.1, "rate_hz": 4000}),
+        parse_scenario(six_joints(0.25)),
+    ],
+    ids=["two joints", "four ticks a millisecond", "six joints"],
+)
+def test_samples_are_the_records_of_their_ticks_and_blocks_hold_ten_milliseconds(
+    scenario: Scenario, tmp_path: Path
+) -> None:
+    session = Session.whole(scenario, tmp_path)
+    samples, blocks = heard(session, scenario.names)
+    log = session.run()
+    assert verify(log).passed
+    assert in_log(log) == in_virtual_time(scenario)
+    for name in scenario.names:
+        small = [decode(payload, PeerSample, layout=scenario.layout(name)) for payload in samples[name]]
+        split = [[*split_states(block)] for block in blocks[name]]
+        assert [payload for block in split for payload in block] == log[name].payloads
+        assert [one.tick for one in small] == list(range(scenario.ticks(name)))
+        for one, state in zip(small, log[name].states, strict=True):
+            assert all(getattr(one, f) == getattr(state, f) for f in PeerSample.__struct_fields__)
+        stamps = [[decode(payload, State).t_ns for payload in block] for block in split]
+        assert max(last[-1] - last[0] for last in stamps) < 10_000_000
+        assert len(blocks[name]) < 0.4 * len(small)
+
+
+def test_a_lost_block_is_filled_with_its_records(tmp_path: Path) -> None:
+    scenario = load_scenario("two_sites", {"duration_s": 0.3})
+    session = Session.whole(scenario, tmp_path)
+    lost: list[bytes] = []
+    join = session.network.join
+
+    def join_lossy() -> Bus:
+        bus = join()
+        publisher = bus.publisher
+
+        def dropping(key: str, *, patient: bool = False):  # type: ignore[no-untyped-def]
+            publish = publisher(key, patient=patient)
+            if key != topics.key(SESSION, "s", topics.STATE):
+                return publish
+
+            def send(payload: bytes) -> None:
+                if 3 <= len(lost) < 5 or len(lost) < 2:
+                    lost.append(payload)
+                else:
+                    lost.append(b"")
+                    publish(payload)
+
+            return send
+
+        bus.publisher = dropping  # type: ignore[method-assign]
+        return bus
+
+    session.network.join = join_lossy  # type: ignore[method-assign]
+    log = session.run()
+    assert any(lost)
+    assert len(log["s"]) == scenario.ticks("s")
+    assert verify(log).passed
+    refilled = log.recorder_stats()[-1].refilled["s/state"]
+    assert refilled == sum(len([*split_states(block)]) for block in lost if block)
