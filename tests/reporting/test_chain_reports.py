@@ -11,7 +11,7 @@ from tests.core.chain_references import chain_references
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
-from trilat_net.reporting import arm_svg, charts
+from trilat_net.reporting import charts
 from trilat_net.reporting.figure_size import REPORT_SIZE, make_print_size
 from trilat_net.reporting.figures import arm_poses, joint_motion
 from trilat_net.reporting.style import arrange_joints
@@ -118,7 +118,7 @@ def test_the_page_draws_chains_from_their_joints():
     assert len(table["columns"]) == 3 * 7 * 2
     titles = [chart["title"] for chart in data["charts"] if chart["section"] == "estimates"]
     assert titles[29] == "forearm.Izz"
-    svg = arm_svg.render_arms_svg(log, bounds, charts.picture_scale(log, bounds))
+    svg = arm_poses.render_arms_svg(log, bounds, charts.picture_scale(log, bounds))
     box = [float(x) for x in re.search(r'viewBox="([^"]*)"', svg).group(1).split()]
     assert max(box[2:]) == pytest.approx(charts.PICTURE_SIDE, abs=2e-3)
     assert svg.count('class="shadow"') == svg.count('class="desired"') > 4

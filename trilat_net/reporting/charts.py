@@ -38,7 +38,7 @@ class Charts:
     `bounds_m` are those of `workspace_box_m`.
     """
 
-    def __init__(self, log: Log, twin: Log | None, bounds_m: tuple[float, float, float, float]) -> None:
+    def __init__(self, log: Log, twin: Log | None, bounds_m: arm_poses.PictureBox) -> None:
         self._log = log
         self._bounds_m = bounds_m
         self._twin = twin
@@ -248,13 +248,13 @@ def _chart(section: str, title: str, unit: str, series: list[JsonObject], **opti
     return {"section": section, "title": title, "unit": unit, "series": series, **options}
 
 
-def workspace_box_m(log: Log) -> tuple[float, float, float, float]:
+def workspace_box_m(log: Log) -> arm_poses.PictureBox:
     """Returns left, right, bottom and top of a box around the motion of all arms, m."""
     times = np.linspace(0.0, recorded_end_s(log), 60)
     return arm_poses.pose_box_m([arm_poses.pose_at(log, site, t) for site in log.sites for t in times])
 
 
-def picture_scale(log: Log, bounds_m: tuple[float, float, float, float]) -> float:
+def picture_scale(log: Log, bounds_m: arm_poses.PictureBox) -> float:
     """Returns the units per m of pictures of the arms: 1 for planar arms, whatever their size."""
     if all(arm.chain is None for arm in log.scenario.arms.values()):
         return 1.0

@@ -20,7 +20,8 @@ from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
-from . import arm_svg, charts, page_tables, style
+from . import charts, page_tables, style
+from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional
 from .figures.loop_timing import explain_missing_loop_times
 from .figures.registry import explain_absent_operator, write_report_figures
@@ -117,7 +118,7 @@ def render_report(
         sites=page_tables.render_sites(log, facts),
         loops=page_tables.render_loops(log, facts),
         links=_links(log, facts),
-        strip=arm_svg.render_arms_svg(log, bounds, factor),
+        strip=render_arms_svg(log, bounds, factor),
         sections=certificate + _sections(log, data["charts"]),
         assumed=page_tables.render_assumptions(scenario),
         again=page_tables.render_commands(log),

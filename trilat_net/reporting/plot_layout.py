@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..files import import_extra
-from ..log.ros2.cdr import JOINT_STATE
-from ..log.ros2.ros2_messages import EVENTS, LINES, Ros2Channel
+from ..log.ros2.cdr import JOINT_STATE, TRANSFORMS
+from ..log.ros2.robot_model import WORLD
+from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, Ros2Channel
 
 Ros2Channels = Mapping[str, Ros2Channel]
 
@@ -43,6 +44,9 @@ _PAGES = {
     "Speeds, estimates": (
         ("joint velocities", "rad/s", (("joint_states", "velocity"), ("reference", "velocity"))),
         ("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
+        ("estimated masses", "kg", (("theta_hat", "m"),)),
+        ("estimated first moments", "kg m", (("theta_hat", "mc"),)),
+        ("estimated moments of inertia", "kg m^2", (("theta_hat", "I"),)),
         ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""),)),
     ),
     "Links, timing": (
@@ -52,26 +56,31 @@ _PAGES = {
         ("largest in 100 ms", "us", (("timing", ""),)),
     ),
 }
-"""Per page its rows: quantity, unit, and parts: channel, and for joint states one of their lists."""
+"""Per page its rows: quantity, unit, and parts: channel, and of joint states one of their lists, of the ten
+parameters of each link of a chain one kind."""
+_MOST_NAMES = 20
+"""Curves that a legend names; of more, the pointer does."""
 
 
 class PlotLayout(NamedTuple):
-    """All pages by name, and the topic of the event lines; "" without any."""
+    """All pages by name, the topic of the event lines, "" without any, and whether arms are to be seen."""
 
     pages: dict[str, PlotPage]
     lines: str
+    arms: bool = False
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
     """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session `<root>/log`."""
-    session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES)]
+    session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES, FRAMES)]
     roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
     pages = {
         name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
         for name, rows in _PAGES.items()
     }
     lines = next((topic for topic in session if topic.endswith(f"/{LINES}")), "")
-    return PlotLayout({name: page for name, page in pages.items() if page}, lines)
+    arms = any(channel.kind == TRANSFORMS for channel in channels.values())
+    return PlotLayout({name: page for name, page in pages.items() if page}, lines, arms)
 
 
 def _row(
@@ -88,6 +97,9 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
     if channel is None:
         return None
     names = _names(channel.about.get("names", ""))
+    if topic.endswith("/theta_hat"):
+        kinds = [name.rpartition(".")[2].rstrip("xyz_") if "." in name else "" for name in names]
+        return PlotCurves(topic, names, tuple(kind == field for kind in kinds)) if field in kinds else None
     if channel.kind != JOINT_STATE:
         prefix = f"{topic.rpartition('/')[2]} " if topic.endswith("/tau_x") else ""
         return PlotCurves(topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names))
@@ -109,6 +121,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 _COLORS = [(31, 119, 180), (214, 96, 20), (44, 160, 44), (148, 103, 189), (150, 120, 30)]
+_COLORS += [(215, 95, 175), (110, 110, 110)]
 _PALE = [(150, 190, 225), (245, 175, 120)]
 """Of references, beside the joints that follow them."""
 _TIMELINE = "message_publish_time"
@@ -125,6 +138,9 @@ def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
         rrb.Vertical(*(rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page), name=name)
         for name, page in board.pages.items()
     ]
+    if board.arms:
+        frame = rrb.SpatialInformation(target_frame=WORLD)
+        pages.append(rrb.Spatial3DView(name="Arms", origin="/", spatial_information=frame))
     events = [rrb.TextLogView(origin=board.lines, name="events")] if board.lines else []
     blueprint = rrb.Blueprint(
         rrb.Vertical(rrb.Tabs(*pages), *events, row_shares=[6, 1][: 1 + len(events)]),
@@ -139,13 +155,14 @@ def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
 
 def _view(rrb: Any, plot: CurvePlot) -> Any:
     """Returns a plot; each of its channels has colors of its own."""
+    many = max(len(curves.names) for curves in plot.curves) > _MOST_NAMES
     overrides = {curves.entity: _lines(curves, 2 * n) for n, curves in enumerate(plot.curves)}
     return rrb.TimeSeriesView(
         name=plot.title,
         origin="/",
         contents=[curves.entity for curves in plot.curves],
         overrides=overrides,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=False if many else None),
     )
 
 

@@ -18,7 +18,11 @@ from ..log.log_layout import SCENARIO, collect_provenance
 from ..log.log_reader import Log
 from ..log.mcap_writer import McapWriter
 from ..log.ros2 import cdr
+from ..log.ros2.cdr import pack_string
 from ..log.ros2.ros2_messages import (
+    FRAMES,
+    ROBOT,
+    ROBOT_CHANNELS,
     SESSION_CHANNELS,
     Ros2Channel,
     Ros2SiteChannels,
@@ -40,6 +44,8 @@ _QOS = """\
   avoid_ros_namespace_conventions: false
 """
 """Reliable, volatile, the last ten: the default of publishers in ROS 2."""
+_TF = "/tf"
+"""The frames of all sites, where tools look for them."""
 _EVERY = 1000
 """Records between two reports of progress."""
 
@@ -57,7 +63,8 @@ def export_ros2(log: Log, path: Path, progress: Callable[[int], None] = lambda _
 
     Per site, under its name: `joint_states`, `reference`, `error`, `tau_x`, `theta_hat`, `mode`, and its
     statistics `link_age`, `link_delay`, `link_offset`, `timing`; of the session `/events` and `/log`. Units
-    and names stand in the channels' metadata and in the labels of dimensions.
+    and names stand in the channels' metadata and in the labels of dimensions. An arm from a URDF has its
+    `robot_description` and its links' frames in `/tf`.
 
     An earlier file is replaced; `progress` is called with the number of records written since its last call.
 
@@ -116,9 +123,11 @@ class _SiteMessages:
             f"/{name}/reference": shapes.joint_states(shapes.joints, effort=False),
             **{f"/{name}/{part}": array.channel for part, array in shapes.arrays.items()},
         }
+        if shapes.robot is not None:
+            self.channels |= {f"/{name}/{ROBOT}": ROBOT_CHANNELS[ROBOT], _TF: ROBOT_CHANNELS[FRAMES]}
 
     def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        return [(f"/{self._name}/{part}", data) for part, data in messages]
+        return [(part if part == _TF else f"/{self._name}/{part}", data) for part, data in messages]
 
     def records(self) -> Iterator[_TimedMessages]:
         """Yields its records in the order of arrival."""
@@ -128,12 +137,16 @@ class _SiteMessages:
             state = part.states[at]
             stamp_ns = max(0, self._epoch_unix_ns + state.tick * NS_PER_S // part.rate_hz)
             row = [column[0] for column in stack_signals([state])]
-            messages = (
+            messages = [
                 ("joint_states", self._states.pack(stamp_ns, state.q, state.qd, state.tau)),
                 ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)),
                 ("error", self._shapes.arrays["error"].pack(*row[self._shapes.error_row])),
                 *self._shapes.slow(row[self._shapes.slow_row]),
-            )
+            ]
+            if (robot := self._shapes.robot) is not None:
+                if count == 1:
+                    messages.append((ROBOT, pack_string(robot.description)))
+                messages.append((_TF, robot.pack(stamp_ns, state.q)))
             yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
             if not count % _EVERY or count == len(part):
                 self._progress((count - 1) % _EVERY + 1)

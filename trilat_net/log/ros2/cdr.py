@@ -18,6 +18,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
 LOG = "rcl_interfaces/msg/Log"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
 _TIME = "int32 sec\nuint32 nanosec\n"
@@ -46,6 +47,19 @@ ROS2_SCHEMAS: dict[str, bytes] = {
         },
     ),
     STRING: _schema("string data\n"),
+    TRANSFORMS: _schema(
+        "geometry_msgs/TransformStamped[] transforms\n",
+        {
+            "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
+            "geometry_msgs/Transform transform\n",
+            "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+            "builtin_interfaces/Time": _TIME,
+            "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\n"
+            "geometry_msgs/Quaternion rotation\n",
+            "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+            "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+        },
+    ),
     LOG: _schema(
         "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
         "string function\nuint32 line\n",
@@ -103,6 +117,27 @@ class JointStatePacker:
         """Returns one message of a time (Unix ns, not below 0): rad, rad/s and N m per joint."""
         p, v, e = self._counts
         return self._pack(_HEAD, *_split_stamp(stamp_ns), self._names, p, *position, v, *velocity, e, *effort)
+
+
+class TransformPacker:
+    """Packer of `tf2_msgs/msg/TFMessage` with these frames: pairs of parent and child."""
+
+    def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
+        self._names, form, offset = [], "<4sI", 4
+        for parent, child in frames:
+            names = _pack_fields(offset + 8, parent, child)
+            gap = -(offset + 8 + len(names)) % 8
+            form += f"iI{len(names)}s{gap}x7d"
+            offset += 8 + len(names) + gap + 56
+            self._names.append(names)
+        self._pack = struct.Struct(form).pack
+
+    def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
+        """Returns one message of a time (Unix ns, not below 0): x, y, z, m, and a quaternion."""
+        fields: list[object] = []
+        for n, names in enumerate(self._names):
+            fields += (*_split_stamp(stamp_ns), names, *numbers[7 * n : 7 * n + 7])
+        return self._pack(_HEAD, len(self._names), *fields)
 
 
 class ArrayDimension(NamedTuple):

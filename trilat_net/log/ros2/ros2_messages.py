@@ -24,17 +24,23 @@ from .cdr import (
     JOINT_STATE,
     LOG,
     STRING,
+    TRANSFORMS,
     ArrayDimension,
     RosLogLevel,
     make_float_array_packer,
     pack_log,
     pack_string,
 )
+from .robot_model import build_robot_model
 
 EVENTS, LINES = "events", "log"
 """Channels of a whole session: events as plain text, and as lines with a time and a level."""
 SLOW_ARRAYS = ("tau_x", "theta_hat", "mode")
 """Arrays of a record besides its joints and their error, in order."""
+
+
+ROBOT, FRAMES = "robot_description", "tf"
+"""Channels of an arm that a URDF describes: that file, and where its links are."""
 
 
 class Ros2Channel(NamedTuple):
@@ -47,6 +53,10 @@ class Ros2Channel(NamedTuple):
 SESSION_CHANNELS = {
     EVENTS: Ros2Channel(STRING, {"content": "what happened, member first"}),
     LINES: Ros2Channel(LOG, {"content": "the same as lines of a log"}),
+}
+ROBOT_CHANNELS = {
+    ROBOT: Ros2Channel(STRING, {"content": "URDF, with links named after their site"}),
+    FRAMES: Ros2Channel(TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
 }
 _LEVELS = {
     "diverged": RosLogLevel.ERROR,
@@ -94,6 +104,7 @@ class Ros2SiteChannels:
         joint_row: of a row of `stack_signals` the joints: q, q_des, qd, tau.
         error_row: the error e = q - q_des, Eq. (9).
         slow_row: the rest: tau_x, theta_hat, mode.
+        robot: the arm for viewers, or None if no URDF describes it.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -101,8 +112,8 @@ class Ros2SiteChannels:
         self._arm, n, peers = arm, arm.counts.joints, self._peers
         self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 5 * n)
         self.slow_row = slice(5 * n, None)
-        stated = bool(scenario.sites[site].arm.urdf)
-        self.joints = [*arm.joint_names] if stated else [f"{site}_{name}" for name in arm.joint_names]
+        self.robot = build_robot_model(scenario, site)
+        self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
         labels = ["_".join(name.split()) for name in self.joints]
         parameters = ["_".join(name.split()) for name, _ in arm.parameters]
         spread = ("median", "max")

@@ -18,8 +18,11 @@ from ...net import topics
 from ...net.messages import Event, LinkStats
 from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
-from .cdr import JointStatePacker
+from .cdr import JointStatePacker, pack_string
 from .ros2_messages import (
+    FRAMES,
+    ROBOT,
+    ROBOT_CHANNELS,
     SESSION_CHANNELS,
     Record,
     Ros2Channel,
@@ -97,6 +100,10 @@ class _SiteBuckets:
             self._states_topic: shapes.joint_states(names),
             **{self._topics[name]: array.channel for name, array in shapes.arrays.items()},
         }
+        if shapes.robot is not None:
+            self._topics |= {name: f"{VIZ_ROOT}{site}/{name}" for name in ROBOT_CHANNELS}
+            self.channels |= {self._topics[name]: channel for name, channel in ROBOT_CHANNELS.items()}
+        self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
         self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
         self._fast, self._slow = _BucketOutput(self._write_fast), _BucketOutput(self._write_slow)
@@ -113,6 +120,12 @@ class _SiteBuckets:
         self._put(self._states_topic, data, stamp_ns, log_ns)
         error = self._shapes.arrays["error"].pack(*row[self._shapes.error_row])
         self._put(self._topics["error"], error, stamp_ns, log_ns)
+        robot = self._shapes.robot
+        if robot is not None:
+            if not self._described:
+                self._described = True
+                self._put(self._topics[ROBOT], pack_string(robot.description), stamp_ns, log_ns)
+            self._put(self._topics[FRAMES], robot.pack(stamp_ns, row[:n]), stamp_ns, log_ns)
 
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         for name, data in self._shapes.slow(row):

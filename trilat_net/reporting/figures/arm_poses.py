@@ -1,10 +1,11 @@
-"""Poses of the arms at a few instants: base, joints and end effector, and the figure of them.
+"""Poses of the arms at a few instants: base, joints and end effector; a figure of them, and SVG for the page.
 
 Invariant: forward kinematics are those of the core; the reference pose is dashed behind each arm. A chain is
 seen along parallel lines from one fixed direction, with up where gravity does not pull.
 """
 
 from collections.abc import Sequence
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ _AZIMUTH, _ELEVATION = np.deg2rad((-50.0, 22.0))
 """Direction from which chains are seen: about the vertical from the base's x axis on, and above the floor."""
 _SHADOW: dict[str, Any] = {"color": "#c9c9c9", "linewidth": 1.6, "solid_capstyle": "round", "zorder": 1.0}
 _DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
+PictureBox = tuple[float, float, float, float]
+"""Left, right, bottom and top."""
 _BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
 
 
@@ -123,7 +126,7 @@ def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2))
 
 
-def pose_box_m(poses: Sequence[ArmPose | None]) -> tuple[float, float, float, float]:
+def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     """Returns left, right, bottom and top of a box around poses with a margin, m; the base is inside."""
     points = [np.concatenate(drawn) for drawn in poses if drawn is not None]
     every = np.concatenate([*points, np.zeros((1, 2))])
@@ -178,3 +181,48 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
     axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")
     axes.plot(*drawn.actual[1:].T, linestyle="none", marker="o", markersize=2.6, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
+
+
+def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float = 1.0) -> str:
+    """Returns HTML with a row per site and a column per instant; bounds: left, right, bottom, top, m.
+
+    A picture has `factor` units per m.
+    """
+    left, right, bottom, top = (factor * bound for bound in bounds_m)
+    times = choose_instants_s(log)
+    cells = ["<span></span>", *(f'<span class="head">t = {t:.4g} s</span>' for t in times)]
+    for index, site in enumerate(log.sites):
+        cells.append(f'<span class="head">{escape(site)}</span>')
+        for t in times:
+            drawn = pose_at(log, site, t)
+            scaled = None if drawn is None else ArmPose(*(factor * points for points in drawn))
+            cells.append(_render_picture(scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"))
+    columns = f"grid-template-columns: max-content repeat({len(times)}, 1fr)"
+    return f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+
+
+def _render_picture(drawn: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:
+    left, right, bottom, top = bounds
+    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
+    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
+    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
+    inside = ""
+    if drawn is not None:
+        paths = [
+            (f"path site-{index}", drawn.path),
+            ("desired", drawn.desired),
+            (f"arm site-{index}", drawn.actual),
+        ]
+        if len(drawn.shadow):
+            ground = ""
+            paths.insert(0, ("shadow", drawn.shadow))
+        inside = "".join(f'<polyline class="{kind}" points="{_svg_points(path)}"/>' for kind, path in paths)
+        inside += "".join(
+            f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>' for x, y in drawn.actual[1:]
+        )
+    return f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">{ground}{inside}{base}</svg>'
+
+
+def _svg_points(xy: Array) -> str:
+    """Returns points for SVG, whose y grows downwards, m."""
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in xy)

@@ -1,0 +1,116 @@
+"""Frames of links for viewers: Pinocchio has the end of an arm there, and others read the messages."""
+
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+
+from tests.core.chain_references import ARMS, chain_references
+from trilat_net.log.ros2 import cdr
+from trilat_net.log.ros2.robot_model import (
+    SPACING_M,
+    RobotModel,
+    build_robot_model,
+    multiply_quaternions,
+    rotate_vector,
+)
+from trilat_net.log.ros2.ros2_messages import ROBOT_CHANNELS
+from trilat_net.scenario import Scenario, parse_scenario
+
+TEXT = """
+name = "two"
+duration_s = 1.0
+[arm]
+urdf = "{arm}.urdf"
+down = {down}
+armature_kg_m2 = 0.2
+[control]
+law = "adaptive"
+Lambda = 1.0
+Kp = 10.0
+Kd = 2.0
+Gamma = 1.0
+[link]
+delay_ms = 40.0
+[sites.m]
+q0_rad = {q0}
+[sites.s]
+role = "slave"
+q0_rad = {q0}
+[dominance]
+m = {{ s = 1.0 }}
+s = {{ m = 1.0 }}
+"""
+POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
+
+
+def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
+    return parse_scenario(TEXT.format(arm=arm, down=down, q0=POSES[arm]), "two.toml")
+
+
+def end_of(model: RobotModel, q) -> tuple:
+    """The last frame in that of the base, by what is sent."""
+    at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+    for origin, own in model.transforms(q)[1:]:
+        at = tuple(a + b for a, b in zip(at, rotate_vector(turned, origin), strict=True))
+        turned = multiply_quaternions(turned, own)
+    return at, turned
+
+
+@pytest.mark.parametrize("arm", POSES)
+def test_the_last_frame_is_where_pinocchio_has_the_end_of_the_arm(arm):
+    model = build_robot_model(scenario(arm), "m")
+    reference = chain_references()[arm]
+    assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
+    for state in reference.states:
+        at, turned = end_of(model, state.q)
+        assert at == pytest.approx(state.tip_position, abs=1e-12)
+        columns = [rotate_vector(turned, axis) for axis in np.eye(3)]
+        assert np.transpose(columns) == pytest.approx(state.tip_rotation, abs=1e-12)
+
+
+def reference_tip(arm: str) -> str:
+    root = ElementTree.fromstring((ARMS / f"{arm}.urdf").read_text())
+    parents = {joint.find("parent").get("link") for joint in root.findall("joint")}
+    (tip,) = {link.get("name") for link in root.findall("link")} - parents
+    return tip
+
+
+@pytest.mark.parametrize("down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
+def test_bases_stand_apart_and_gravity_points_down(down):
+    models = [build_robot_model(scenario(down=str([*down])), site) for site in ("m", "s")]
+    (m, turned), (s, _) = (model.transforms(POSES["arm6"])[0] for model in models)
+    assert math.dist(m, s) == SPACING_M
+    assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx((0, 0, -1))
+
+
+def test_a_message_is_read_by_the_decoder_of_ros():
+    model = build_robot_model(scenario(), "m")
+    schema = Schema(id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS])
+    q = POSES["arm6"]
+    message = DecoderFactory().decoder_for("cdr", schema)(model.pack(5_000_000_007, q))
+    assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == model.frames
+    for one, (origin, turned) in zip(message.transforms, model.transforms(q), strict=True):
+        t, r = one.transform.translation, one.transform.rotation
+        assert ((t.x, t.y, t.z), (r.x, r.y, r.z, r.w)) == (origin, turned)
+        assert (one.header.stamp.sec, one.header.stamp.nanosec) == (5, 7)
+    assert {channel.kind for channel in ROBOT_CHANNELS.values()} == {cdr.STRING, cdr.TRANSFORMS}
+
+
+def test_the_description_has_the_links_of_the_file_named_after_the_site_and_shapes_that_end_at_joints():
+    root = ElementTree.fromstring(build_robot_model(scenario(), "s").description)
+    given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
+    names = [link.get("name") for link in root.findall("link")]
+    assert names == [f"s/{link.get('name')}" for link in given.findall("link")]
+    assert [j.get("name") for j in root.findall("joint")] == [j.get("name") for j in given.findall("joint")]
+    arm = next(link for link in root.findall("link") if link.get("name") == "s/upper_arm")
+    assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
+
+
+def test_planar_arms_have_no_model():
+    from trilat_net.scenario import load_scenario
+
+    assert build_robot_model(load_scenario("two_sites"), "m") is None
