@@ -9,7 +9,7 @@ velocity of the joints and its derivative are
     v = psi + J' y,    J J' y = -Lambda e - J psi            (v = J+ (-Lambda e) + (I - J+ J) psi)
     a = v' ,           J J' y' = -Lambda e' - J' psi - J psi' - (J' J^T + J J'^T) y
 
-with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = e' + Lambda e. J J' gets a
+with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = x' + Lambda e. J J' gets a
 damping that is zero while 1 / trace((J J')^-1), a lower bound of the square of the least singular value, is
 above that of `singular_value`.
 
