@@ -28,23 +28,37 @@ _MAX_SHOWN_PARAMETER = 2.5
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns magnitude and phase of the transmitted impedance, free and clamped, a column for each joint."""
+    """Returns magnitude and phase of the transmitted impedance, free and clamped, a column for each joint.
+
+    The joints of larger arms stand in several rows of both.
+    """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
     joints = sorted({one.joint for one in ports.transparency})
     sites = dict.fromkeys(one.at for one in ports.transparency)
-    with style.styled_figure(size, 3.8) as figure:
-        grid = style.add_panels(figure, 2, len(joints), sharex=True, sharey="row")
-        for column, joint in enumerate(joints):
+    rows = style.arrange_joints(len(joints), size.narrow)
+    blocks, columns = len(rows), min(len(rows[0]), len(joints))
+    crowded = size.narrow or columns > 2
+    with style.styled_figure(size, 3.8 * blocks) as figure:
+        grid = style.add_panels(figure, 2 * blocks, columns, sharex=True, sharey="row")
+        for place, joint in enumerate(joints):
+            top, column = 2 * (place // columns), place % columns
             of_joint = [one for one in ports.transparency if one.joint == joint]
-            _plot_impedance(ports, of_joint, *grid[:, column])
-            grid[0, column].set_title(f"joint {joint}" + ("" if size.narrow else _describe_ratios(of_joint)))
-            grid[1, column].set_xlabel("frequency (Hz)")
-            if size.narrow:
-                grid[1, column].set_xticks((0.1, 1.0, 10.0))  # those at the ends meet the next panel's
-        grid[0, 0].set_ylabel("|Z| (N m s/rad)")
-        grid[1, 0].set_ylabel("phase (degrees)")
-        grid[1, 0].yaxis.set_major_locator(MultipleLocator(45.0))
+            magnitude, phase = grid[top : top + 2, column]
+            _plot_impedance(ports, of_joint, magnitude, phase)
+            magnitude.set_title(f"joint {joint}" + ("" if crowded else _describe_ratios(of_joint)))
+            if place + columns >= len(joints):
+                phase.set_xlabel("frequency (Hz)")
+                phase.xaxis.set_tick_params(labelbottom=True)
+            if crowded:
+                phase.set_xticks((0.1, 1.0, 10.0))  # those at the ends meet the next panel's
+            if not column:
+                magnitude.set_ylabel("|Z| (N m s/rad)")
+                phase.set_ylabel("phase (degrees)")
+                phase.yaxis.set_major_locator(MultipleLocator(45.0))
+        for column in range(len(joints) - columns * (blocks - 1), columns):
+            grid[-2, column].set_visible(False)
+            grid[-1, column].set_visible(False)
         of = ports.transparency[0].of
         entries: list[tuple[str, dict[str, Any]]] = [
             *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
