@@ -83,6 +83,8 @@ def explain_missing_functional(spec: SiteSpec) -> str:
     if not isinstance(spec.control, Adaptive | AdaptiveBox):
         name = next(name for name, kind in LAWS.items() if isinstance(spec.control, kind))
         return f"law {name}, for which there is no such V"
+    if spec.task.shared:
+        return f"it follows with its end effector ({spec.task.space}), for which there is no such V"
     return ""
 
 

@@ -109,8 +109,8 @@ def _with_interval(mean: float | None, half: float | None) -> str:
 def describe_procedure(plan: TuningPlan) -> list[str]:
     """Returns what was the same for all, a sentence each."""
     scenario = plan.base.scenario
-    clamps = sorted({spec.limits.tau_limit_nm for spec in scenario.sites.values()})
-    clamp = " to ".join(f"{value:g}" for value in dict.fromkeys((clamps[0], clamps[-1])))
+    clamps = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
+    clamp = " to ".join(f"{value:g}" for value in dict.fromkeys((clamps.min(), clamps.max())))
     informed = any(space.law == "known" for space in plan.spaces)
     lines = [
         f"{plan.budget} candidates per law, {(plan.budget + 1) // 2} of a Latin hypercube, the others "
