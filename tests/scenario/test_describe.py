@@ -1,5 +1,7 @@
+from tests.scenario.chains import six
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import compare_scenarios
+from trilat_net.scenario.describe import compare_scenarios, describe_scenario
+from trilat_net.scenario.resolve import SHIPPED_FOLDER
 
 
 def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
@@ -43,3 +45,15 @@ def test_other_scenarios_other_sites_other_hands() -> None:
     assert "wall" in found["environment of s"][0]
     assert found["environment of s"][1] == "none"
     assert found["duration_s"] == ("15", "30")
+
+
+def test_a_chain_is_told_joint_by_joint_with_the_notes_of_its_file() -> None:
+    unlimited = (SHIPPED_FOLDER / "arm6.urdf").read_text().replace('effort="28" velocity', "velocity", 1)
+    text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
+    first = (
+        "  shoulder_pan moves shoulder, 3.7 kg; -6.283 to 6.283 rad; 150 N m; 3.142 rad/s; drive 0.2 kg m^2"
+    )
+    assert f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n" in text
+    assert "  note: joint 'wrist_1' states no limit, or 0, of effort: none is kept" in text
+    assert "  wrist_1 moves wrist_1_link, 1.219 kg; -6.283 to 6.283 rad; 3.142 rad/s; drive" in text
+    assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
