@@ -7,7 +7,7 @@ the equations.
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...analysis.arm_rows import compute_end_effector
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.torque_sources import list_walls, wall_depth, wall_force
 from ...log.log_reader import Log
 from .. import style
@@ -27,8 +27,7 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         column = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:
             part, spec = log[site], log.scenario.sites[site]
-            links_m = (spec.arm.l1_m, spec.arm.l2_m)
-            end_effector = compute_end_effector(links_m, part.q.reshape(-1, 2), part.qd.reshape(-1, 2))
+            end_effector = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd)
             walls = list_walls(spec)
             for wall, dashes in zip(walls, [*style.DASHES] * len(walls), strict=False):
                 depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
