@@ -44,6 +44,8 @@ LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "lin
 
 REPORT_WIDTH_IN = REPORT_SIZE.width_in
 REPORT_DPI = REPORT_SIZE.dpi
+_LEAST_RANGE = 1e-9
+"""Of values; less is rounding."""
 BUCKETS_PER_PANEL = 700
 """Per panel: half a page is 700 pixels wide."""
 
@@ -160,6 +162,13 @@ def title_joints(log: Log, row: Sequence[Axes]) -> None:
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
     """Writes beside the first panel of a low row what the row shows."""
     axes.set_ylabel("\n".join(textwrap.wrap(text, 12)), fontsize=form.tick_pt)
+
+
+def flatten_rounding(axes: Axes) -> None:
+    """Widens the axis of values that differ by rounding alone."""
+    low, high = axes.get_ylim()
+    if high - low < _LEAST_RANGE:
+        axes.set_ylim(low - 0.05, high + 0.05)
 
 
 class JointPanels(NamedTuple):

@@ -40,8 +40,6 @@ _ACROSS = {"col": "row", "none": "none"}
 """What shares an axis of values if rows and columns change places."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
 """Lower end of the axis of errors, rad."""
-_LEAST_RANGE = 1e-9
-"""Of an axis of estimates; less is rounding."""
 _LOOP_PT = 0.8
 """Width of a line that crosses itself."""
 _STEP = 0.01
@@ -275,8 +273,7 @@ def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Fi
             )
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
-            if np.ptp(axes.get_ylim()) < _LEAST_RANGE:
-                axes.set_ylim(-0.05, 0.05)
+            style.flatten_rounding(axes)
             if form.narrow:  # no room for numbers beside the panels
                 axes.margins(y=0.25)
                 axes.tick_params(axis="y", pad=-2.0)

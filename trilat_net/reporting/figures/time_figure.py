@@ -75,6 +75,8 @@ class TimeFigure:
                 style.plot_decimated(axes, tick, t_s, one, **style.site_line(self.log, site))
         for axes in row:
             self.mark(axes, sites)
+            if len(row) > 2:
+                style.flatten_rounding(axes)
 
     def mark(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
         """Marks a panel: shaded in the color of a site while it does not follow its peers, lines at changes.
