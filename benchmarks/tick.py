@@ -1,4 +1,4 @@
-"""One site tick called from Python, from two payloads that came in to the finished record, and its parts."""
+"""One site tick called from Python, from two samples that came in to the own one, and its parts."""
 
 import gc
 
@@ -10,7 +10,7 @@ from trilat_net.core.ticks import Arrival, TickInput
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, exact_offset
 from trilat_net.net.timing import PeerClock, SiteTiming
-from trilat_net.net.wire import decode, encode_state
+from trilat_net.net.wire import decode, encode_sample, encode_state
 from trilat_net.scenario import load_scenario
 
 from .stopwatch import each_us
@@ -24,14 +24,14 @@ def run() -> list[str]:
     site = Site(scenario.setup("m1"))
     record = site.step(TickInput(0))
     echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
-    payloads = [encode_state(p, 7, ("m1", "s"), record, [], 0, 0, AT_NS - DELAY_NS, echo) for p in site.peers]
+    payloads = [encode_sample(p, 7, record, AT_NS - DELAY_NS, echo) for p in site.peers]
     peers = [PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers]
     timing = SiteTiming(0, site.rate_hz, peers, "m2")
     timing.sent(0, AT_NS - 2 * DELAY_NS)
     counter = iter(range(1, 10_000_000))
 
     def decoded() -> list[PeerSample]:
-        return [decode(payload, PeerSample) for payload in payloads]
+        return [decode(payload, PeerSample, layout=site.layout) for payload in payloads]
 
     def arrivals(samples: list[PeerSample]) -> list[Arrival]:
         pairs = zip(timing.meters, samples, strict=True)
@@ -59,7 +59,7 @@ def run() -> list[str]:
         sent_ns, echoed = timing.sent(k, AT_NS), timing.echo()
         if k % 100 == 0:
             timing.measured(AT_NS)
-        return encode_state("m1", 7, site.peers, done, taken, 0, 0, sent_ns, echoed)
+        return encode_sample("m1", 7, done, sent_ns, echoed)
 
     def leaf() -> None:
         k = next(counter)
@@ -72,7 +72,8 @@ def run() -> list[str]:
         "stamps: deadline, two delays, sending, echo": each_us(stamps),
         "Site.step": each_us(lambda: site.step(TickInput(next(counter), came))),
         "  of it the compiled leaf": each_us(leaf),
-        "encode the record": each_us(
+        "encode the sample": each_us(lambda: encode_sample("m1", 7, output, AT_NS, echo)),
+        "outside of it, a block at a time: encode the record": each_us(
             lambda: encode_state("m1", 7, site.peers, output, came, 0, 0, AT_NS, echo)
         ),
     }

@@ -56,10 +56,12 @@ def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
 
 
 @cache
-def _vectors_getter(kind: type[msgspec.Struct]) -> Callable[[Any], tuple[list[float], ...]] | None:
-    """Returns a function that takes the vectors out of a message; None for one without any."""
-    names = _vectors(kind, Layout())
-    return attrgetter(*names) if names else None
+def _checks(
+    kind: type[msgspec.Struct], layout: Layout | None
+) -> tuple[Callable[[Any], tuple[list[float], ...]], tuple[int, ...] | None] | None:
+    """Returns what takes the vectors out of a message, and their lengths if known; None without any."""
+    vectors = _vectors(kind, layout or Layout())
+    return (attrgetter(*vectors), tuple(vectors.values()) if layout else None) if vectors else None
 
 
 def encode_state(
@@ -201,14 +203,15 @@ def decode(
         raise WireError("malformed", str(error)) from None
     if message.v not in versions:
         raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    vectors_of = _vectors_getter(kind)
-    if vectors_of is not None:
+    check = _checks(kind, layout)
+    if check is not None:
+        vectors_of, lengths = check
         vectors = vectors_of(message)
-        if layout is not None:
+        if layout is not None and tuple(map(len, vectors)) != lengths:
             _check_lengths(vectors, _vectors(kind, layout))
         # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
         if not _isfinite(sum(map(sum, vectors))):
-            for name, vector in zip(_vectors(kind, Layout()), vectors, strict=True):
+            for name, vector in zip(_vectors(kind, layout or Layout()), vectors, strict=True):
                 if not all(map(_isfinite, vector)):
                     number = message.n if kind is ArmMeasurement else message.tick
                     raise WireError("not finite", f"{name} of {message.site} at {number}")
