@@ -239,10 +239,14 @@ NO_BUCKETS = np.zeros((0, 3))
 
 
 def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
-    """Returns buckets with some more records of a site, which follow those in it; there may be spare rows."""
+    """Returns buckets with some more records of a site, which follow those in it; there may be spare rows.
+
+    In task space e has as many columns as the task; the fewer of e and q are filled up with zeros.
+    """
     if not len(bucket):
         return into
-    joints = q.shape[1]
+    joints = max(q.shape[1], e.shape[1])
+    e, qd, q = (np.pad(one, ((0, 0), (0, joints - one.shape[1]))) for one in (e, qd, q))
     if not len(into):
         into = np.zeros((0, 3 * joints))
     lacking = int(bucket[-1]) + 1 - len(into)
@@ -301,7 +305,7 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
 
 def _split_buckets(scenario: Scenario, buckets: Sequence[Array]) -> list[Array]:
     """Returns the buckets of each site by kind and joint, shape (K, 3, n): |e|, |qd| and q."""
-    joints = [len(spec.q0_rad) for spec in scenario.sites.values()]
+    joints = [max(arm.counts.joints, arm.counts.shared) for arm in scenario.arms.values()]
     return [
         site.reshape(len(site), 3, -1)[:, :, :n] if len(site) else np.zeros((0, 3, n))
         for n, site in zip(joints, buckets, strict=True)
@@ -432,7 +436,7 @@ def _find_disagreement(
     for group in find_coupled_sites(scenario):
         if len(group) < 2 or max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM:
             continue
-        if len({columns[n].shape[2] for n in group}) > 1:  # their joints are not each other's
+        if any(scenario.arms[scenario.names[n]].shares_pose for n in group):  # e says if they agree
             continue
         q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)
@@ -446,7 +450,7 @@ def _find_disagreement(
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
-    ends = [site[-1, 2] for site in sites]
+    ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     hanging = [
         name
         for name, start, end in zip(scenario.names, starts, ends, strict=True)

@@ -22,14 +22,22 @@ Signal = Callable[[SiteLog], Array]
 """A column over the K records of a site."""
 joint_angles: Signal = attrgetter("q")
 """q, shape (K, n), rad."""
-reference_angles: Signal = attrgetter("q_des")
-"""q_des, Eq. (6), shape (K, n), rad."""
 joint_errors: Signal = attrgetter("e")
 """e = q - q_des, Eq. (9), shape (K, n), rad."""
 controller_torques: Signal = attrgetter("tau")
 """tau, Eq. (13), shape (K, n), N m."""
 parameter_estimates: Signal = attrgetter("theta_hat")
 """theta_hat, Eq. (15), shape (K, P); P = 5 of the planar arm, kg m^2 and kg m, 10 n of a chain."""
+
+
+def reference_angles(part: SiteLog) -> Array:
+    """Returns q_des, Eq. (6), shape (K, n), rad; in task space, where joints have none, q."""
+    return part.q if part.layout.task else part.q_des
+
+
+def follows_in_task_space(log: Log) -> bool:
+    """True if sites follow with their end effectors: then no joint has an error of its own."""
+    return any(arm.shares_pose for arm in log.scenario.arms.values())
 
 
 def joint_error_rates(part: SiteLog) -> Array:

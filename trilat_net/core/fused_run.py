@@ -92,15 +92,18 @@ def _update_peaks(
     """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
     error = 0.0
     bucket, joints = progress.bucket, peaks.shape[1] // 3
-    for i in range(s.shared):
-        e = s.e[i] if s.task else row[i] - row[2 * s.joints + i]
+    for i in range(joints):  # where a task has more or fewer coordinates than there are joints, zeros stand
+        e = speed = angle = 0.0
+        if i < s.shared:
+            e = s.e[i] if s.task else row[i] - row[2 * s.joints + i]
+        if i < s.joints:
+            speed, angle = abs(row[s.joints + i]), row[i]
         sums.errors[i] += e * e
         apart = abs(e)
         error = max(error, apart)
         peaks[bucket, i] = max(peaks[bucket, i], apart)
-    for i in range(s.joints):
-        peaks[bucket, joints + i] = max(peaks[bucket, joints + i], abs(row[s.joints + i]))
-        peaks[bucket, 2 * joints + i] = row[i]
+        peaks[bucket, joints + i] = max(peaks[bucket, joints + i], speed)
+        peaks[bucket, 2 * joints + i] = angle
     if error >= apart_rad:
         progress.apart_ns = t_ns
     progress.part += BUCKETS_PER_S

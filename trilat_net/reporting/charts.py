@@ -95,8 +95,9 @@ class Charts:
             tables = self._tables_of(site_signals.external_torques, operated)
             yield from self._per_joint("torques", "operator torque on the arm", "N m", tables)
         yield from self._positions()
-        tables = self._tables_of(site_signals.joint_errors)
-        yield from self._per_joint("errors", "tracking error", "rad", tables)
+        if not site_signals.follows_in_task_space(log):
+            tables = self._tables_of(site_signals.joint_errors)
+            yield from self._per_joint("errors", "tracking error", "rad", tables)
         yield from self._estimates()
         if self._twin is not None:
             moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites}
@@ -226,7 +227,9 @@ class Charts:
         """Stores where a chain's joints, those of its reference and their shadows are in the picture."""
         part, arm = self._log[site], self._log.scenario.arms[site]
         rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
-        actual, desired = (arm_poses.joint_positions_m(arm, q[rows]) for q in (part.q, part.q_des))
+        actual, desired = (
+            arm_poses.joint_positions_m(arm, q[rows]) for q in (part.q, site_signals.reference_angles(part))
+        )
         pictures = (
             arm_poses.project_arm_m(arm, actual),
             arm_poses.project_arm_m(arm, desired),

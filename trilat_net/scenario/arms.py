@@ -191,6 +191,11 @@ class ArmModel(NamedTuple):
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return list(place_end_effector(rows, np.array(self.chain.tip_m)))
 
+    @property
+    def shares_pose(self) -> bool:
+        """True if its site follows with the end effector, in task space."""
+        return self.chain is not None and self.chain.task is not None
+
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
         """Returns what a site shares of a pose: its joint angles, or its end effector's place or pose."""
         if self.chain is None or self.chain.task is None:

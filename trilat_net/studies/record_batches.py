@@ -17,6 +17,7 @@ from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
 from ..core.vectors import Array
 from ..execution import virtual
 from ..log.record_columns import Ints
+from ..log.site_log import find_task_errors
 from ..scenario import Scenario
 
 BATCH_RECORDS = 1000
@@ -30,7 +31,7 @@ class RecordBatch(NamedTuple):
         t_ns: nominal time, shape (K,), ns.
         q: joint angles, shape (K, n), rad.
         qd: joint velocities, shape (K, n), rad/s.
-        q_des: reference, Eq. (6), shape (K, n), rad.
+        e: its error against the reference, Eq. (9), shape (K, m), rad; m in task space.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
         used: tick of the sample in use, -1 before the first, shape (K, P).
@@ -39,7 +40,7 @@ class RecordBatch(NamedTuple):
     t_ns: Ints
     q: Array
     qd: Array
-    q_des: Array
+    e: Array
     tau: Array
     tau_x: Array
     used: Ints
@@ -55,7 +56,7 @@ class RecordBatch(NamedTuple):
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
         """Returns the buckets of a judgement with these records added, see `reduce_to_buckets`."""
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return reduce_to_buckets(bucket, self.q - self.q_des, self.qd, self.q, into)
+        return reduce_to_buckets(bucket, self.e, self.qd, self.q, into)
 
     def _part(self, first: int, last: int | None) -> "RecordBatch":
         return RecordBatch._make(column[first:last] for column in self)
@@ -85,7 +86,7 @@ class _PendingRecords:
         """Takes one record."""
         self._t_ns.append(output.t_ns)
         self._used.extend(output.used)
-        vectors = (output.q, output.qd, output.q_des, output.tau, output.tau_x)
+        vectors = (output.q, output.qd, output.q_des, output.tau, output.tau_x, output.x)
         for vector in vectors:
             self._floats.extend(vector)
         self._lengths = tuple(map(len, vectors))
@@ -100,7 +101,9 @@ class _PendingRecords:
         used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), -1)
         rows = np.array(self._floats).reshape(len(t_ns), -1)
         vectors = np.split(rows, np.cumsum(self._lengths)[:-1], axis=1)
-        self._take(RecordBatch._make((t_ns, *map(np.ascontiguousarray, vectors), used)))
+        q, qd, q_des, tau, tau_x, x = map(np.ascontiguousarray, vectors)
+        e = find_task_errors(x, q_des) if x.size else q - q_des
+        self._take(RecordBatch(t_ns, q, qd, e, tau, tau_x, used))
         for column in (self._t_ns, self._used, self._floats):
             del column[:]
 

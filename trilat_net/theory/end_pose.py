@@ -50,9 +50,9 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
     if not all(map(is_constant_link, log.scenario.links.values())):
         return _no_roots("delays vary")
     scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    q, theta_hat = _choose_state(scenario, parts)
     try:
         conditions = derive_operating_conditions(scenario)
+        q, theta_hat = _choose_state(scenario, parts)
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
     except ScenarioError as error:
         return _no_roots(error.problem)

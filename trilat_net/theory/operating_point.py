@@ -130,6 +130,12 @@ def is_constant_link(link: LinkBase) -> bool:
 
 def _refuse_unknown_equations(scenario: Scenario) -> None:
     for name, spec in scenario.sites.items():
+        if spec.task.space != "joints":
+            raise ScenarioError(
+                f"is {spec.task.space!r}: loops are linearised joint by joint, and not in task space",
+                path=f"sites.{name}.task.space",
+                source=scenario.name,
+            )
         if isinstance(spec.control, ImportedLaw):
             raise ScenarioError(
                 f"{spec.control.code} is an imported law, whose equations are unknown here; adaptive, "

@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...errors import LogError
 from ...log.log_reader import Log
 from ..aligned import align_records
 from ..dominance_history import trace_dominance
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
+from ..site_signals import follows_in_task_space
 from ..torque_sources import attribute_torque, list_walls
 from . import motion_metrics as motion
 from . import static_windows
@@ -129,6 +131,11 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 
 
 def _measure(log: Log) -> LogMetrics:
+    if follows_in_task_space(log):
+        raise LogError(
+            f"{log.scenario.name}: its sites follow with their end effectors, and these metrics compare joint "
+            "by joint"
+        )
     scenario, specs = log.scenario, log.scenario.sites
     runs = {
         site: SiteRun(own, attribute_torque(own, scenario), trace_dominance(log, site, own.t_s))

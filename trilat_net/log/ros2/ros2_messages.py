@@ -18,6 +18,7 @@ from ...core.ticks import Mode, TickRecord
 from ...errors import LogError
 from ...net.messages import Event, LinkStats, State
 from ...scenario import Scenario
+from ...scenario.arms import TASK_AXES
 from .cdr import (
     ENCODING,
     FLOAT64_ARRAY,
@@ -110,8 +111,9 @@ class Ros2SiteChannels:
     def __init__(self, scenario: Scenario, site: str) -> None:
         arm, self._peers = scenario.arms[site], scenario.peers(site)
         self._arm, n, peers = arm, arm.counts.joints, self._peers
-        self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 5 * n)
-        self.slow_row = slice(5 * n, None)
+        shared = arm.counts.shared
+        self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 4 * n + shared)
+        self.slow_row = slice(4 * n + shared, None)
         self.robot = build_robot_model(scenario, site)
         self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
         labels = ["_".join(name.split()) for name in self.joints]
@@ -121,7 +123,9 @@ class Ros2SiteChannels:
         if arm.chain is not None:
             estimate = ("estimate", "kg, kg m, kg m^2")
         self.arrays = {
-            "error": ArrayChannel("q - q_des", self._unit("rad"), labels),
+            "error": ArrayChannel("q - q_des", self._unit("rad"), labels)
+            if scenario.sites[site].task.space == "joints"
+            else ArrayChannel("x - x_des", "m or rad", TASK_AXES[:shared]),
             "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels),
             "theta_hat": ArrayChannel(*estimate, parameters),
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
@@ -203,13 +207,16 @@ SignalRow = Sequence[float]
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x, theta_hat, mode.
 
-    A column may be shorter where all of its numbers are the same.
+    A column may be shorter where all of its numbers are the same. In task space no joint has a reference: its
+    own angle stands there, and e is x - x_des.
     """
-    rows = [(*m.q, *m.q_des, *m.qd, *m.tau, *m.tau_x, *m.theta_hat) for m in records]
+    task = bool(records[0].x)
+    rows = [(*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat) for m in records]
     columns: list[SignalRow] = [*zip(*rows, strict=True)]
     n = len(records[0].q)
-    q, q_des = columns[:n], columns[n : 2 * n]
-    error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(q, q_des, strict=True)]
+    here = [*zip(*(m.x for m in records), strict=True)] if task else columns[:n]
+    there = [*zip(*(m.q_des for m in records), strict=True)]
+    error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)]
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]

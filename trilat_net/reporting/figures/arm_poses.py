@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis import site_signals
+from ...analysis.site_signals import reference_angles
 from ...analysis.timeline import recorded_end_s
 from ...core.chain import build_chain, place_end_effector, place_joints
 from ...core.site_setup import ChainSetup
@@ -121,7 +122,7 @@ def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
     found = joint_positions_m(arm, part.q[rows])
     actual = project_arm_m(arm, found)
-    desired = project_arm_m(arm, joint_positions_m(arm, part.q_des[last : last + 1])[0])
+    desired = project_arm_m(arm, joint_positions_m(arm, reference_angles(part)[last : last + 1])[0])
     shadow = project_arm_m(arm, found[-1 if arm.chain else len(found) :][:1], onto_floor=True)
     return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2))
 

@@ -64,7 +64,7 @@ class WindowStats:
         if not len(inside.t_ns):
             return
         self._records += len(inside.t_ns)
-        for key, values in zip(self._peaks, (inside.q - inside.q_des, inside.qd, inside.tau), strict=True):
+        for key, values in zip(self._peaks, (inside.e, inside.qd, inside.tau), strict=True):
             self._peaks[key] = max(self._peaks[key], float(np.abs(values).max()))
         self._q_least = np.minimum(self._q_least, inside.q.min(axis=0))
         self._q_most = np.maximum(self._q_most, inside.q.max(axis=0))
@@ -139,7 +139,7 @@ class SiteStats:
         """Takes in the next records."""
         if not len(rows.t_ns):
             return
-        error = np.abs(rows.q - rows.q_des)
+        error = np.abs(rows.e)
         largest = error.max(axis=1)
         self.records += len(largest)
         self.peak_error_rad = max(self.peak_error_rad, float(largest.max()))
@@ -261,9 +261,7 @@ def compute_run_metrics(
         synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
         peak_error_rad=largest("peak_error_rad"),
         rms_error_rad=largest("rms_error_rad"),
-        end_error_rad=max(
-            (float(np.abs(end.q - end.q_des).max(initial=0.0)) for end in ends.values()), default=None
-        ),
+        end_error_rad=max((float(np.abs(end.e).max(initial=0.0)) for end in ends.values()), default=None),
         end_spread_rad=_end_spread_rad(list(ends.values())) if whole else None,
         end_pose_rad={name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()},
         peak_torque_nm=largest("peak_torque_nm"),
@@ -294,6 +292,8 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
     """Compares every site's latest angles at the ticks of the first one, in their last second."""
     if not all(len(end.t_ns) for end in ends):  # a site's part ends long before the others'
+        return None
+    if len({end.q.shape[1] for end in ends}) > 1:  # unlike arms have no angle in common
         return None
     at_ns = ends[0].t_ns[ends[0].t_ns >= max(end.t_ns[0] for end in ends)]
     poses: Array = np.array([end.q[np.searchsorted(end.t_ns, at_ns, side="right") - 1] for end in ends])
@@ -328,7 +328,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     for name, tally in tallies.items():
         part = log[name]
         used = np.array([part.used[peer] for peer in part.peers]).T
-        tally.add(RecordBatch(part.t_ns, part.q, part.qd, part.q_des, part.tau, part.tau_x, used))
+        tally.add(RecordBatch(part.t_ns, part.q, part.qd, part.e, part.tau, part.tau_x, used))
         wanted = scenario.ticks(name) if diverged_at_s is None else made.get(name, 0)
         missing += max(0, wanted - len(part))
     return compute_run_metrics(

@@ -137,8 +137,8 @@ def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
     at_ns = slowest[slowest <= end_ns]
     latest = [np.searchsorted(record.t_ns, at_ns, side="right") - 1 for record in records]
     q = np.array([record.q[rows] for record, rows in zip(records, latest, strict=True)])
-    q_des = np.array([record.q_des[rows] for record, rows in zip(records, latest, strict=True)])
-    return at_ns / NS_PER_S, q, q - q_des
+    e = np.array([record.e[rows] for record, rows in zip(records, latest, strict=True)])
+    return at_ns / NS_PER_S, q, e
 
 
 def _effort(record: RecordBatch, scenario: Scenario, site: str) -> tuple[float, float]:
