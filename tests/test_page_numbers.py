@@ -36,7 +36,7 @@ from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
-WORDS = {"Nineteen": "19", "eleven": "11", "−": "-"}
+WORDS = {"Twenty": "20", "eleven": "11", "−": "-"}
 G = 9.81
 WALL = "sites.s.environment.0"
 DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
@@ -381,7 +381,7 @@ PAGES: dict[str, dict[str, Make]] = {
             test_energy.booked("paper", "digital").residual,
             *[test_energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
-        "{} runs of the nineteen": lambda: [len(shipped_trials())],
+        "{} runs of the twenty": lambda: [len(shipped_trials())],
         "run once): {} s simulated": lambda: [sum(one.scenario.duration_s for one in shipped_trials())],
     },
     "README.md": {

@@ -225,7 +225,8 @@ def timed(log: Log) -> Log:
 
 
 def replaced(state: State, **fields: object) -> State:
-    return msgspec.structs.replace(state, **fields)
+    plain = {key: [*map(float, value)] if isinstance(value, list) else value for key, value in fields.items()}
+    return msgspec.structs.replace(state, **plain)
 
 
 def in_modes(modes: Sequence[str]) -> SiteLog:

@@ -10,6 +10,7 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.figures.registry import list_drawable_figures
 from trilat_net.scenario import load_scenario
+from trilat_net.theory.operating_point import derive_operating_conditions
 
 SHORT = {"duration_s": 1.0}
 
@@ -46,4 +47,4 @@ def test_what_compares_joint_by_joint_is_refused_in_a_sentence(log: Log) -> None
     with pytest.raises(LogError, match="joint by joint"):
         compute_log_metrics(log)
     with pytest.raises(ScenarioError, match="not in task space"):
-        trilat_net.linear("unlike_arms")
+        derive_operating_conditions(log.scenario)

@@ -15,6 +15,7 @@ from .jit import leaf
 from .kernel import act_stages, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
 from .site_arrays import SiteArrays
+from .task_space import PLACE
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
@@ -92,10 +93,13 @@ def _update_peaks(
     """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
     error = 0.0
     bucket, joints = progress.bucket, peaks.shape[1] // 3
+    here = 4 * s.joints + 2 * s.shared + s.parameters if s.task else 0
     for i in range(joints):  # where a task has more or fewer coordinates than there are joints, zeros stand
         e = speed = angle = 0.0
         if i < s.shared:
-            e = s.e[i] if s.task else row[i] - row[2 * s.joints + i]
+            e = row[here + i] - row[2 * s.joints + i]
+            if i >= PLACE and s.task:  # of an orientation
+                e = s.e[i]
         if i < s.joints:
             speed, angle = abs(row[s.joints + i]), row[i]
         sums.errors[i] += e * e

@@ -23,8 +23,8 @@ from .jit import leaf
 from .rotation import rotation_matrix, turn_between
 from .vectors import Array, Row, RowArray
 
-POSE = 6
-"""Numbers of a task that has an orientation."""
+PLACE, POSE = 3, 6
+"""Numbers of a task without and with an orientation."""
 TINY = 1e-12
 """A pivot of J J' below this is of an axis along which the end effector cannot move at all."""
 

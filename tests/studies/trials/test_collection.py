@@ -150,7 +150,7 @@ def test_the_cut_into_blocks_changes_no_statistics_of_a_site(seed: int, cuts: li
 def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     rows = records(seed)
     tally = tallied(rows, [37, 38, 290])
-    error = np.abs(rows.q - rows.q_des)
+    error = np.abs(rows.e)
     assert tally.peak_error_rad == error.max()
     assert tally.peak_torque_nm == np.abs(rows.tau).max()
     assert tally.peak_speed_rad_s == np.abs(rows.qd).max()

@@ -133,8 +133,7 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 def _measure(log: Log) -> LogMetrics:
     if follows_in_task_space(log):
         raise LogError(
-            f"{log.scenario.name}: its sites follow with their end effectors, and these metrics compare joint "
-            "by joint"
+            f"{log.scenario.name}: its sites follow in task space, and metrics compare joint by joint"
         )
     scenario, specs = log.scenario, log.scenario.sites
     runs = {

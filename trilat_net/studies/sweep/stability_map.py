@@ -58,9 +58,10 @@ def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Returns the condition in closed form that covers a scenario, or None."""
     if scenario.timeline or any(spec.on_stale.action != "use" for spec in scenario.sites.values()):
         return None
-    if any(model.chain is not None for model in scenario.arms.values()):  # they are of the planar arm
+    if any(arm.shares_pose for arm in scenario.arms.values()):
         return None
-    return _damped(scenario) or _sampled(scenario)
+    chains = any(arm.chain is not None for arm in scenario.arms.values())
+    return _damped(scenario) or (None if chains else _sampled(scenario))
 
 
 def _damped(scenario: Scenario) -> StabilityCriterion | None:
