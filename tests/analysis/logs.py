@@ -6,6 +6,7 @@ from functools import cache
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
 import trilat_net
 from trilat_net.core.ticks import LinkCounts
@@ -225,7 +226,12 @@ def timed(log: Log) -> Log:
 
 
 def replaced(state: State, **fields: object) -> State:
-    plain = {key: [*map(float, value)] if isinstance(value, list) else value for key, value in fields.items()}
+    plain = {
+        key: [float(x) if isinstance(x, np.floating) else x for x in value]
+        if isinstance(value, list)
+        else value
+        for key, value in fields.items()
+    }
     return msgspec.structs.replace(state, **plain)
 
 
