@@ -19,12 +19,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ..core.chain import MAX_JOINTS, Matrix, Three
 from ..core.sincos import sincos
 from ..errors import ScenarioError
 from .fields import MAX_QUANTITY, suggest_nearest
 
 MAX_CHARACTERS = 1_000_000
-MAX_JOINTS = 12
 MAX_OFFSET_M = 100.0
 """Largest coordinate of an origin; beyond it a file is in millimetres, or wrong."""
 CONSISTENCY = 1e-9
@@ -33,12 +33,10 @@ LEAST_MASS_KG = 1e-9
 LEAST_MOMENT_KG_M2 = 1e-12
 """Of a body that moves; of a single link less than it counts as none."""
 
-Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]
 BodyParameters = tuple[float, ...]
 """m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the origin of a frame, in its axes."""
 
-_ZERO: Vector = (0.0, 0.0, 0.0)
+_ZERO: Three = (0.0, 0.0, 0.0)
 _UNIT: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -84,9 +82,9 @@ class UrdfJoint(NamedTuple):
     name: str
     link: str
     kind: str
-    axis: Vector
+    axis: Three
     rotation: Matrix
-    origin_m: Vector
+    origin_m: Three
     inertia: BodyParameters
     lower: float
     upper: float
@@ -114,7 +112,7 @@ class UrdfChain(NamedTuple):
     tip: str
     joints: tuple[UrdfJoint, ...]
     tip_rotation: Matrix
-    tip_origin_m: Vector
+    tip_origin_m: Three
     notes: tuple[str, ...]
 
 
@@ -122,7 +120,7 @@ class _Pose(NamedTuple):
     """A frame in another one."""
 
     rotation: Matrix = _UNIT
-    origin_m: Vector = _ZERO
+    origin_m: Three = _ZERO
 
     def __matmul__(self, inner: "_Pose") -> "_Pose":
         """Returns where a frame is that is given in this one."""
@@ -467,7 +465,7 @@ def _parse_number(word: str, what: str, place: str, most: float) -> float:
     return value
 
 
-def _read_vector(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> Vector:
+def _read_vector(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> Three:
     words = element.get(key, "").split()
     if len(words) != 3:
         _refuse(place, f"its <{element.tag} {key}> has {len(words)} numbers, must have three")
@@ -596,11 +594,11 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[BodyParameters]) -> BodyParameter
     return total
 
 
-def _dot(a: Vector, b: Vector) -> float:
+def _dot(a: Three, b: Three) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _turn(rotation: Matrix, vector: Vector) -> Vector:
+def _turn(rotation: Matrix, vector: Three) -> Three:
     return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
 
 
