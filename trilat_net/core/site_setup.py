@@ -11,6 +11,7 @@ from typing import NamedTuple
 from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
 from .exogenous import TorqueSource
+from .law_channel import LawChannel
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
 from .user_law import UserLawFactory
@@ -79,6 +80,8 @@ class LinkSetup(NamedTuple):
         models: in the order of their first stamps; the first applies from stamp 0.
         traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
         outages: when the link is cut: pairs of first stamp and end, ns.
+        channel: what the peer's law sends besides its motion.
+        place: the site's place among the peers of its peer, in scenario order.
     """
 
     peer: str
@@ -89,6 +92,8 @@ class LinkSetup(NamedTuple):
     models: tuple[LinkModel, ...] = (LinkModel(),)
     traces: tuple[Points | None, ...] = (None,)
     outages: tuple[tuple[int, int], ...] = ()
+    channel: LawChannel = LawChannel()
+    place: int = 0
 
 
 class Layout(NamedTuple):
@@ -232,6 +237,7 @@ class SiteSetup(NamedTuple):
         own: makes the user's law, if it is one.
         theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
+        channel: what the site's law sends to its peers.
     """
 
     name: str
@@ -253,6 +259,7 @@ class SiteSetup(NamedTuple):
     own: UserLawFactory | None = None
     theta_known: bool = True
     chain: ChainSetup | None = None
+    channel: LawChannel = LawChannel()
 
     @property
     def layout(self) -> Layout:

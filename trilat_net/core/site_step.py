@@ -220,7 +220,7 @@ class Site:
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
         offset = 0
-        for peer, tick, q, qd, _, _ in arrivals:
+        for peer, tick, q, qd, *_ in arrivals:
             self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
             offset += self._arrival_size
         if self._reflects:

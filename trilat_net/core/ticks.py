@@ -61,6 +61,7 @@ class Arrival(NamedTuple):
         qd: its joint velocities, rad/s.
         latency_us: its time under way, microseconds; telemetry, enters no formula.
         tau_x: the exogenous torque of the peer's record, N m; laws that reflect force use it.
+        ch: what the peer's law sent to this site besides, see `LawChannel.part`.
     """
 
     peer: int
@@ -69,6 +70,7 @@ class Arrival(NamedTuple):
     qd: Sequence[float]
     latency_us: int = 0
     tau_x: Sequence[float] = ()
+    ch: Sequence[float] = ()
 
 
 class DominanceRamp(NamedTuple):
@@ -156,6 +158,7 @@ class TickRecord(NamedTuple):
         x: in task space what the site shares of its end effector: its place, m, and orientation; else empty.
         xd: its derivative, m/s and rad/s.
         wrench: what tau_x amounts to there, N and N m.
+        ch: what the site's law sends besides, see `LawChannel`.
     """
 
     tick: int
@@ -175,6 +178,7 @@ class TickRecord(NamedTuple):
     x: Sequence[float] = ()
     xd: Sequence[float] = ()
     wrench: Sequence[float] = ()
+    ch: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Returns the motion and the exogenous torque that peers get, in the coordinates that sites share."""

@@ -67,6 +67,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         x: in task space the coordinates that the sites exchange; in joint space these are left out.
         xd: their derivatives.
         wrench: exogenous torque in those coordinates.
+        ch: what the site's law sends besides, see `core.law_channel`; left out if it sends nothing.
     """
 
     v: int
@@ -94,6 +95,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     x: list[float] = []
     xd: list[float] = []
     wrench: list[float] = []
+    ch: list[float] = []
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -111,6 +113,7 @@ class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     tau_x: list[float]
     sent_ns: Instant = 0
     echo: list[Stamp] = []
+    ch: list[float] = []
 
 
 class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

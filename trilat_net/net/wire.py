@@ -83,8 +83,8 @@ def encode_state(
         WireError: a number is not finite.
     """
     (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *task) = output
-    x, xd, wrench = task
-    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench]
+    x, xd, wrench, ch = task
+    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench, *ch]
     # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
     if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
@@ -112,7 +112,11 @@ def encode_state(
         "sent_ns": t_ns if sent_ns is None else sent_ns,
         "echo": echo,
     }
-    return _encode(fields | {"x": x, "xd": xd, "wrench": wrench} if x else fields)
+    if x:
+        fields |= {"x": x, "xd": xd, "wrench": wrench}
+    if ch:
+        fields["ch"] = ch
+    return _encode(fields)
 
 
 def encode_sample(

@@ -1,0 +1,63 @@
+"""What a control law sends to its peers besides the motion and the exogenous torque of its record.
+
+Invariant: a law declares its vectors once; their numbers stand one behind the other in the field `ch` of its
+record and of its sample: first the vectors that go to all peers, then per peer, in scenario order, those
+that go to that peer alone. A receiver takes the first part and its own; what it took in is thereby found in
+the sender's record.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+MAX_SENT = 16
+"""Most numbers per joint that a law sends to a peer."""
+
+
+class SentVector(NamedTuple):
+    """A vector that a law sends at every tick.
+
+    Attributes:
+        name: its name, as the law uses it.
+        unit: of its numbers.
+        length: how many numbers it has.
+        per_peer: true: another one for each peer; false: the same for all.
+    """
+
+    name: str
+    unit: str
+    length: int
+    per_peer: bool = False
+
+
+class LawChannel(NamedTuple):
+    """All that the law of a site sends.
+
+    Attributes:
+        vectors: those for all peers before those of each peer.
+        peers: how many peers the site has.
+    """
+
+    vectors: tuple[SentVector, ...] = ()
+    peers: int = 0
+
+    def numbers(self, *, per_peer: bool) -> int:
+        """Returns how many numbers go to each peer alone, or to all."""
+        return sum(vector.length for vector in self.vectors if vector.per_peer is per_peer)
+
+    @property
+    def received(self) -> int:
+        """How many numbers one peer gets."""
+        return sum(vector.length for vector in self.vectors)
+
+    @property
+    def floats(self) -> int:
+        """How many numbers stand in a record."""
+        return self.numbers(per_peer=False) + self.peers * self.numbers(per_peer=True)
+
+    def part(self, sent: Sequence[float], place: int) -> Sequence[float]:
+        """Returns what the peer at a place among the sender's peers gets of a record's numbers."""
+        own, common = self.numbers(per_peer=True), self.numbers(per_peer=False)
+        if not own:
+            return sent
+        first = common + place * own
+        return [*sent[:common], *sent[first : first + own]]
