@@ -38,6 +38,22 @@ def test_a_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> No
     assert {name: link.loss for name, link in scenario.links.items() if link.loss != 0.1} == {"m1->s": 0.2}
 
 
+@pytest.mark.parametrize(
+    ("one", "whole"),
+    [
+        ("control.Kp.3=7", "control.Kp=[10, 10, 10, 7, 2, 2]"),
+        ("sites.s.control.Kp.0=7", "sites.s.control.Kp=[7, 10, 10, 2, 2, 2]"),
+        ("sites.s.control.Lambda.5=3", "sites.s.control.Lambda=[1, 1, 1, 1, 1, 3]"),
+        ("limits.tau_limit_nm.5=9", "limits.tau_limit_nm=[150, 150, 150, 28, 28, 9]"),
+        ("sites.m1.q0_rad.2=1", "sites.m1.q0_rad=[0.3, -1.0, 1.0, -0.6, 0.5, 0.2]"),
+    ],
+)
+def test_a_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> None:
+    """Also where the author wrote one number for all joints, or the vector of a group."""
+    scenario = load_scenario("six_joints", [whole])
+    assert load_scenario("six_joints", [one]) == scenario == load_scenario(load_scenario("six_joints"), [one])
+
+
 def test_another_law_has_its_own_gains_from_the_start() -> None:
     control = load_scenario(PAPER, ["control.law=p_d", "control.K=20"]).sites["m2"].control
     assert (control.K, control.d) == ((20.0, 20.0), (3.0, 3.0))
@@ -63,6 +79,8 @@ def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
         (["limits.tau_limit=5"], ["limits.tau_limit", "did you mean 'tau_limit_nm'"]),
         (["control=5"], ["control", "must be a table"]),
         (["nonsense.x=5"], ["nonsense", "unknown key"]),
+        (["control.Kd.2=5"], ["control.Kd.2", "it has 2, counted from 0"]),
+        (["control.Kdd.1=5"], ["control.Kdd.1", "did you mean 'Kd'"]),
     ],
     ids=str,
 )

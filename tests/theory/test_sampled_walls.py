@@ -4,14 +4,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from tests.certificate.adversaries import RunInMemory
+from tests.core.chain_references import Array, ChainState, chain_references
 from trilat_net.analysis.run_end import Stability
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
 from trilat_net.theory import find_linear_edge
 from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.linear_edge import LinearEdge
+from trilat_net.theory.linear_edge import LinearEdge, find_contact_growth
 
 ENVIRONMENT = "sites.s.environment"
 STIFFNESS = f"{ENVIRONMENT}.0.stiffness_n_m"
@@ -86,3 +88,95 @@ def test_the_sweep_over_stiffness_is_monotone() -> None:
         [end_alone(1e3 * K) is Stability.STABLE for K in range(1, 41)],
     ):
         assert stable == [K <= 15 for K in range(1, 41)]
+
+
+H_S, DELAY_TICKS, FORCE_N = 1e-3, 5, 20.0
+STIFF = np.array([60.0, 60.0, 60.0, 12.0, 12.0, 12.0])
+DAMPING = np.array([6.0, 6.0, 6.0, 0.7, 0.7, 0.7])
+HAND_NM_RAD = 40.0
+DRIVES = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+NORMAL = np.array([0.6, -0.3, 0.74])
+NORMAL /= np.linalg.norm(NORMAL)
+
+
+def press(state: ChainState, K: float) -> Scenario:
+    """Two arms of six joints: the hand of s leans it against a sampled wall of any direction."""
+    q = state.q.tolist()
+    to = state.q - state.jacobian[:3].T @ NORMAL * (FORCE_N / HAND_NM_RAD)
+    wall = {"kind": "wall", "sampled": True, "normal": NORMAL.tolist(), "stiffness_n_m": K}
+    return load_scenario(
+        "two_sites",
+        {
+            "scheme": "digital",
+            "expect": {},
+            "arm": {"urdf": "arm6.urdf", "g_m_s2": 0.0, "stops": False, "armature_kg_m2": DRIVES.tolist()},
+            "control": {"law": "p_d", "K": STIFF.tolist(), "d": DAMPING.tolist(), "gravity": 0.0},
+            "link": {"model": "constant", "delay_ms": 1e3 * H_S * DELAY_TICKS},
+            "sites.m": {"role": "master", "q0_rad": q},
+            "sites.s": {
+                "role": "slave",
+                "q0_rad": q,
+                "hands": [{"kind": "spring", "to_rad": to.tolist(), "stiffness_nm_rad": HAND_NM_RAD}],
+                "environment": [{**wall, "point_m": (state.tip_position + FORCE_N / K * NORMAL).tolist()}],
+            },
+        },
+    )
+
+
+def wall_stiffness(state: ChainState, K: float) -> Array:
+    """How the torque of the wall falls with the angles: J'n K n'J, and the turning of J under its force.
+
+    The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i x J_j.
+    """
+    linear, angular = state.jacobian[:3], state.jacobian[3:]
+    turning = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            first, last = min(i, j), max(i, j)
+            turning[i, j] = NORMAL @ np.cross(angular[:, first], linear[:, last])
+    along = linear.T @ NORMAL
+    return K * np.outer(along, along) - FORCE_N * turning
+
+
+def growth_of_ticks(state: ChainState, K: float) -> float:
+    """The rate of the largest eigenvalue of a tick's map, of Pinocchio's M and J: its hand acts at any time,
+    both laws and the wall are held, each arm sees the other as it was `DELAY_TICKS` ago."""
+    none, one = np.zeros((6, 6)), np.eye(6)
+    inverse = np.linalg.inv(state.inertia + np.diag(DRIVES))
+    step: dict[str, tuple[Array, Array]] = {}
+    for site, hand in (("m", 0.0), ("s", HAND_NM_RAD)):
+        rates = np.block([[none, one, none], [-hand * inverse, none, inverse], [none, none, none]])
+        made = expm(H_S * rates)
+        step[site] = made[:12, :12], made[:12, 12:]
+    size = 24 + 12 * DELAY_TICKS  # m, s, then (q_m, q_s) of the ticks before, latest first
+    A = np.zeros((size, size))
+    law = np.hstack([-np.diag(STIFF), -np.diag(DAMPING)])
+    oldest = size - 12
+    for n, (site, wall) in enumerate((("m", none), ("s", wall_stiffness(state, K)))):
+        free, pushed = step[site]
+        own = slice(12 * n, 12 * n + 12)
+        A[own, own] = free + pushed @ (law - np.hstack([wall, none]))
+        peer = oldest + 6 * (1 - n)
+        A[own, peer : peer + 6] = pushed @ np.diag(STIFF)
+        A[24 + 6 * n : 30 + 6 * n, 12 * n : 12 * n + 6] = one
+    A[36:, 24:-12] = np.eye(12 * (DELAY_TICKS - 1))
+    return float(np.log(np.abs(np.linalg.eigvals(A)).max()) / H_S)
+
+
+@pytest.mark.parametrize("n", range(3))
+def test_growth_in_contact_of_arms_of_six_joints_is_that_of_pinocchios_arm(n: int) -> None:
+    """At walls in space, soft and hard; of several states the deepest counts, and without contact nothing."""
+    state = chain_references()["arm6"].states[n]
+    signs = set()
+    for K in (1e4, 1e6):
+        scenario = press(state, K)
+        at = np.tile(state.q, (2, 1))
+        theta = np.zeros((3, 2, 60))
+        away = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
+        wanted = growth_of_ticks(state, K)
+        assert find_contact_growth(scenario, np.stack([away, at, away]), theta) == pytest.approx(
+            wanted, rel=1e-5
+        )
+        assert np.isnan(find_contact_growth(scenario, away[None], theta[:1]))
+        signs.add(wanted > 0.0)
+    assert signs == {True, False}

@@ -43,7 +43,7 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
         if key == "rate_hz":
             every |= {f"sites.{site}.rate_hz": value for site in scenario.names}
         elif group in SITE_GROUPS and name:
-            check_keys({name: value}, field_names(SITE_GROUPS[group]), group)
+            check_keys({_split_entry(name)[0]: value}, field_names(SITE_GROUPS[group]), group)
             every |= {f"sites.{site}.{key}": value for site in scenario.names}
         elif group in _KIND_KEYS and name:
             every |= dict.fromkeys(_expand_group(scenario, group, name, given), value)
@@ -85,21 +85,49 @@ def _expand_group(scenario: Scenario, group: str, name: str, given: Mapping[str,
     }
     built_in = {path: kind for path, kind in kinds.items() if path not in user_laws}
     valid = sorted({key for names in keys.values() for key in names})
-    members = [f"{path}.{name}" for path, kind in built_in.items() if name in keys.get(kind, valid)]
+    vector = _split_entry(name)[0]
+    members = [f"{path}.{name}" for path, kind in built_in.items() if vector in keys.get(kind, valid)]
     if user_laws and not members:
         return [
             _user_law_key(path, name) if law == _USER_LAW else f"{path}.{name}"
             for path, law in user_laws.items()
         ]
-    if name not in valid:
-        hint = suggest_nearest(name, [*_KIND_KEYS[group], *valid]) or f"; valid are {', '.join(valid)}"
+    if vector not in valid:
+        hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid]) or f"; valid are {', '.join(valid)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     if not members:
-        word, owners = _KIND_KEYS[group][0], [kind for kind, names in keys.items() if name in names]
+        word, owners = _KIND_KEYS[group][0], [kind for kind, names in keys.items() if vector in names]
         is_now = ", ".join(dict.fromkeys(kinds.values()))
         problem = f"belongs to {word} {', '.join(owners)}, and here is only {is_now}: set {group}.{word} too"
         raise ScenarioError(problem, path=f"{group}.{name}")
     return members
+
+
+def _split_entry(key: str) -> tuple[str, str]:
+    """Returns a key of an entry of a list as the key of the list and the entry's number, else "" for that."""
+    vector, _, entry = key.rpartition(".")
+    return (vector, entry) if vector and entry.isdecimal() else (key, "")
+
+
+def split_entries(tables: TomlTable, pairs: Sequence[Override]) -> tuple[dict[str, Any], list[Override]]:
+    """Returns overrides of an author's tables, and those of entries of vectors that they do not write out.
+
+    A vector may be one number, or be that of a group: its entries are there once the tables are resolved.
+    """
+    own, of_entries = {}, []
+    for key, value in pairs:
+        vector, entry = _split_entry(key)
+        reached: Any = tables if entry else []
+        for name in vector.split(".") if entry else ():
+            if isinstance(reached, list) and name.isdecimal() and int(name) < len(reached):
+                reached = reached[int(name)]
+            else:
+                reached = reached.get(name) if isinstance(reached, dict) else None
+        if isinstance(reached, list):
+            own[key] = value
+        else:
+            of_entries.append((key, value))
+    return own, of_entries
 
 
 def _law(scenario: Scenario, site: str, given: Mapping[str, Any]) -> Any:

@@ -15,7 +15,7 @@ from ..core.delay import MAX_DELAY_US
 from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
 from ..errors import ScenarioError
 from .fields import suggest_nearest
-from .override import apply_overrides, expand_overrides, parse_overrides
+from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
@@ -126,8 +126,14 @@ def parse_scenario(
             tables = tomllib.loads(text)
         except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
             raise ScenarioError(f"is not TOML: {error}") from None
-        apply_overrides(tables, overrides)
-        return build_scenario(resolve_scenario(tables, folder))
+        own, of_entries = split_entries(tables, parse_overrides(overrides))
+        apply_overrides(tables, own)
+        scenario = build_scenario(resolve_scenario(tables, folder))
+        if of_entries:
+            tables = tomllib.loads(scenario.text)
+            apply_overrides(tables, expand_overrides(scenario, of_entries))
+            scenario = build_scenario(resolve_scenario(tables, folder))
+        return scenario
     except ScenarioError as error:
         raise ScenarioError(error.problem, path=error.path, source=source) from None
     except RecursionError:

@@ -19,7 +19,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..core.chain import MAX_JOINTS, Matrix, Three
+from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
 from ..core.sincos import sincos
 from ..errors import ScenarioError
 from .fields import MAX_QUANTITY, suggest_nearest
@@ -124,9 +124,9 @@ class _Pose(NamedTuple):
 
     def __matmul__(self, inner: "_Pose") -> "_Pose":
         """Returns where a frame is that is given in this one."""
-        x, y, z = _turn(self.rotation, inner.origin_m)
+        x, y, z = apply(self.rotation, inner.origin_m)
         ox, oy, oz = self.origin_m
-        return _Pose(_multiply(self.rotation, inner.rotation), (ox + x, oy + y, oz + z))
+        return _Pose(multiply(self.rotation, inner.rotation), (ox + x, oy + y, oz + z))
 
 
 class _Edge(NamedTuple):
@@ -558,9 +558,8 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
     Its centre of mass and the axes of its tensor are given in the frame of the link.
     """
     (r0, r1, r2), (x, y, z) = pose @ centre
-    columns = [_turn(tensor, row) for row in (r0, r1, r2)]
-    xx, xy, xz = (_dot(r0, column) for column in columns)
-    yy, yz, zz = _dot(r1, columns[1]), _dot(r1, columns[2]), _dot(r2, columns[2])
+    columns = apply(tensor, r0), apply(tensor, r1), apply(tensor, r2)
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = apply(columns, r0), apply(columns, r1), apply(columns, r2)
     return (
         mass,
         mass * x,
@@ -592,20 +591,3 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[BodyParameters]) -> BodyParameter
     slack = CONSISTENCY * moments[2]
     _check_moments(place, moments, max(LEAST_MOMENT_KG_M2, slack), slack)
     return total
-
-
-def _dot(a: Three, b: Three) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _turn(rotation: Matrix, vector: Three) -> Three:
-    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
-
-
-def _multiply(a: Matrix, b: Matrix) -> Matrix:
-    first, second, third = (_turn(a, (b[0][n], b[1][n], b[2][n])) for n in range(3))
-    return (
-        (first[0], second[0], third[0]),
-        (first[1], second[1], third[1]),
-        (first[2], second[2], third[2]),
-    )

@@ -99,10 +99,11 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
     ("setting", "word"),
     [
         ("link.model=measured", "links.m2->m1.model: is measured: that is the delay of a real network"),
+        ("task.space=position", "task.space: laws are compared by the distance of joint angles"),
         ("sites.m2.plant=external", "sites.m2.plant: is external: that arm is outside of the program"),
     ],
 )
-def test_what_only_runs_live_is_refused(setting: str, word: str) -> None:
+def test_what_only_runs_live_or_has_no_common_angles_is_refused(setting: str, word: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         check_comparable(load_scenario("free", [setting]))
     assert word in str(refused.value)

@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.core.chain_references import ChainState, chain_references
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
+from trilat_net.studies.commands import format_toml_value
 from trilat_net.studies.tuning.candidate import TuningScenario, load_tuning_scenario
 from trilat_net.studies.tuning.search_space import (
     DEFAULT_LAWS,
@@ -14,6 +16,7 @@ from trilat_net.studies.tuning.search_space import (
     ModelInformation,
     build_model_information,
     select_search_spaces,
+    weigh_joints,
 )
 
 from .experiments import trio
@@ -61,6 +64,45 @@ def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
             ranges.setdefault(knob.name.partition("_")[0], set()).add((knob.unit, knob.low, knob.high))
     assert all(len(found) == 1 for found in ranges.values())
     assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
+
+
+def six(state: ChainState, **overrides: object) -> TuningScenario:
+    """`six_joints` of two equal start poses."""
+    start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
+    given = {"arm.stops": False, **start, **overrides}
+    return load_tuning_scenario(
+        "six_joints", [f"{key}={format_toml_value(one)}" for key, one in given.items()]
+    )
+
+
+def test_joints_of_chains_share_a_gain_by_the_inertia_that_pinocchio_says_they_show() -> None:
+    armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+    for state in chain_references()["arm6"].states:
+        inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
+        weights = weigh_joints(six(state).scenario)
+        assert weights == pytest.approx(inertia / inertia.max(), rel=0.05)  # two digits
+        gains = {"Lambda": 2.0, "Kp": 30.0, "Kd": 4.0, "Gamma": 0.5}
+        found = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
+        control = found.scenario.sites["m1"].control
+        assert control.Kp == pytest.approx(30.0 * np.array(weights))
+        assert control.Kd == pytest.approx(4.0 * np.array(weights))
+        assert control.Lambda == (2.0,) * 6
+        assert sum("control=" in text for text in found.overrides) == 1  # one for all sites
+    assert weigh_joints(load_scenario("free")) == []
+
+
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+@pytest.mark.parametrize("armature_kg_m2", [0.0, 0.001, 0.2])
+def test_every_choice_within_the_ranges_is_one_that_the_arms_can_take(
+    armature_kg_m2: float, scheme: str
+) -> None:
+    state, *_ = chain_references()["arm6"].states
+    small = {"law": "p_d", "K": 1.0, "d": 1e-3}
+    experiment = six(state, scheme=scheme, control=small, **{"arm.armature_kg_m2": armature_kg_m2})
+    for space in SEARCH_SPACES.values():
+        if space.law != "p_f":
+            most = {knob.name: knob.high for knob in space.knobs}
+            experiment.with_gains(space, ModelInformation(), most)
 
 
 def test_the_usual_laws_take_any_number_of_sites() -> None:

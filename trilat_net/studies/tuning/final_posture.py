@@ -42,6 +42,13 @@ def check_comparable(scenario: Scenario) -> None:
         ScenarioError: says why, and what would be right.
     """
     refuse_live_only(scenario)
+    if any(spec.task.shared for spec in scenario.sites.values()):
+        raise ScenarioError(
+            "laws are compared by the distance of joint angles, and here end effectors agree: take a "
+            "scenario in joint space",
+            path="task.space",
+            source=scenario.name,
+        )
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
         words = " and ".join(", ".join(scenario.names[site] for site in group) for group in groups)

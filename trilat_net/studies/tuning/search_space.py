@@ -3,7 +3,8 @@
 Its gains with units and ranges, and the model information all laws share.
 
 Invariant: ranges are log-uniform, one number for both joints and all sites of a role; a quantity has the
-same range in every law (stiffness is K or Kp Lambda, damping d or Kp). All laws get the same gravity
+same range in every law (stiffness is K or Kp Lambda, damping d or Kp). Of a chain that number is the
+heaviest joint's, and the others have their share of it, see `weigh_joints`. All laws get the same gravity
 parameters, the true ones times one share, and no inertia: a law that estimates it starts at zero.
 """
 
@@ -89,13 +90,48 @@ class SearchSpace(NamedTuple):
     Attributes:
         knobs: its gains.
         told: what it uses of the common model information, in words.
-        controls: writes a choice of gains out as the control of every site.
+        write: writes a choice of gains out as the control of every site, one number for all joints.
     """
 
     law: str
     knobs: tuple[GainRange, ...]
     told: str
-    controls: Callable[[Scenario, ModelInformation, GainValues], SiteControls]
+    write: Callable[[Scenario, ModelInformation, GainValues], SiteControls]
+
+    def controls(self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+        """Returns the control of every site; gains of chains that make a torque have a number per joint."""
+        tables = self.write(scenario, knowledge, gains)
+        weights = weigh_joints(scenario)
+        for table in tables.values() if weights else ():
+            for key in _TORQUE_GAINS:
+                if key in table:
+                    table[key] = [float(f"{table[key] * weight:.4g}") for weight in weights]
+        return tables
+
+
+_TORQUE_GAINS = ("Kp", "Kd", "K", "d")
+
+
+def weigh_joints(scenario: Scenario) -> list[float]:
+    """Returns the share of each joint of chains in a gain that makes a torque, at most 1; [] of planar arms.
+
+    It is the inertia that the joint shows while the others are free, 1 / (M^-1)_ii, least over the sites'
+    start poses, as a part of the largest; all less where an arm could not take the upper ends of the ranges
+    at its tick rate (`validate`).
+    """
+    arms = [(scenario.sites[name], model) for name, model in scenario.arms.items() if model.chain is not None]
+    if not arms:
+        return []
+    inverses = [np.linalg.inv(model.inertia(np.array(site.q0_rad))) for site, model in arms]
+    inertia = np.min([1.0 / np.diag(inverse) for inverse in inverses], axis=0)
+    weights = inertia / inertia.max()
+    scaled = np.sqrt(weights)
+    most = 1.0 if scenario.scheme == "second_order" else 2.0
+    for (site, _), inverse in zip(arms, inverses, strict=True):
+        fastest = np.linalg.eigvalsh(scaled * inverse * scaled[:, None])[-1] / site.rate_hz
+        weights *= min(1.0, 0.9 * most / ((_KP.high + _KD.high) * fastest))
+        scaled = np.sqrt(weights)
+    return [float(f"{weight:.2g}") for weight in weights]
 
 
 def _adaptive(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:

@@ -27,7 +27,7 @@ from ..intervals import MeanInterval
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
 from .pareto_search import REFINEMENT_STEPS, Objective, ObjectivePoint
-from .search_space import SEARCH_SPACES
+from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, SearchResult, TuningPlan, TuningResult
 
 
@@ -120,6 +120,9 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         plan.knowledge.text + ("; known gets inertia exactly as well" if informed else ""),
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS of tau - G(q)",
     ]
+    if weights := weigh_joints(scenario):
+        shares = ", ".join(f"{weight:g}" for weight in weights)
+        lines.append(f"of Kp, Kd, K and d the joints have {shares} times the number, by their inertia")
     if plan.others:
         lines.append(f"every candidate is the mean of {1 + len(plan.others)} seeds, with its 95 % interval")
     if plan.objective is Objective.SETTLING:
@@ -195,6 +198,7 @@ def tuning_to_json(tuned: TuningResult) -> JsonObject:
             "gravity_told": asked.knowledge.gravity,
             "knowledge": asked.knowledge.text,
             "box": asked.knowledge.box,
+            **({"joint_weights": weights} if (weights := weigh_joints(scenario)) else {}),
             "outcomes": {outcome.value: text for outcome, text in CLASS_MEANINGS.items()},
         },
         "laws": {found.space.law: _law(tuned, found) for found in tuned.found},
