@@ -37,11 +37,6 @@ def test_its_error_is_that_of_the_place(log: Log) -> None:
     assert np.abs(log["s"].e[-1]).max() < np.abs(log["s"].e[500]).max()
 
 
-def test_a_certificate_says_that_there_is_no_v(log: Log) -> None:
-    found = trilat_net.certify(log)
-    assert "no such V" in " ".join(premise.text for premise in found.premises)
-
-
 def test_what_compares_joint_by_joint_is_refused_in_a_sentence(log: Log) -> None:
     assert "tracking_errors" not in list_drawable_figures(log)
     with pytest.raises(LogError, match="joint by joint"):

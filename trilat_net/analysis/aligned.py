@@ -18,10 +18,12 @@ from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
+from ..log.site_log import SiteLog, find_task_errors
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+_TASK_COLUMNS = ("x", "xd")
+_NONE: Array = np.zeros((0, 0))
 
 
 class AlignedRecords(NamedTuple):
@@ -39,6 +41,7 @@ class AlignedRecords(NamedTuple):
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
         theta_hat: estimate, shape (K, P).
         used: per peer the tick of the sample in use; -1 before the first.
+        x, xd: in task space the end effector's place or pose and its derivative, shape (K, m); else empty.
     """
 
     site: str
@@ -54,6 +57,18 @@ class AlignedRecords(NamedTuple):
     tau_x: Array
     theta_hat: Array
     used: dict[str, Ints]
+    x: Array = _NONE
+    xd: Array = _NONE
+
+    @property
+    def shared(self) -> Array:
+        """What peers get: q, or x in task space, shape (K, m)."""
+        return self.x if self.x.size else self.q
+
+    @property
+    def shared_rate(self) -> Array:
+        """Its derivative: qd, or xd in task space, shape (K, m)."""
+        return self.xd if self.x.size else self.qd
 
     @property
     def h_s(self) -> float:
@@ -73,8 +88,13 @@ class AlignedRecords(NamedTuple):
 
     @property
     def e(self) -> Array:
-        """Position error, Eq. (9), shape (K, n), rad."""
-        return self.q - self.q_des
+        """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
+        return find_task_errors(self.x, self.q_des) if self.x.size else self.q - self.q_des
+
+    @property
+    def ed(self) -> Array:
+        """Its derivative, shape (K, n), rad/s; in task space (K, m)."""
+        return self.shared_rate - self.qd_des
 
     @property
     def known_periods(self) -> Bools:
@@ -124,7 +144,8 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 
 def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
     """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
-    part.prepare(*RECORD_COLUMNS)
+    names = (*RECORD_COLUMNS, *(_TASK_COLUMNS if part.layout.task else ()))
+    part.prepare(*names)
     tick = part.tick[rows]
     first = int(tick[0])
     end = int(tick[-1]) if last is None else max(first, min(last, int(tick[-1])))
@@ -132,7 +153,7 @@ def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Align
     before = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[before] == grid
     follows: Bools = (part.mode[rows] == "run")[before]
-    columns = {name: getattr(part, name)[rows] for name in RECORD_COLUMNS}
+    columns = {name: getattr(part, name)[rows] for name in names}
     for name, values in columns.items():
         columns[name] = (
             values[: len(grid)]
@@ -144,10 +165,10 @@ def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Align
 
 
 class PeerMotion(NamedTuple):
-    """Motion of a peer at K times.
+    """Motion of a peer at K times: of its joints, or of its end effector in task space.
 
     Attributes:
-        q, qd: shape (K, n), rad and rad/s.
+        q, qd: what it shares, shape (K, n), rad and rad/s; in task space (K, m), m and m/s.
         squares: integral of qd squared since row 0, per joint, shape (K, n), rad^2/s.
         known: True if it follows from records.
     """
@@ -163,7 +184,7 @@ class PeerTrajectory:
 
     def __init__(self, records: AlignedRecords) -> None:
         self.records = records
-        squares = records.qd**2
+        squares = records.shared_rate**2
         steps = 0.5 * records.h_s * (squares[1:] + squares[:-1])
         self._squares: Array = np.vstack([np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)])
 
@@ -179,7 +200,8 @@ class PeerTrajectory:
         place = np.where(np.abs(place - nearest) < 1e-5, nearest, place)
         low = np.clip(np.floor(place), 0, len(records.known) - 2).astype(np.int64)
         x = np.clip(place - low, 0.0, 1.0)[:, np.newaxis]
-        qa, qb, va, vb = records.q[low], records.q[low + 1], records.qd[low], records.qd[low + 1]
+        at, rate = records.shared, records.shared_rate
+        qa, qb, va, vb = at[low], at[low + 1], rate[low], rate[low + 1]
         q = qa + x * (h * va + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb))))
         qd = va + x * (vb - va)
         sa, sb = va**2, vb**2

@@ -26,7 +26,7 @@ from ..core.chain import (
     three,
 )
 from ..core.jit import leaf
-from ..core.site_setup import ChainSetup
+from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import JOINTS
 from ..core.vectors import Array, Row, RowArray
 from ..scenario import Scenario
@@ -101,6 +101,11 @@ class PlanarArmRows(NamedTuple):
     theta: Array
     g: float
     lengths_m: tuple[float, float]
+
+    @property
+    def task(self) -> None:
+        """None: it follows joint by joint."""
+        return
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
@@ -184,7 +189,7 @@ def _put_gradients(
 def _put_end_effectors(
     chain: RowArray, theta: Array, gravity: Array, tip: Array, q: Array, at: Array, J: Array, energy: Array
 ) -> None:
-    """Writes place, (K, 3), and Jacobian, (K, 3, n), of every row, and the links' potential energy, (K,), J.
+    """Writes place, (K, 3), and Jacobian, (K, 6, n), of every row, and the links' potential energy, (K,), J.
 
     That energy is -g'(m p + R mc) of every link, p and R its place and orientation in the base's frame.
     """
@@ -202,7 +207,7 @@ def _put_end_effectors(
             mc = rotate(row.R_base, (theta[first + 1], theta[first + 2], theta[first + 3]))
             energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(three(gravity), mc)
             for j in range(3):
-                J[k, j, i] = row.J_lin[j]
+                J[k, j, i], J[k, 3 + j, i] = row.J_lin[j], row.J_ang[j]
 
 
 class ChainArmRows(NamedTuple):
@@ -217,6 +222,11 @@ class ChainArmRows(NamedTuple):
 
     theta: Array
     chain: ChainSetup
+
+    @property
+    def task(self) -> TaskSetup | None:
+        """How it follows with its end effector; None: joint by joint."""
+        return self.chain.task
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
@@ -273,8 +283,8 @@ class ChainArmRows(NamedTuple):
         return self.law_torque(self.theta[np.newaxis], q, still, still, still)
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Returns place and Jacobian of the end effector, and the potential energy."""
-        found = np.zeros((len(q), 3)), np.zeros((len(q), 3, q.shape[1])), np.zeros(len(q))
+        """Returns place and Jacobian of the end effector, with that of its turn, and the potential energy."""
+        found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
         gravity, tip = np.array(self.chain.gravity_m_s2), np.array(self.chain.tip_m)
         _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)
         return found
@@ -292,7 +302,8 @@ class ChainArmRows(NamedTuple):
     def stop_torque(self, q: Array, qd: Array) -> Array:
         """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that never pull."""
         stiffness, damping = self._column("stop_stiffness"), self._column("stop_damping")
-        under, over = self._column("lower") - q, q - self._column("upper")
+        under = np.maximum(self._column("lower") - q, 0.0)
+        over = np.maximum(q - self._column("upper"), 0.0)
         up = np.where(under > 0.0, np.maximum(stiffness * under - damping * qd, 0.0), 0.0)
         down = np.where(over > 0.0, np.maximum(stiffness * over + damping * qd, 0.0), 0.0)
         torque: Array = up - down
@@ -301,7 +312,20 @@ class ChainArmRows(NamedTuple):
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in space, in the base's frame."""
         at, J, _ = self._place(q)
+        J = np.ascontiguousarray(J[:, :3])
         return EndEffectorRows(at, np.einsum("kij,kj->ki", J, qd), J)
+
+    def jacobian_rate(self, q: Array, qd: Array) -> Array:
+        """Returns the derivative of the end effector's Jacobian along qd, shape (K, 3, n).
+
+        Column i turns with all joints up to i; of those after it the end effector moves about its axis.
+        """
+        J = self._place(q)[1].transpose(0, 2, 1)
+        linear, axis = J[:, :, :3], J[:, :, 3:]
+        speed, turn = (qd[:, :, np.newaxis] * x for x in (linear, axis))
+        later = speed.sum(axis=1, keepdims=True) - np.cumsum(speed, axis=1)
+        found: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, later)
+        return found.transpose(0, 2, 1)
 
     def hangs(self, q: Array) -> bool:
         """True if a pose, shape (n,), stores hardly more energy than any: as a pendulum within `HANGING_RAD`.
@@ -336,4 +360,7 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     model = scenario.arms[site]
     if model.chain is None:
         return PlanarArmRows(model.theta, scenario.sites[site].arm.g_m_s2, model.lengths_m)
-    return ChainArmRows(model.theta, model.chain)
+    chain, task = model.chain, model.chain.task
+    if task is not None and not task.posture:
+        chain = chain._replace(task=task._replace(posture=scenario.sites[site].q0_rad))
+    return ChainArmRows(model.theta, chain)

@@ -58,15 +58,16 @@ def left_perron_vector(alpha: Array) -> Array:
 def find_kd_scales(Kd: Array) -> Array | None:
     """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd shape (N, n).
 
-    If every Kd is zero, nothing couples the sites and any scale holds: ones.
+    A number that is NaN is of an axis of the task that its site does not follow. If every Kd is zero, nothing
+    couples the sites and any scale holds: ones.
     """
-    if not Kd.any():
+    if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
-    sizes = Kd.sum(axis=1)
+    sizes = Kd[:, np.isfinite(Kd).all(axis=0)].sum(axis=1)
     if not sizes.all():
         return None
     shapes = Kd / sizes[:, np.newaxis]
-    if np.abs(shapes - shapes[0]).max() > KD_SHAPE_TOLERANCE:
+    if np.nan_to_num(np.fmax.reduce(shapes) - np.fmin.reduce(shapes)).max() > KD_SHAPE_TOLERANCE:
         return None
     scales: Array = sizes / sizes[0]
     return scales

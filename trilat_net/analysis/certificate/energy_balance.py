@@ -111,14 +111,18 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(own) for site, own in records.items()}
     energies = {}
+    constants = {site: energy_terms.derive_site_constants(log.scenario, site) for site in records}
+    axes = [c.axes for c in constants.values() if c.axes]
+    common = tuple(np.prod(axes, axis=0).tolist()) if axes else ()
     for site, own in records.items():
         motion = SiteMotion(
             own,
-            energy_terms.derive_site_constants(log.scenario, site),
+            constants[site],
             trace_dominance(log, site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
             split_torque(own, log.scenario),
             Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL,
+            common,
         )
         views = enumerate(motion.peers.values())
         known = [own.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
@@ -285,7 +289,7 @@ def _trace_weights(
     energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, ones: bool
 ) -> tuple[Array, Array]:
     """Returns beta at a site's ticks, shape (K, N), and at the ends of its periods, before a step there."""
-    Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
+    Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     constant = all(energy.motion.dominance.constant for energy in energies.values())
     solved: dict[bytes, Array] = {}  # by dominance matrix
 

@@ -4,7 +4,8 @@ Invariant: V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta)
 alpha_ij int qd_j' Kd qd_j ds ), the integral from the stamp of the sample in use to now: the paper's Eq.
 (16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, V_i' = -r'Kp r - 1/2
 sum_j alpha_ij |qd_i - qd_j(t - T)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2: the first two terms
-dissipate, the last two are transferred between sites and cancel under beta.
+dissipate, the last two are transferred between sites and cancel under beta. In task space e and qd_j are
+those of end effectors and r is that of the task (`following`); docs/certificate.md says what else changes.
 
 Within a sample period a term is a trapezoid, with an error of second order in the period, followed by an
 exact jump at its end; a jump of e is divided among links, changes of dominance and the rule for stale
@@ -25,8 +26,9 @@ from ...log.record_columns import Ints
 from ...scenario import Scenario, SiteSpec
 from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
-from ..arm_rows import ArmRows, build_arm_rows
+from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
+from ..following import Following, JointFollowing, follow_with_end_effector
 from ..torque_sources import TorqueSplit
 
 
@@ -35,11 +37,13 @@ class SiteConstants(NamedTuple):
 
     Attributes:
         arm: the arm, of true parameters.
-        Lambda, Kp, Kd: gains, 1/s and N m s/rad.
+        Lambda, Kp, Kd: gains, 1/s and N m s/rad; in task space Lambda and Kd (N s/m) have shape (m,).
         Gamma: adaptation gain.
         low, high: limits of the estimates.
         tau_limit: largest torque of a joint, N m, shape () or (n,).
         outside: True if the arm is outside of the program: theta is then what its author states.
+        axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and Kd are 0;
+            () in joint space.
     """
 
     arm: ArmRows
@@ -51,11 +55,17 @@ class SiteConstants(NamedTuple):
     high: Array
     tau_limit: Array
     outside: bool = False
+    axes: tuple[float, ...] = ()
 
     @property
     def theta(self) -> Array:
         """The arm's true parameters, shape (P,)."""
         return self.arm.theta
+
+    @property
+    def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
+        """Kd as the weights of V see it: NaN along an axis that the site does not follow, shape (m,)."""
+        return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd) if self.axes else self.Kd
 
     @property
     def adapts(self) -> Bools:
@@ -67,12 +77,16 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
     spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
-    names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high")
+    of_law = {name: np.array(getattr(gains, name)) for name in ("Lambda", "Kp", "Kd", "Gamma", "low", "high")}
+    task = arm.task
+    if task is not None:
+        of_law |= {name: np.array(task.axes) * of_law[name] for name in ("Lambda", "Kd")}
     return SiteConstants(
+        **of_law,
         arm=arm,
+        axes=() if task is None else task.axes,
         tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
         outside=spec.plant == "external",
-        **{name: np.array(getattr(gains, name)) for name in names},
     )
 
 
@@ -83,8 +97,8 @@ def explain_missing_functional(spec: SiteSpec) -> str:
     if not isinstance(spec.control, Adaptive | AdaptiveBox):
         name = next(name for name, kind in LAWS.items() if isinstance(spec.control, kind))
         return f"law {name}, for which there is no such V"
-    if spec.task.shared:
-        return f"it follows with its end effector ({spec.task.space}), for which there is no such V"
+    if spec.task.space == "pose":
+        return "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
     return ""
 
 
@@ -93,7 +107,8 @@ class PeriodEnds(NamedTuple):
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad.
+        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad; in task space, as
+            all of e, (peers, K - 1, m), m.
         dominance: the jump of e by a step of dominance factors, rad.
         rule: the jump of e by the rule for stale peers, rad.
         r_left, r_right, r_middle: r = qd + Lambda e, rad/s.
@@ -121,6 +136,7 @@ class SiteMotion:
         dominance, peers: its factors for its peers, and these as the site sees them, in the same order.
         torque: ON its arm.
         digital: True if the scheme holds tau_k, False if it extrapolates the torque.
+        common: per coordinate 1 if all sites follow along it, else 0; () if they follow along all.
     """
 
     records: AlignedRecords
@@ -129,18 +145,27 @@ class SiteMotion:
     peers: Mapping[str, DelayedPeer]
     torque: TorqueSplit
     digital: bool = False
+    common: tuple[float, ...] = ()
+
+    @cached_property
+    def follows(self) -> Following:
+        """How an error of the reference becomes motion and torque of the joints."""
+        at, c = self.records, self.constants
+        if isinstance(c.arm, PlanarArmRows) or c.arm.task is None:
+            return JointFollowing(c.Lambda)
+        return follow_with_end_effector(c.arm, at.q, at.qd, c.Lambda)
 
     @cached_property
     def r(self) -> Array:
-        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s."""
-        return self.records.qd + self.constants.Lambda * self.records.e
+        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s; in task space qd - v."""
+        return self.records.qd - self.follows.reference(slice(None), self.records.e, self.records.ed)[0]
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r of Eq. (15), shape (K, P)."""
-        at, c = self.records, self.constants
-        v, a = -c.Lambda * at.e, -c.Lambda * (at.qd - at.qd_des)
-        return c.arm.gradient(at.q, at.qd, v, a, self.r)
+        at = self.records
+        v, a = self.follows.reference(slice(None), at.e, at.ed)
+        return self.constants.arm.gradient(at.q, at.qd, v, a, self.r)
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
@@ -149,11 +174,15 @@ class SiteMotion:
 
     def law_torque(self, rows: Ints) -> Array:
         """Returns tau of Eq. (13), without its limit, in some rows, shape (K, n), N m."""
-        at = self.records
-        ed = (at.qd - at.qd_des)[rows]
-        return _control_torque(
-            self.constants, at.theta_hat[rows], (at.q[rows], at.qd[rows], at.e[rows], ed), self.r[rows]
-        )
+        return self.control_torque(rows, self.records.e[rows], self.records.ed[rows], self.r[rows])
+
+    def control_torque(self, rows: Ints, e: Array, ed: Array, r: Array) -> Array:
+        """Returns tau of Eq. (13) with these errors in place of the recorded ones, without its limit."""
+        at, c = self.records, self.constants
+        v, a = self.follows.reference(rows, e, ed)
+        model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
+        found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed)
+        return found
 
     @cached_property
     def ends(self) -> PeriodEnds:
@@ -162,7 +191,7 @@ class SiteMotion:
         While the site follows its peers, the smooth course of its reference is Eq. (6) with every stamp
         moving at rate one. Otherwise the rule decides: the trapezoid rule on the recorded derivative.
         """
-        at, c, views, alpha = self.records, self.constants, list(self.peers.values()), self.dominance
+        at, views, alpha = self.records, list(self.peers.values()), self.dominance
         following = at.follows[:-1] & at.follows[1:]
         here, left = following[:, np.newaxis], at.follows[:-1, np.newaxis]
         before, after, rate = (x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1]))
@@ -176,14 +205,15 @@ class SiteMotion:
         dominance = np.where(here, np.sum(steps, axis=0), 0.0)
         rule = np.where(here, 0.0, np.where(left, kept_q, ruled_q) - at.q_des[1:])
         jump = link.sum(axis=0) + dominance + rule
+        moved = self.follows.lift(slice(1, None), jump)
         return PeriodEnds(
             following,
             link,
             dominance,
             rule,
             r_left=self.r[:-1],
-            r_right=self.r[1:] - c.Lambda * jump,
-            r_middle=self.r[1:] - 0.5 * c.Lambda * jump,
+            r_right=self.r[1:] - moved,
+            r_middle=self.r[1:] - 0.5 * moved,
             e_middle=at.e[1:] - 0.5 * jump,
             qd_des_left=qd_des_left,
             qd_des_right=qd_des_right,
@@ -252,15 +282,19 @@ def _nothing(site: SiteMotion) -> Increment:
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2.
 
-    And r'(friction(qd) - friction(qd - r)) of joints with friction, which the law knows.
+    And r'(friction(qd) - friction(qd - r)) of joints with friction, which the law knows; and along axes that
+    not all sites follow what they do not give back to each other.
     """
     at, c, ends, alpha = site.records, site.constants, site.ends, site.dominance
+    rate = at.shared_rate
     left = right = np.zeros(len(at.known) - 1)
     for j, view in enumerate(site.peers.values()):
-        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, at.qd[:-1] - view.seen.qd[:-1])
-        right = right + 0.5 * alpha.before[:, j] * _norm(c, at.qd[1:] - view.kept.qd)
+        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.seen.qd[:-1])
+        right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.kept.qd)
     damping = ((c.Kp * r**2).sum(axis=1) for r in (ends.r_left, ends.r_right))
     found = {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
+    if not all(site.common):
+        found["open axes"] = _compute_transfer(site, 1.0 - np.array(site.common))
     friction = [
         (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
         for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
@@ -270,10 +304,16 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 def compute_transfer(site: SiteMotion) -> Increment:
     """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that follow it."""
-    own = 0.5 * _norm(site.constants, site.records.qd)
+    return _compute_transfer(site, np.array(site.common or 1.0))
+
+
+def _compute_transfer(site: SiteMotion, axes: Array) -> Increment:
+    """Returns the same along some axes alone: those of weight 1 and not of weight 0."""
+    c = site.constants._replace(Kd=axes * site.constants.Kd)
+    own = 0.5 * _norm(c, site.records.shared_rate)
     left, right = own[:-1], own[1:]
     for j, view in enumerate(site.peers.values()):
-        peer = 0.5 * _norm(site.constants, view.now.qd)
+        peer = 0.5 * _norm(c, view.now.qd)
         left = left - site.dominance.alpha[:-1, j] * peer[:-1]
         right = right - site.dominance.before[:, j] * peer[1:]
     return _trapezoid(site, left, right)
@@ -297,6 +337,7 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
         "rule": stale_rule_work(site),
         "torque limit": torque_limit_work(site),
         "estimates": estimate_work(site),
+        **({"singular poses": singular_pose_work(site)} if site.constants.axes else {}),
     }
 
 
@@ -334,9 +375,9 @@ def dominance_change_work(site: SiteMotion) -> Increment:
         kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ c.Kd
         followed_rate = np.where(ends.following, rate, 0.0)
         left = left + rate * stored[:-1]
-        left = left + followed_rate * (at.qd[:-1] * c.Kd * view.seen.q[:-1]).sum(axis=1)
+        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.seen.q[:-1]).sum(axis=1)
         right = right + rate * kept
-        right = right + followed_rate * (at.qd[1:] * c.Kd * view.kept.q).sum(axis=1)
+        right = right + followed_rate * (at.shared_rate[1:] * c.Kd * view.kept.q).sum(axis=1)
         jump = jump + (alpha.alpha[1:, j] - alpha.before[:, j]) * stored[1:]
     return _trapezoid(site, left, right, jump)
 
@@ -350,8 +391,9 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     views = list(enumerate(site.peers.values()))
     seen = np.sum([alpha.alpha[:-1, j, None] * view.seen.qd[:-1] for j, view in views], axis=0)
     kept = np.sum([alpha.before[:, j, None] * view.kept.qd for j, view in views], axis=0)
-    left = (at.qd[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
-    right = (at.qd[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
+    rate = at.shared_rate
+    left = (rate[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
+    right = (rate[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
     return _trapezoid(
         site, *(np.where(ruled, x, 0.0) for x in (left, right, _energy_of_jump(site, ends.rule)))
     )
@@ -365,6 +407,31 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     if len(cut):
         power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
+
+
+def singular_pose_work(site: SiteMotion) -> Increment:
+    """Returns the work of the damping near singular poses: int r'M(a - v') - (J r - x' - Lambda e)'Kd ed.
+
+    Both are zero where J J+ = I.
+    """
+    at, c, ends = site.records, site.constants, site.ends
+    ends_of_e = (
+        (at.e[:-1], slice(0, -1), ends.qd_des_left),
+        (
+            2.0 * ends.e_middle - at.e[1:],
+            slice(1, None),
+            ends.qd_des_right,
+        ),
+    )
+    powers = []
+    for (e, rows, qd_des), r in zip(ends_of_e, (ends.r_left, ends.r_right), strict=True):
+        missed, a_missed = site.follows.miss(rows, e)
+        ed = at.shared_rate[rows] - qd_des
+        power = -(missed * c.Kd * ed).sum(axis=1)
+        if a_missed.any():
+            power = power + (c.arm.multiply_inertia(at.q[rows], r) * a_missed).sum(axis=1)
+        powers.append(power)
+    return _trapezoid(site, *powers)
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
@@ -422,24 +489,15 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     """Returns tau of Eq. (13) and Y'r at the end of every period, before its jump, K - 1 rows each."""
     at, c, ends = site.records, site.constants, site.ends
     tau, Yr = at.tau[1:].copy(), site.Yr[1:].copy()
-    q, qd, e = at.q[1:], at.qd[1:], 2.0 * ends.e_middle - at.e[1:]
+    e = 2.0 * ends.e_middle - at.e[1:]
     moved = np.abs(e - at.e[1:]) + np.abs(ends.qd_des_right - at.qd_des[1:]) > JUMP_TOLERANCE
     rows = np.flatnonzero(moved.any(axis=1))
-    e, ed, r = e[rows], (qd - ends.qd_des_right)[rows], ends.r_right[rows]
-    Yr[rows] = c.arm.gradient(q[rows], qd[rows], -c.Lambda * e, -c.Lambda * ed, r)
-    law = _control_torque(c, at.theta_hat[1:][rows], (q[rows], qd[rows], e, ed), r)
-    tau[rows] = np.clip(law, -c.tau_limit, c.tau_limit)
+    e, ed, r = e[rows], (at.shared_rate[1:] - ends.qd_des_right)[rows], ends.r_right[rows]
+    later = rows + 1
+    v, a = site.follows.reference(later, e, ed)
+    Yr[rows] = c.arm.gradient(at.q[later], at.qd[later], v, a, r)
+    tau[rows] = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
     return tau, Yr
-
-
-def _control_torque(
-    c: SiteConstants, theta_hat: Array, at: tuple[Array, Array, Array, Array], r: Array
-) -> Array:
-    """Returns tau of Eq. (13) at q, qd, e and ed, without its limit, shape (K, n), N m."""
-    q, qd, e, ed = at
-    model = c.arm.law_torque(theta_hat, q, qd, -c.Lambda * e, -c.Lambda * ed)
-    found: Array = model - c.Kp * r - c.Kd * ed
-    return found
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
@@ -450,6 +508,7 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
     c, ends = site.constants, site.ends
     if not de.any():
         return np.zeros(len(de))
-    gradient = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle) + c.Kd * ends.e_middle
-    change: Array = (gradient * c.Lambda * de).sum(axis=1)
+    momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)
+    change: Array = (momentum * site.follows.lift(slice(1, None), de)).sum(axis=1)
+    change += (c.Kd * ends.e_middle * c.Lambda * de).sum(axis=1)
     return change

@@ -15,6 +15,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import Bools
+from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
 from ..timeline import find_mode_intervals
 from .energy_balance import ZERO_ENERGY_J, EnergyBalance, SiteEnergy
@@ -26,6 +27,8 @@ MIN_FREE_S = 1.0
 """The least free motion at the end of a run of which the theorem speaks, s; and so many times the largest age
 of a sample in use:"""
 MIN_FREE_AGES = 5.0
+LEAST_SPEED_M_S = 1e-9
+"""What rounding may leave of the speed along an axis along which an end effector cannot move."""
 MAX_LISTED_NAMES = 4
 """Links or sites that a sentence names."""
 
@@ -64,6 +67,8 @@ def check_run_premises(log: Log, energies: Mapping[str, SiteEnergy], balance: En
         _check_following(log),
         _check_torque_limits(log.scenario, energies),
         *_check_stops(log.scenario, energies),
+        *_check_axes(energies),
+        *_check_singular_poses(energies),
         _check_operators(energies, balance),
         _check_records(balance),
     ]
@@ -83,13 +88,13 @@ def _check_parameters(scenario: Scenario, constants: Mapping[str, SiteConstants]
 
 
 def _check_gains(constants: Mapping[str, SiteConstants]) -> Premise:
-    Kd = np.array([c.Kd for c in constants.values()])
+    Kd = np.array([c.weighing_Kd for c in constants.values()])
     scales = find_kd_scales(Kd)
     if scales is None:
         rows = [f"{site} ({', '.join(f'{value:g}' for value in c.Kd)})" for site, c in constants.items()]
         text = f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
         return Premise("Kd", False, text)
-    if not Kd.all():
+    if not Kd.all():  # NaN counts as positive
         return Premise("Kd", False, "some Kd is zero: the theorem asks for positive ones")
     alike = np.ptp(scales) == 0.0
     scalars = f"one Kd but for a scalar: {_per_site(constants, scales)}"
@@ -101,7 +106,7 @@ def _check_dominance(log: Log, energies: Mapping[str, SiteEnergy]) -> Premise:
     changing = [site for site, energy in energies.items() if not energy.motion.dominance.constant]
     if changing:
         return Premise("shares", False, f"the shares of {_list(changing)} change")
-    Kd = np.array([energy.motion.constants.Kd for energy in energies.values()])
+    Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(alpha, Kd)
     if len(weights.groups) > 1:
         groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
@@ -182,6 +187,44 @@ def _check_stops(scenario: Scenario, energies: Mapping[str, SiteEnergy]) -> list
     return [Premise("stops", not touched, text)]
 
 
+def _check_axes(energies: Mapping[str, SiteEnergy]) -> list[Premise]:
+    """Nobody follows a site along an axis along which it moves and follows nobody; [] in joint space."""
+    motions = {site: energy.motion for site, energy in energies.items() if energy.motion.constants.axes}
+    if not motions:
+        return []
+    faults = []
+    for site, motion in motions.items():
+        free = np.array(motion.constants.axes) == 0.0
+        free &= np.abs(motion.records.xd).max(axis=0) > LEAST_SPEED_M_S
+        for follower, other in motions.items():
+            if site in energies[follower].followed and (free & (np.array(other.constants.axes) > 0.0)).any():
+                faults.append(f"{follower} follows {site} along an axis that {site} does not follow")
+    text = "every site follows along each axis along which it moves and is followed"
+    return [Premise("axes", not faults, _list(faults) or text)]
+
+
+def _check_singular_poses(energies: Mapping[str, SiteEnergy]) -> list[Premise]:
+    """No pose is damped: then J J+ = I; [] in joint space."""
+    found = {
+        site: follows
+        for site, energy in energies.items()
+        if isinstance(follows := energy.motion.follows, TaskFollowing)
+    }
+    if not found:
+        return []
+    near = [
+        f"{site} from {energies[site].motion.records.t_s[int(np.argmax(one.damping > 0.0))]:.4g} s on"
+        for site, one in found.items()
+        if one.damping.any()
+    ]
+    if near:
+        return [
+            Premise("singular poses", False, f"a pose is so nearly singular that it is damped: {_list(near)}")
+        ]
+    bounds = _per_site(found, np.array([one.least.min() for one in found.values()]))
+    return [Premise("singular poses", True, f"none is near; least singular value at least: {bounds}")]
+
+
 def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> Premise:
     """Passive with respect to r: they give no more than they took before, up to a constant."""
     pushed_s = {
@@ -202,7 +245,8 @@ def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance)
     if gave <= 1e-9 * balance.scale + ZERO_ENERGY_J:
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(pushed_s[site][-1] for site in sites)
-    text = f"the {who} gave up to {gave:.3g} J with respect to r = qd + Lambda e"
+    r = "qd - v" if any(energy.motion.constants.axes for energy in energies.values()) else "qd + Lambda e"
+    text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
     free_s, least_s = float(balance.t_s[-1] - let_go_s), _least_free_motion_s(energies)
     if free_s >= least_s:
         return Premise("hands", True, f"{text}; nobody pushes after {let_go_s:.3f} s")

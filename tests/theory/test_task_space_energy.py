@@ -1,0 +1,102 @@
+"""V of task space falls as the page says: along a closed loop of textbook equations that SciPy integrates.
+
+One two-link arm of point masses follows the place of a peer that moves as it likes, as it was T before. Its
+equations are written here, its reference acceleration is a complex step, and nothing is the program's.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+Vector = NDArray[np.float64]
+T, G = 0.3, 9.81
+LAMBDA, KP, KD, GAMMA = np.array([1.5, 0.7]), np.array([3.0, 2.0]), np.array([8.0, 5.0]), 0.4
+THETA = np.array([3.0, 1.0, 1.0, 2.0, 1.0])
+STEP = 1e-30
+
+
+def peer(t: float) -> tuple[Vector, Vector, Vector]:
+    """Place, velocity and acceleration of the peer."""
+    turn = np.array([1.3, 0.9]) * t + np.array([0.2, 1.0])
+    rate, size = np.array([1.3, 0.9]), np.array([0.15, 0.2])
+    middle = np.array([0.9, 0.8])
+    return middle + size * np.sin(turn), size * rate * np.cos(turn), -size * rate**2 * np.sin(turn)
+
+
+def place(q: Vector) -> Vector:
+    both = q[0] + q[1]
+    return np.array([np.cos(q[0]) + np.cos(both), np.sin(q[0]) + np.sin(both)])
+
+
+def jacobian(q: Vector) -> Vector:
+    both = q[0] + q[1]
+    return np.array(
+        [[-np.sin(q[0]) - np.sin(both), -np.sin(both)], [np.cos(q[0]) + np.cos(both), np.cos(both)]]
+    )
+
+
+def regressor(q: Vector, qd: Vector, v: Vector, a: Vector) -> Vector:
+    """M a + C v + G of the textbook, C of Christoffel's symbols, as a matrix of its parameters."""
+    c, s, one, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
+    first = 2 * c * a[0] + c * a[1] - s * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
+    return np.array(
+        [[a[0], first, a[1], one, both], [0.0, c * a[0] + s * qd[0] * v[0], a[0] + a[1], 0.0, both]]
+    )
+
+
+def inertia(q: Vector) -> Vector:
+    bend = THETA[1] * np.cos(q[1])
+    return np.array([[THETA[0] + 2 * bend, THETA[2] + bend], [THETA[2] + bend, THETA[2]]])
+
+
+def reference(q: Vector, x_des: Vector) -> Vector:
+    return np.linalg.solve(jacobian(q), -LAMBDA * (place(q) - x_des))
+
+
+def loop(t: float, q: Vector, qd: Vector, theta_hat: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+    """The sliding variable, the error's derivative, qdd and the estimate's derivative."""
+    x_des, xd_des, _ = peer(t - T)
+    J, v = jacobian(q), reference(q, x_des)
+    a = np.imag(reference(q + 1j * STEP * qd, x_des + 1j * STEP * xd_des)) / STEP
+    r, ed = qd - v, J @ qd - xd_des
+    Y = regressor(q, qd, v, a)
+    tau = Y @ theta_hat - KP * r - J.T @ (KD * ed)
+    bias = regressor(q, qd, qd, np.zeros(2)) @ THETA
+    return r, ed, np.linalg.solve(inertia(q), tau - bias), -GAMMA * Y.T @ r
+
+
+def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
+    """The derivative of V at a time by a difference of fourth order."""
+
+    def V(t: float) -> float:
+        state = moves(t)
+        q, qd, theta_hat, stored = state[:2], state[2:4], state[4:9], state[9]
+        x_des = peer(t - T)[0]
+        r, e = qd - reference(q, x_des), place(q) - x_des
+        off = theta_hat - THETA
+        return float(
+            0.5 * r @ inertia(q) @ r + 0.5 * off @ off / GAMMA + 0.5 * e @ (LAMBDA * KD * e) + 0.5 * stored
+        )
+
+    return (8 * (V(t + h) - V(t - h)) - V(t + 2 * h) + V(t - 2 * h)) / (12 * h)
+
+
+def test_its_derivative_is_what_is_taken_and_passed_on() -> None:
+    def field(t: float, state: Vector) -> Vector:
+        q, qd = state[:2], state[2:4]
+        _, _, qdd, rate = loop(t, q, qd, state[4:9])
+        now, then = peer(t)[1], peer(t - T)[1]
+        return np.concatenate([qd, qdd, rate, [now @ (KD * now) - then @ (KD * then)]])
+
+    begin = np.array([0.1, 1.3, 0.0, 0.0, *(0.5 * THETA), 0.0])
+    run = solve_ivp(field, (0.0, 4.0), begin, method="DOP853", rtol=1e-12, atol=1e-13, dense_output=True)
+    for t in np.linspace(0.2, 3.8, 25):
+        state = run.sol(t)
+        q, qd = state[:2], state[2:4]
+        r, ed, _, _ = loop(t, q, qd, state[4:9])
+        xd, now = jacobian(q) @ qd, peer(t)[1]
+        passed_on = 0.5 * xd @ (KD * xd) - 0.5 * now @ (KD * now)
+        wanted = -r @ (KP * r) - 0.5 * ed @ (KD * ed) - passed_on
+        assert abs(follow(run.sol, t, 1e-3) - wanted) <= 1e-7 * (1.0 + abs(wanted)), t

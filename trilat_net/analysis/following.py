@@ -1,0 +1,137 @@
+"""How the law turns errors into motion and torque of the joints, over rows: joint by joint, or in task space.
+
+Invariant: written with NumPy from the equations of `docs/laws.md`, independently of the core; J and J' of the
+followed axes alone count, and those that are not followed have no effect. With A = J J' + damping the
+reference velocity and its derivative are
+
+    v = psi + J'y,              A y = -Lambda e - J psi
+    a = psi' + Jd'y + J'y',     A y' = -Lambda ed - Jd v - J (psi' + Jd'y)
+
+so that J v = -Lambda e - damping y: what is missed where the pose is nearly singular.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.vectors import Array
+from ..log.record_columns import Ints
+from .arm_rows import ChainArmRows
+
+Rows = slice | Ints
+_LEAST_EIGENVALUE = 1e-12
+"""Below this an eigenvalue of J J' is of an axis along which the end effector cannot move at all."""
+
+
+class JointFollowing(NamedTuple):
+    """A site that follows joint by joint; `TaskFollowing` has the same functions."""
+
+    Lambda: Array
+
+    def reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Returns the reference velocity -Lambda e and its derivative, shape (K, n)."""
+        return -self.Lambda * e, -self.Lambda * ed
+
+    def lift(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
+        """Returns what a change of e adds to r, shape (K, n)."""
+        return self.Lambda * de
+
+    def push(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
+        """Returns the torque of a force along what sites share, shape (K, n)."""
+        return force
+
+    def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Returns what damping near singular poses leaves of J r and of the reference acceleration: 0."""
+        return np.zeros_like(e), np.zeros_like(e)
+
+
+@dataclass(frozen=True)
+class TaskFollowing:
+    """A site that follows with its end effector, over K rows.
+
+    Attributes:
+        Lambda: 0 along an axis that it does not follow, shape (m,).
+        J, Jd: Jacobian of the followed axes and its derivative, shape (K, m, n).
+        psi, psi_rate: velocity towards the posture, and its derivative, shape (K, n).
+        inverse: of J J' with its damping, shape (K, m, m).
+        damping, damping_rate: shape (K,), m^2 and m^2/s.
+        least: the lower bound of the least singular value that damping goes by, shape (K,), m.
+    """
+
+    Lambda: Array
+    J: Array
+    Jd: Array
+    psi: Array
+    psi_rate: Array
+    inverse: Array
+    damping: Array
+    damping_rate: Array
+    least: Array
+
+    def _solve(self, rows: Rows, b: Array) -> Array:
+        found: Array = np.einsum("kij,kj->ki", self.inverse[rows], b)
+        return found
+
+    def _weights(self, rows: Rows, e: Array) -> Array:
+        """Returns y, shape (K, m)."""
+        return self._solve(rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows]))
+
+    def reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
+        """Returns v and a of the joints, shape (K, n)."""
+        J, Jd, y = self.J[rows], self.Jd[rows], self._weights(rows, e)
+        v = self.psi[rows] + self.push(rows, y)
+        a = self.psi_rate[rows] + np.einsum("kij,ki->kj", Jd, y)
+        b = -self.Lambda * ed - np.einsum("kij,kj->ki", Jd, v) - np.einsum("kij,kj->ki", J, a)
+        return v, a + self.push(rows, self._solve(rows, b))
+
+    def lift(self, rows: Rows, de: Array) -> Array:
+        """Returns what a change of e adds to r: J+ Lambda de, shape (K, n)."""
+        return self.push(rows, self._solve(rows, self.Lambda * de))
+
+    def push(self, rows: Rows, force: Array) -> Array:
+        """Returns the torque of a force along what sites share: J'f, shape (K, n)."""
+        torque: Array = np.einsum("kij,ki->kj", self.J[rows], force)
+        return torque
+
+    def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:
+        """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing is damped."""
+        damping, rate = self.damping[rows, np.newaxis], self.damping_rate[rows, np.newaxis]
+        if not (damping.any() or rate.any()):
+            return np.zeros_like(e), np.zeros_like(self.psi[rows])
+        y = self._weights(rows, e)
+        return damping * y, self.push(rows, self._solve(rows, rate * y))
+
+
+Following = JointFollowing | TaskFollowing
+
+
+def follow_with_end_effector(arm: ChainArmRows, q: Array, qd: Array, Lambda: Array) -> TaskFollowing:
+    """Returns how a site follows in task space along rows of its joints, shape (K, n)."""
+    task = arm.task
+    assert task is not None
+    place = arm.place_end_effector(q, qd)
+    axes = np.array(task.axes)[:, np.newaxis]
+    J, Jd = (axes * task.scale * x for x in (place.J, arm.jacobian_rate(q, qd)))
+    A = J @ J.transpose(0, 2, 1) + np.diag(1.0 - axes[:, 0])
+    turn, basis = np.linalg.eigh(A)
+    inverse = (basis / np.maximum(turn, _LEAST_EIGENVALUE)[:, np.newaxis]) @ basis.transpose(0, 2, 1)
+    trace = np.trace(axes * inverse, axis1=1, axis2=2)
+    limit, least = task.singular_value**2, 1.0 / trace
+    damping = np.maximum(limit - least, 0.0)
+    half = J @ Jd.transpose(0, 2, 1)
+    bent = -np.trace(inverse @ (half + half.transpose(0, 2, 1)) @ inverse, axis1=1, axis2=2)
+    if damping.any():
+        inverse = np.linalg.inv(A + damping[:, np.newaxis, np.newaxis] * np.eye(len(axes)))
+    off = q - np.array(task.posture)
+    return TaskFollowing(
+        Lambda,
+        J,
+        Jd,
+        -task.posture_rate * off,
+        -task.posture_rate * qd,
+        inverse,
+        damping,
+        np.where(damping > 0.0, bent / trace**2, 0.0),
+        np.sqrt(least),
+    )
