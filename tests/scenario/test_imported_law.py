@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 import tests.laws
+from trilat_net.core.law_channel import LawChannel, SentVector
 from trilat_net.core.site_step import Site
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 
 LAW = "tests.laws:Adaptive"
 CODE = """
@@ -153,3 +154,86 @@ def test_a_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
     with pytest.raises(ScenarioError, match=r"is not the one that the scenario names") as caught:
         other.sites["s"].control.check_unchanged("s")
     assert caught.value.path == "sites.s.control.source_sha256"
+
+
+SENDING = """
+class Base: sends = {"never": {"unit": "m"}}
+class Law(Base):
+    sends = {SENDS}
+    def torque(self): raise RuntimeError("it ran")
+    memory = recall = torque
+"""
+
+
+def load_sending(folder: Path, sends: str) -> Scenario:
+    """Returns a scenario of three sites whose law declares what it sends."""
+    (folder / "sending.py").write_text(SENDING.replace("{SENDS}", sends))
+    return load_scenario("paper", {"control.law": "sending:Law"})
+
+
+def test_what_a_law_sends_is_read_from_its_file_and_stands_in_the_scenario(folder: Path) -> None:
+    sends = "{'u': {'unit': 'sqrt(W)', 'per_peer': True}, 'E': {'unit': 'J', 'length': 1}, 'w': {}}"
+    scenario = load_sending(folder, sends)
+    assert parse_scenario(scenario.text) == scenario
+    to_all = (SentVector("E", "J", 1), SentVector("w", "", 2))
+    channel = LawChannel((*to_all, SentVector("u", "sqrt(W)", 2, per_peer=True)), peers=2)
+    assert all(scenario.channel(site) == channel for site in scenario.names)
+    assert channel.floats == scenario.layout("s").lengths()["ch"] == 3 + 2 * 2
+    for site in scenario.names:
+        setup = scenario.setup(site)
+        assert setup.channel == channel
+        for link in setup.links:  # what is sent to this site is found in the peer's record
+            record = list(range(channel.floats))
+            first = 3 + 2 * scenario.peers(link.peer).index(site)
+            assert link.channel.part(record, link.place) == [0, 1, 2, first, first + 1]
+
+
+def test_a_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> None:
+    scenario = load_sending(folder, "{}")
+    assert "sends" not in scenario.text
+    assert "ch" not in scenario.layout("s").lengths()
+    assert scenario.setup("s").channel.floats == 0
+
+
+@pytest.mark.parametrize(
+    ("sends", "key", "fact"),
+    [
+        ("make()", "law", "must be written out, as it is read and not run"),
+        ("{'u': {}, 'u': {}}", "law", "has a name twice"),
+        ("['u']", "law", "expected object, got list"),
+        ("{'u': {'units': 'J'}}", "law", "unknown field units"),
+        ("{'u': {'length': 0}}", "law", ">= 1"),
+        ("{'u': {'length': 'arms'}}", "law", "arms"),
+        ("{'two words': {}}", "sends.two words", "is no name for a vector"),
+        ("{'class': {}}", "sends.class", "is no name for a vector"),
+        ("{'T': {}}", "sends.T", "is taken"),
+        ("{'u': {'length': 20}, 'v': {'length': 13, 'per_peer': True}}", "sends", "33 numbers to each peer"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused_as_the_scenario_is_read(
+    sends: str, key: str, fact: str, folder: Path
+) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_sending(folder, sends)
+    assert caught.value.path in (f"control.{key}", f"sites.m1.control.{key}")
+    assert fact in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sends", "overrides", "fact"),
+    [
+        ("{}", {}, "sends other vectors than the scenario names"),
+        ("{'u': {}}; schemes = ('digital',)", {}, "is for scheme = 'digital', and here it is 'second_order'"),
+        ("{'u': {}}; schemes = ('digital',)", {"scheme": "digital"}, ""),
+    ],
+)
+def test_a_site_is_built_of_the_law_that_the_scenario_names_in_the_scheme_it_is_for(
+    sends: str, overrides: dict[str, object], fact: str, folder: Path
+) -> None:
+    scenario = load_sending(folder, "{'u': {}}")
+    made = "def __init__(self, *_): raise OSError"
+    (folder / "sending.py").write_text(SENDING.replace("{SENDS}", f"{sends}\n    {made}"))
+    scenario = load_scenario(scenario, overrides)
+    with pytest.raises(ScenarioError, match=fact or "OSError"):
+        Site(scenario.setup("s"))
+    assert load_scenario(scenario, {"control.law": "adaptive"}).channel("s").floats == 0

@@ -105,6 +105,7 @@ class Layout(NamedTuple):
         parameters: one per dynamic parameter of the arm.
         chain: true: the arm is a chain of joints, else the planar two-link arm.
         task: true: the coordinates are those of the end effector, else the joint angles.
+        sent: numbers that the law sends in a record, see `LawChannel.floats`.
     """
 
     joints: int = JOINTS
@@ -112,23 +113,24 @@ class Layout(NamedTuple):
     parameters: int = PARAMETERS
     chain: bool = False
     task: bool = False
+    sent: int = 0
 
     @classmethod
-    def of_arm(cls, chain: "ChainSetup | None") -> "Layout":
-        """Returns the layout of a chain; None: of the planar two-link arm."""
+    def of_arm(cls, chain: "ChainSetup | None", sent: int = 0) -> "Layout":
+        """Returns the layout of a chain, or without one of the planar two-link arm; its law sends so much."""
         if chain is None:
-            return cls()
+            return cls(sent=sent)
         n = len(chain.joints)
         task = chain.task
         shared = n if task is None else len(task.axes)
-        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None)
+        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None, sent)
 
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
         n, m = self.joints, self.shared
         vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
         shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
-        return {**vectors, "theta_hat": self.parameters, **shared}
+        return {**vectors, "theta_hat": self.parameters, **shared, **({"ch": self.sent} if self.sent else {})}
 
     def columns(self) -> dict[str, slice]:
         """Returns where the vectors of a record stand in its row of floats, in their order."""
@@ -141,7 +143,7 @@ class Layout(NamedTuple):
     @property
     def floats(self) -> int:
         """Length of a record's row of floats."""
-        return 4 * self.joints + (5 if self.task else 2) * self.shared + self.parameters
+        return 4 * self.joints + (5 if self.task else 2) * self.shared + self.parameters + self.sent
 
 
 class TaskSetup(NamedTuple):
@@ -264,4 +266,4 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain)
+        return Layout.of_arm(self.chain, self.channel.floats)

@@ -36,6 +36,7 @@ from .fields import (
     PositiveCoordinates,
     PositiveJoints,
 )
+from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 _METHODS = ("torque", "memory", "recall")
@@ -51,23 +52,32 @@ class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
         code: its place, as in "package.module:Law".
         source_sha256: hash of the file of that module.
         settings: the arguments of its class, by name.
+        sends: what it sends to its peers, as its class declares it.
     """
 
     code: Annotated[str, Meta(pattern=LAW_PATH_PATTERN, max_length=200)]
     source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     settings: dict[str, Any] = field(default_factory=dict)
+    sends: SentVectorSpecs = field(default_factory=dict)
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core: none."""
         return Gains(Law.OWN)
 
-    def maker(self, sites: int) -> UserLawFactory:
+    def maker(self, sites: int, scheme: str) -> UserLawFactory:
         """Returns the factory of the law, for a site of an experiment of so many sites."""
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
             kind = _import_class(self.code, f"{path}.law")
-            _check_class(kind, self.code, context, sites)  # before anything of it is called
+            _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
+            declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
+            if [*declared.items()] != [*self.sends.items()]:
+                raise ScenarioError(
+                    f"{self.code} sends other vectors than the scenario names: write sends out in the body "
+                    f"of that class, and law = {self.code!r} to take what is there",
+                    path=f"sites.{context.site}.control.sends",
+                )
             try:
                 law: UserLaw = kind(context, **self.settings)
             except (Exception, SystemExit) as error:  # the user's code
@@ -117,10 +127,20 @@ def hash_law_source(code: str, path: str) -> str:
         raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
 
 
-def _check_class(kind: Any, code: str, context: LawContext, sites: int) -> None:
+def read_law_sends(code: str, path: str) -> SentVectorSpecs:
+    """Returns what a law declares that it sends; errors call the key `path`.
+
+    Raises:
+        ScenarioError: there is no such file, or no such declaration can be read from it.
+    """
+    return read_sends(_find_file(code, path), code, path)
+
+
+def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
     """Refuses a class that is no law, before anything of it runs; a log can name any class.
 
-    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, and `needs_theta = True`.
+    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
+    `needs_theta = True`.
     """
     path = f"sites.{context.site}.control.law"
     missing = [name for name in _METHODS if not callable(getattr(kind, name, None))]
@@ -134,6 +154,9 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int) -> None:
     if not least <= sites <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"
         raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
+    if scheme not in (schemes := getattr(kind, "schemes", None) or (scheme,)):
+        wanted = " or ".join(map(repr, schemes))
+        raise ScenarioError(f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path)
     if getattr(kind, "needs_theta", False) and not context.theta:
         raise ScenarioError(
             f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "

@@ -37,7 +37,7 @@ from .fields import (
     reword_problem,
     suggest_nearest,
 )
-from .laws import LAW_PATH_PATTERN, LAWS, hash_law_source
+from .laws import LAW_PATH_PATTERN, LAWS, hash_law_source, read_law_sends
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import SITE_GROUPS, Change, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS
@@ -181,8 +181,11 @@ def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: s
             "the settings of a user's law stand next to its name, as in control.gain = 5",
             path=f"{path}.settings",
         )
+    if "sends" in settings:
+        raise ScenarioError("is declared by the class of the law, not here", path=f"{path}.sends")
     sha256 = hash_law_source(code, f"{path}.law")
-    return {"law": "own", "code": code, "source_sha256": sha256, "settings": settings}
+    sends = msgspec.to_builtins(read_law_sends(code, f"{path}.law"))
+    return {"law": "own", "code": code, "source_sha256": sha256, "settings": settings, "sends": sends}
 
 
 def _unix_lines(value: Any) -> Any:

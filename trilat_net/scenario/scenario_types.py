@@ -18,6 +18,7 @@ from msgspec import Meta
 
 from ..core import dominance
 from ..core.chain import MAX_JOINTS
+from ..core.law_channel import LawChannel
 from ..core.philox import link_key
 from ..core.site_setup import Layout, LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
 from ..core.ticks import DominanceRamp
@@ -31,6 +32,7 @@ from .expect import Expect
 from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
 from .laws import ControlLaw, ImportedLaw
 from .operators import Environment, Operator
+from .sent_vectors import SentVectorSpecs, build_channel
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
@@ -156,6 +158,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     "task": ({},),
     "environment": ((), []),
     "plant": ("simulated",),
+    "sends": ({},),
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
@@ -245,9 +248,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         tables: dict[str, Any] = msgspec.to_builtins(self)
         words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         words = {key: value for key, value in words.items() if value}
-        for site in tables["sites"].values():
+        sites = tables["sites"].values()
+        for site in sites:
             _drop_unused(site["arm"])
-        for table in (tables, *tables["sites"].values()):
+        for table in (tables, *sites, *(site["control"] for site in sites)):
             for key, absent in _ABSENT.items():
                 if table.get(key) in absent:
                     del table[key]
@@ -296,9 +300,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         """The sites whose arms are outside of the program."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
+    def channel(self, site: str) -> LawChannel:
+        """Returns what the law of a site sends to its peers."""
+        sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
+        return build_channel(sends, Layout.of_arm(self.arms[site].chain), len(self.names) - 1)
+
     def layout(self, site: str) -> Layout:
         """Returns how many numbers the vectors of a site have."""
-        return Layout.of_arm(self.arms[site].chain)
+        return Layout.of_arm(self.arms[site].chain, self.channel(site).floats)
 
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""
@@ -324,9 +333,12 @@ class Scenario(Frozen, frozen=True, dict=True):
             ),
             on_stale=spec.on_stale.rule,
             external=spec.plant == "external",
-            own=spec.control.maker(len(self.sites)) if isinstance(spec.control, ImportedLaw) else None,
+            own=spec.control.maker(len(self.sites), self.scheme)
+            if isinstance(spec.control, ImportedLaw)
+            else None,
             theta_known=spec.arm.known,
             chain=arm.chain,
+            channel=self.channel(site),
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
@@ -342,6 +354,8 @@ class Scenario(Frozen, frozen=True, dict=True):
             models=tuple(link.core(from_ns) for from_ns, link in models),
             traces=tuple(link.points for _, link in models),
             outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
+            channel=self.channel(peer),
+            place=self.peers(peer).index(site),
         )
 
     def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> DominanceRamp:

@@ -30,6 +30,7 @@ from .operators import (
     Wall,
 )
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
+from .sent_vectors import check_sends
 
 FORCE_REFLECTION_SITES = 2
 """Sites of direct force reflection: one master, one slave."""
@@ -132,6 +133,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_start_poses(scenario)
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
+        check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     for name, link in scenario.links.items():
