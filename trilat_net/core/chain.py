@@ -453,6 +453,20 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
 
 
 @leaf
+def put_model(
+    chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector, M: Array, bias: Array
+) -> None:
+    """Writes M, shape (n, n), and C qd + G + friction - stops, shape (n,), after `place_joints`."""
+    _bias(chain, theta, gravity, q, qd)
+    mass_matrix(chain, theta)
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        bias[i] = row.bias
+        for j in range(i + 1):
+            M[i, j] = M[j, i] = row.M[j]
+
+
+@leaf
 def find_acceleration(
     chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector, torque: Vector, qdd: Array
 ) -> None:

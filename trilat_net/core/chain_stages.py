@@ -12,6 +12,7 @@ from .chain import (
     parameter_gradient,
     place_joints,
     propagate_motion,
+    put_model,
 )
 from .control import limit_torque
 from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
@@ -103,6 +104,17 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
     """Writes G(q), N m, shape (n,)."""
     place_joints(chain, q)
     _put_gravity(s, chain, s.theta, torque)
+
+
+@leaf
+def update_model(s: Row, chain: RowArray) -> None:
+    """Writes what a law may know of the arm in this tick: G, and if it wants them M and the bias torque.
+
+    The bias is C qd + G with friction, less the torque of the stops. The joints are placed.
+    """
+    _put_gravity(s, chain, s.known, s.G)
+    if s.needs_model != 0:
+        put_model(chain, s.known, s.gravity, s.q, s.qd, s.M, s.bias)
 
 
 @leaf

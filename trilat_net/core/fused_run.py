@@ -73,15 +73,16 @@ def _receive(
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
     n, m = peer.joints, peer.shared
     q, qd, tau_x = 0, n, 3 * n + 2 * m
+    sent_at = 4 * n + 2 * m + peer.parameters
     if peer.task:
-        q = 4 * n + 2 * m + peer.parameters
-        qd, tau_x = q + m, q + 2 * m
+        q = sent_at
+        qd, tau_x, sent_at = q + m, q + 2 * m, q + 3 * m
     while next_sample < made:
         record: Row = sent[next_sample & (sent.shape[0] - 1)]
         if record.t_ns >= t_ns:
             break
         row = record.row
-        accept_sample(k, rate_hz, next_sample, row[q:], row[qd:], row[tau_x:], link)
+        accept_sample(k, rate_hz, next_sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
         next_sample += 1
     return next_sample
 
@@ -202,11 +203,12 @@ def _step_site(
             arrays.samples[i, p],
             arrays.calendars[i, p],
             arrays.points,
+            None,
         )
         sender: Row = arrays.site[j, 0]
         taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], sent[j], link)
         recall_sample(k, rate_hz, link)
-    reference_stages(k, t_ns, site, links, arrays.ramps[i], chain)
+    reference_stages(k, t_ns, site, links, arrays.ramps[i], arrays.actors[i], arrays.table, chain)
     torque_stage(site, chain)
     record: Row = sent[i, k & (sent.shape[1] - 1)]
     record.t_ns = t_ns

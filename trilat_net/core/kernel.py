@@ -11,12 +11,12 @@ from . import chain_stages, control, two_link_stages
 from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
-from .link import LinkArrays, accept_sample, recall_sample, release_tick
+from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme
 from .task_space import POSE, update_orientation_reference
 from .ticks import Mode, tick_ns
-from .vectors import Array, IntArray, Points, Row, RowArray, Vector
+from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
 _DIVERGED = int(Mode.DIVERGED)
 _DIGITAL = int(Scheme.DIGITAL)
@@ -107,7 +107,7 @@ def _write_record(s: Row, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: Row, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Stage 7: the torque of operators and environments."""
+    """Writes the torque of operators and environments; a law may know that of its own tick."""
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
     else:
@@ -132,6 +132,7 @@ def _advance(
     Constant over the period are the control torque at its middle, and the sampled sources.
     """
     h_s = 1.0 / s.rate_hz
+    put(s.q_before, s.q)
     if s.external == 0:
         for i in range(s.u.shape[0]):
             torque = s.tau[i]
@@ -149,10 +150,24 @@ def _advance(
 
 
 @leaf
+def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
+    """Returns what one peer sends, of what all peers do; of stacked arrays, what the peers of one site do."""
+    if channel is None:
+        return None
+    return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.places[peer])
+
+
+@leaf
 def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
     """Returns the arrays of the link from one peer."""
-    state = arrays.links[peer : peer + 1]
-    return LinkArrays(state, arrays.models[peer], arrays.samples[peer], arrays.calendars[peer], arrays.points)
+    return LinkArrays(
+        arrays.links[peer : peer + 1],
+        arrays.models[peer],
+        arrays.samples[peer],
+        arrays.calendars[peer],
+        arrays.points,
+        channel_of(arrays.channel, peer),
+    )
 
 
 @leaf
@@ -168,30 +183,40 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
     for n in range(count):
         arrival: Row = buffers.arrivals[n]
         link = link_arrays(arrays, arrival.peer)
-        accept_sample(k, rate_hz, arrival.tick, arrival.q, arrival.qd, buffers.forces[n], link)
+        forces, sent = buffers.forces[n], buffers.sent[n]
+        accept_sample(k, rate_hz, arrival.tick, arrival.q, arrival.qd, forces, sent, link)
 
 
 @leaf
 def reference_stages(
-    k: int, t_ns: int, site: RowArray, links: RowArray, ramps: Array, chain: RowArray | None
+    k: int,
+    t_ns: int,
+    site: RowArray,
+    links: RowArray,
+    ramps: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    chain: RowArray | None,
 ) -> None:
-    """Stages 3 to 5 of a tick, with the samples that it releases in use."""
+    """Stages 3 to 5 of a tick and its external torque, with the samples that it releases in use."""
     s: Row = site[0]
     update_reference(t_ns, s, links, ramps)  # 3 reference
     _place_arm(s, chain, links, True)
     update_stale_mode(t_ns, s, links)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
+    _update_external_torque(t_ns * 1e-9, s, chain, actors, table)
 
 
 @leaf
 def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate."""
+    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate, the external torque."""
     accept_stage(k, count, arrays, buffers)
     rate_hz = arrays.site[0].rate_hz
     for j in range(arrays.links.shape[0]):  # 2 recall
         recall_sample(k, rate_hz, link_arrays(arrays, j))
-    reference_stages(k, t_ns, arrays.site, arrays.links, arrays.ramps, arrays.chain)
+    a = arrays
+    reference_stages(k, t_ns, a.site, a.links, a.ramps, a.actors, a.table, a.chain)
 
 
 @leaf
@@ -206,7 +231,6 @@ def act_stages(
 ) -> None:
     """Stages 7 and 8 of a tick, with the torque in place: the record, and the step to the next tick."""
     s: Row = site[0]
-    _update_external_torque(t_ns * 1e-9, s, chain, actors, table)
     for i in range(s.joints):
         if not abs(s.qd[i]) <= s.qd_limit[i]:
             s.mode = _DIVERGED
@@ -230,8 +254,10 @@ def site_tick(
     actors: TorqueSourceRows,
     table: TorqueTable,
     chain: RowArray | None,
+    channel: ChannelArrays | None,
     arrivals: RowArray,
     forces: Array,
+    sent: Array,
     record: Array,
 ) -> None:
     """Computes tick k of one site at t_ns, ns since the epoch, with its first `count` arrivals.
@@ -239,8 +265,8 @@ def site_tick(
     It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as tuples they would
     cost more than a microsecond.
     """
-    arrays = SiteArrays(site, links, models, samples, calendars, points, ramps, actors, table, chain)
-    sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, record))
+    arrays = SiteArrays(site, links, models, samples, calendars, points, ramps, actors, table, chain, channel)
+    sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, sent, record))
     torque_stage(site, chain)  # 6 torque
     act_stages(k, t_ns, site, actors, table, chain, record)
 

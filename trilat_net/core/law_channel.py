@@ -54,6 +54,18 @@ class LawChannel(NamedTuple):
         """How many numbers stand in a record."""
         return self.numbers(per_peer=False) + self.peers * self.numbers(per_peer=True)
 
+    def find_places(self, vectors: Sequence[SentVector]) -> list[int]:
+        """Returns where each number of some vectors stands in a peer's part; -1: it is not sent."""
+        first, firsts = 0, {}
+        for vector in self.vectors:
+            firsts[vector.name] = first
+            first += vector.length
+        return [
+            firsts[vector.name] + n if vector.name in firsts else -1
+            for vector in vectors
+            for n in range(vector.length)
+        ]
+
     def part(self, sent: Sequence[float], place: int) -> Sequence[float]:
         """Returns what the peer at a place among the sender's peers gets of a record's numbers."""
         own, common = self.numbers(per_peer=True), self.numbers(per_peer=False)
@@ -61,3 +73,17 @@ class LawChannel(NamedTuple):
             return sent
         first = common + place * own
         return [*sent[:common], *sent[first : first + own]]
+
+
+def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
+    """Returns the vectors that a law may receive from any of its peers, each name once.
+
+    Raises:
+        ValueError: two peers send vectors of one name and of different lengths.
+    """
+    found: dict[str, SentVector] = {}
+    for vector in (vector for channel in channels for vector in channel.vectors):
+        other = found.setdefault(vector.name, vector)
+        if other.length != vector.length:
+            raise ValueError(f"peers send {vector.name} of {other.length} and of {vector.length} numbers")
+    return tuple(found.values())

@@ -33,13 +33,15 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the layout of a link on which samples of so many coordinates come: one row per peer.
 
     They stand in scenario order. `used` is -1 until the first sample is released; until then q and qd are the
-    peer's start pose, at rest (L7).
+    peer's start pose, at rest (L7). It is `new` in the tick that released it; `tick` and `age_s` are filled
+    in for laws that look at their peers.
     """
     fields = [
         ("alpha", "f8"),
         ("alpha_rate", "f8"),
         ("rate_hz", "i8"),
-        ("used", "i8"),
+        *((name, "i8") for name in ("used", "tick", "new")),
+        ("age_s", "f8"),
         *_sample_vectors(shared),
         ("key", "u8"),
         *((name, "i8") for name in _CHANNEL),
@@ -59,6 +61,20 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
     return np.dtype((np.record, [("due_ns", "i8"), ("tick", "i8"), *_sample_vectors(shared)]))
 
 
+class ChannelArrays(NamedTuple):
+    """What peers' laws send besides, in the order in which the receiver's law has it; one axis more per peer.
+
+    Attributes:
+        waiting: of the samples that wait, by their page, shape (pages, C).
+        received: of the sample in use, shape (C,); zeros before the first.
+        places: where each number stands among those that come with a sample; -1: it does not, and is 0.
+    """
+
+    waiting: Array
+    received: Array
+    places: IntArray
+
+
 class LinkArrays(NamedTuple):
     """The arrays of one link.
 
@@ -68,6 +84,7 @@ class LinkArrays(NamedTuple):
         samples: where samples wait, shape (pages,), see `sample_dtype`.
         calendar: the newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
         points: the site's traces and outages, shape (n, 2).
+        channel: what the peer's law sends besides; None: the site's law does not look at it.
     """
 
     state: RowArray
@@ -75,6 +92,7 @@ class LinkArrays(NamedTuple):
     samples: RowArray
     calendar: IntArray
     points: Points
+    channel: ChannelArrays | None
 
 
 AHEAD_LIMIT_S = 10
@@ -115,10 +133,28 @@ def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 
 @leaf
+def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
+    if channel is None:
+        return
+    for c in range(channel.places.shape[0]):
+        place = channel.places[c]
+        channel.waiting[page, c] = sent[place] if place >= 0 else 0.0
+
+
+@leaf
+def _use_sent(channel: ChannelArrays | None, page: int) -> None:
+    if channel is not None:
+        put(channel.received, channel.waiting[page])
+
+
+@leaf
 def accept_sample(
-    k: int, rate_hz: int, tick: int, q: Array, qd: Array, tau_x: Array, link: LinkArrays
+    k: int, rate_hz: int, tick: int, q: Array, qd: Array, tau_x: Array, sent: Array, link: LinkArrays
 ) -> None:
-    """Files one arrival of a peer's tick in a link at the receiver's tick k; counts what it cannot use."""
+    """Files one arrival of a peer's tick in a link at the receiver's tick k; counts what it cannot use.
+
+    `sent` is what the peer's law sends besides its motion; a site whose law does not look at it takes any.
+    """
     row: Row = link.state[0]
     samples, calendar = link.samples, link.calendar
     row.accepted += 1
@@ -145,6 +181,7 @@ def accept_sample(
     put(slot.q, q)
     put(slot.qd, qd)
     put(slot.tau_x, tau_x)
+    _file_sent(link.channel, tick & (samples.shape[0] - 1), sent)
     if tick <= row.used:  # filed all the same: a duplicate of it is recognised
         row.superseded += 1
         return
@@ -162,6 +199,7 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     the peer costs nothing at its end.
     """
     row: Row = link.state[0]
+    row.new = 0
     calendar = link.calendar
     sample = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
     schedule_deliveries(sample, row, link.models, link.samples, link.points)
@@ -172,9 +210,10 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     calendar[page] = -1
     slot: Row = link.samples[newest & (link.samples.shape[0] - 1)]
     if newest > row.used and slot.tick == newest:
-        row.used = newest
+        row.used, row.new = newest, 1
         put(row.q, slot.q)
         put(row.qd, slot.qd)
         put(row.tau_x, slot.tau_x)
+        _use_sent(link.channel, newest & (link.samples.shape[0] - 1))
     else:
         row.superseded += 1

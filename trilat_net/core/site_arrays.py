@@ -16,19 +16,23 @@ from .chain import build_chain
 from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
-from .link import calendar_pages, link_dtype, sample_dtype
+from .law_channel import join_received
+from .link import ChannelArrays, calendar_pages, link_dtype, sample_dtype
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, DominanceRamp, Mode, first_tick_at
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
-_SETTINGS = ("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns")
+_SETTINGS = (
+    *("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
+    *("theta_known", "needs_model"),
+)
 _COUNTS = ("joints", "shared", "parameters", "task")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
-    *("r", "u"),
+    *("r", "u", "tau_x", "q_before", "G", "bias"),
 )
 _PER_COORDINATE = (
     *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),
@@ -54,6 +58,7 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
     """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
     fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns")]
     fields += [("g", "f8"), ("wall_n", "f8"), ("lengths", "f8", (2,))]
+    fields += [("k", "i8"), ("t_s", "f8"), ("h_s", "f8"), ("M", "f8", (layout.joints, layout.joints))]
     for names, count in (
         (_PER_JOINT, layout.joints),
         (_PER_COORDINATE, layout.shared),
@@ -93,6 +98,7 @@ class SiteArrays(NamedTuple):
         actors: operators and environments, shape (A,), see `torque_source_dtype`.
         table: their recorded torques, shape (rows, 1 + n); of stacked sites one for all.
         chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link arm.
+        channel: what the peers' laws send, per peer, for a plugged law; None: the law is one of the kernel's.
     """
 
     site: RowArray
@@ -105,6 +111,7 @@ class SiteArrays(NamedTuple):
     actors: TorqueSourceRows
     table: TorqueTable
     chain: RowArray | None
+    channel: ChannelArrays | None
 
 
 class TickBuffers(NamedTuple):
@@ -113,19 +120,26 @@ class TickBuffers(NamedTuple):
     Attributes:
         arrivals: what came in, shape (MAX_ARRIVALS,), see `arrival_dtype`.
         forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, m), N m.
+        sent: what the peers' laws sent with it, shape (MAX_ARRIVALS, C).
         record: the record's floats, see `Layout.columns`; written.
     """
 
     arrivals: RowArray
     forces: Array
+    sent: Array
     record: Array
 
 
-def build_tick_buffers(layout: Layout) -> TickBuffers:
-    """Returns the buffers of a site of this layout."""
-    m = layout.shared
+def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
+    """Returns the buffers of a site."""
+    layout = setup.layout
+    shape = (MAX_ARRIVALS, layout.shared)
+    most = 0 if setup.own is None else max(link.channel.received for link in setup.links)
     return TickBuffers(
-        np.zeros(MAX_ARRIVALS, arrival_dtype(m)), np.zeros((MAX_ARRIVALS, m)), np.zeros(layout.floats)
+        np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
+        np.zeros(shape),
+        np.zeros((MAX_ARRIVALS, most)),
+        np.zeros(layout.floats),
     )
 
 
@@ -152,7 +166,8 @@ def build_site_arrays(
     calendars = np.full((peers, pages), -1, dtype=np.int64)
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
     site = _build_site(setup, layout)
-    arrays = SiteArrays(site, rows, models, samples, calendars, points, ramps, actors, table, chain)
+    channel = None if setup.own is None else _build_channel(links, pages)
+    arrays = SiteArrays(site, rows, models, samples, calendars, points, ramps, actors, table, chain, channel)
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
     return arrays
@@ -209,11 +224,12 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     }
     if not largest.chain:
         del columns["chain"]
+    del columns["channel"]
     joined: dict[str, Any] = {name: np.concatenate(columns.pop(name)) for name in ("points", "table")}
     stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
     for row, site in zip(stacked["actors"], sites, strict=True):
         row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
-    return SiteArrays(**{"chain": None, **stacked, **joined})
+    return SiteArrays(**{"chain": None, "channel": None, **stacked, **joined})
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -234,6 +250,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
     s.joints, s.shared, s.parameters, s.task = own.joints, own.shared, own.parameters, own.task
     s.external, s.ramps = int(setup.external), 1
+    s.theta_known, s.needs_model = setup.theta_known, setup.needs_model
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
     if setup.chain is None:
         s.g, s.lengths = setup.g_m_s2, setup.lengths_m
@@ -247,7 +264,9 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
     vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
-    vectors |= {"q": setup.q0, "qd": setup.qd0}
+    vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
+    if gains.law is Law.OWN and setup.theta_known:
+        vectors["known"] = setup.theta
     vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
     lengths = {
         **dict.fromkeys(_PER_JOINT, own.joints),
@@ -257,6 +276,14 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     for name, value in vectors.items():
         s[name][: lengths[name]] = value
     return site
+
+
+def _build_channel(links: Sequence[LinkSetup], pages: int) -> ChannelArrays:
+    vectors = join_received([link.channel for link in links])
+    numbers = sum(vector.length for vector in vectors)
+    places = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
+    shape = (len(links), numbers)
+    return ChannelArrays(np.zeros((len(links), pages, numbers)), np.zeros(shape), places.reshape(shape))
 
 
 def _build_links(links: Sequence[LinkSetup], spare: int, shared: int) -> tuple[RowArray, RowArray, Points]:

@@ -14,7 +14,7 @@ from .exogenous import TorqueSource
 from .law_channel import LawChannel
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
-from .user_law import UserLawFactory
+from .user_law import LawContext, UserLawFactory
 from .vectors import Array, Points, Vector
 
 
@@ -237,6 +237,7 @@ class SiteSetup(NamedTuple):
         on_stale: the rule for a stale peer.
         external: true: the arm is outside of the program; it is measured, and nothing is integrated.
         own: makes the user's law, if it is one.
+        needs_model: true: the user's law wants the inertia matrix and the bias torque at every tick.
         theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
         channel: what the site's law sends to its peers.
@@ -262,8 +263,23 @@ class SiteSetup(NamedTuple):
     theta_known: bool = True
     chain: ChainSetup | None = None
     channel: LawChannel = LawChannel()
+    needs_model: bool = False
 
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
         return Layout.of_arm(self.chain, self.channel.floats)
+
+    def law_context(self) -> LawContext:
+        """Returns what a plugged law may know before it begins."""
+        return LawContext(
+            site=self.name,
+            rate_hz=self.rate_hz,
+            g_m_s2=self.g_m_s2,
+            lengths_m=self.lengths_m,
+            theta=tuple(map(float, self.theta)) if self.theta_known else (),
+            tau_limit_nm=self.tau_limit_nm,
+            joints=self.layout.joints,
+            coordinates=self.layout.shared,
+            peers=tuple(link.peer for link in self.links),
+        )

@@ -16,10 +16,11 @@ import numpy as np
 from .channel import LOST
 from .delay import DelayKind
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
+from .law_view import PlainView, update_law_view
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
-from .user_law import LawContext, LawInput, UserLaw, call_law, restore_law
+from .user_law import UserLaw, call_law, restore_law
 from .vectors import Row
 
 _MODES = {int(mode): mode for mode in Mode}
@@ -50,19 +51,22 @@ class Site:
         self._external = setup.external
         self._arrays = build_site_arrays(setup, MAX_CHANGES)
         self.layout = setup.layout
-        self._columns = tuple(self.layout.columns().values())
-        self._buffers = build_tick_buffers(self.layout)
+        columns = self.layout.columns()
+        columns.pop("ch", None)
+        self._columns = tuple(columns.values())
+        self._buffers = build_tick_buffers(setup)
         arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
         self._pack_arrival, self._arrival_size = arrival.pack_into, arrival.size
         self._tick_arrays = (*self._arrays, *self._buffers)
         self._site, self._links = self._arrays.site, self._arrays.links
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
-        self._user_law = None
-        if setup.own is not None:
-            theta = tuple(map(float, setup.theta)) if setup.theta_known else ()
-            g, lengths, limit = setup.g_m_s2, setup.lengths_m, setup.tau_limit_nm
-            self._user_law = setup.own(LawContext(setup.name, setup.rate_hz, g, lengths, theta, limit))
+        self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
+        self._sends = bool(self._sent.size)
+        self._user_law = None if setup.own is None else setup.own(setup.law_context())
+        self._view = PlainView(setup, self._arrays, self._sent)
+        counts = [link.channel.received for link in setup.links]
+        self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
     def order(self, command: CoreChange) -> None:
@@ -103,13 +107,14 @@ class Site:
             site_tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
             sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
-            memory = self._call_user_law(self._user_law, tick.k)
             a = self._arrays
+            update_law_view(tick.k, t_ns, a.site, a.links, a.chain)
+            memory = self._call_user_law(self._user_law, tick.k)
             act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
         q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
         mode = self._site["mode"].item()
-        return TickRecord(
+        record = TickRecord(
             tick.k,
             t_ns,
             _MODES[mode],
@@ -126,13 +131,12 @@ class Site:
             [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
             *(row[column] for column in task),
         )
+        return record._replace(ch=self._sent.tolist()) if self._sends else record
 
     def _call_user_law(self, law: UserLaw, k: int) -> list[float]:
         """Stage 6 of a user's law: takes its torque and estimate in, and returns its memory."""
         s: Row = self._site[0]
-        vectors = (s.q, s.qd, s.q_des, s.qd_des, s.felt)
-        now = LawInput(k, k / self.rate_hz, 1.0 / self.rate_hz, *(vector.tolist() for vector in vectors))
-        torque, estimate, memory = call_law(law, self.name, now, self.layout.joints, self.layout.parameters)
+        torque, estimate, memory = call_law(law, self.name, self._view.read(k), self._view.take_sent)
         s.tau = np.clip(torque, -s.tau_limit, s.tau_limit)
         s.theta_hat = estimate
         return memory
@@ -140,9 +144,12 @@ class Site:
     def _crc(self, packed: int, arrivals: int) -> int:
         """Returns `TickRecord.rx_crc`."""
         crc = zlib.crc32(self._arrival_bytes[:packed])
-        return (
-            zlib.crc32(self._force_bytes[: arrivals * 8 * self.layout.shared], crc) if self._reflects else crc
-        )
+        if self._reflects:
+            crc = zlib.crc32(self._force_bytes[: arrivals * 8 * self.layout.shared], crc)
+        if self._received_counts:
+            for n, peer in enumerate(self._buffers.arrivals["peer"][:arrivals].tolist()):
+                crc = zlib.crc32(self._buffers.sent[n, : self._received_counts[peer]].data, crc)
+        return crc
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
@@ -186,6 +193,7 @@ class Site:
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
+        self._sent[:] = last.ch or 0.0
         if self._user_law is not None:
             restore_law(self._user_law, self.name, last.mem[held + 1 :])
         resume_stages(last.tick, self._arrays)
@@ -204,7 +212,7 @@ class Site:
         self._arrays.samples["tick"] = -1
         self._arrays.calendars[:] = -1
         link: Row
-        for link, start, sample in zip(self._links, self._starts, in_use, strict=True):
+        for n, (link, start, sample) in enumerate(zip(self._links, self._starts, in_use, strict=True)):
             # the channel's memory is a function of what went before
             link.foreseen, link.model, link.due_before = -1, 0, 0
             if sample is None:
@@ -212,6 +220,9 @@ class Site:
             else:
                 link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
                 link.tau_x = sample.tau_x or 0.0
+            if (channel := self._arrays.channel) is not None:
+                sent = np.append(() if sample is None else sample.ch, 0.0)  # place -1 is this zero
+                channel.received[n] = sent[channel.places[n]] if len(sent) > 1 else 0.0
         self._pack(waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
@@ -226,4 +237,7 @@ class Site:
         if self._reflects:
             for n, arrival in enumerate(arrivals):
                 self._buffers.forces[n] = arrival.tau_x or 0.0
+        if self._received_counts:
+            for n, arrival in enumerate(arrivals):
+                self._buffers.sent[n, : self._received_counts[arrival.peer]] = arrival.ch or 0.0
         return offset

@@ -10,7 +10,7 @@ from . import control
 from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .jit import leaf
 from .site_setup import Law
-from .two_link_arm import forward_dynamics, regressor
+from .two_link_arm import forward_dynamics, inertia, regressor
 from .vectors import Array, Pair, Row, Vector, five, pair, put_five, put_pair
 
 _ADAPTIVE = int(Law.ADAPTIVE)
@@ -54,9 +54,31 @@ def update_torque(s: Row) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Writes G(q), N m, of this tick: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
-    outer = s.Y[1, 4] * s.theta[4]
-    put_pair(torque, (s.Y[0, 3] * s.theta[3] + outer, outer))
+    """Writes G(q), N m, of this tick."""
+    _put_gravity(s, s.theta, torque)
+
+
+@leaf
+def _put_gravity(s: Row, theta: Array, torque: Array) -> None:
+    """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
+    outer = s.Y[1, 4] * theta[4]
+    put_pair(torque, (s.Y[0, 3] * theta[3] + outer, outer))
+
+
+@leaf
+def update_model(s: Row) -> None:
+    """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd + G."""
+    _put_gravity(s, s.known, s.G)
+    if s.needs_model != 0:
+        q, qd = pair(s.q), pair(s.qd)
+        M = inertia(s.known, q)
+        put_pair(s.M[0], M[0])
+        put_pair(s.M[1], M[1])
+        Y = regressor(s.g, q, qd, qd, (0.0, 0.0))
+        for i in range(2):
+            s.bias[i] = 0.0
+            for p in range(5):
+                s.bias[i] += Y[i][p] * s.known[p]
 
 
 @leaf

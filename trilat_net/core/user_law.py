@@ -5,8 +5,10 @@ record of every tick, so a log resumes in the middle of a run.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from ..errors import LawFailed
 from .vectors import Vector
@@ -26,6 +28,10 @@ class LawContext(NamedTuple):
         theta: the arm's true parameters, shape (5,), for a law that claims to know them; () if they are
             unknown, as of a real arm that was not identified.
         tau_limit_nm: largest torque of a joint, N m; one number, or one per joint.
+        joints: how many joints the arm has.
+        coordinates: how many numbers q, qd and tau_x of a peer have: one per joint, or one per coordinate of
+            the end effector.
+        peers: names of the peers, in scenario order.
     """
 
     site: str
@@ -34,10 +40,35 @@ class LawContext(NamedTuple):
     lengths_m: tuple[float, float]
     theta: tuple[float, ...]
     tau_limit_nm: Vector
+    joints: int = 2
+    coordinates: int = 2
+    peers: tuple[str, ...] = ()
+
+
+class PeerView(NamedTuple):
+    """A peer as a law sees it at a tick: its sample in use, or its start pose at rest.
+
+    Attributes:
+        alpha: its dominance factor now.
+        tick: the stamp of the sample in use, a tick of the peer; -1 before the first.
+        age_s: the age of that sample, s; before the first, the time since the epoch.
+        new: 1 if it came into use at this tick, else 0.
+        q: of the sample, rad or m.
+        qd: its derivative.
+        tau_x: the exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
+    """
+
+    alpha: float
+    tick: int
+    age_s: float
+    new: int
+    q: list[float]
+    qd: list[float]
+    tau_x: list[float]
 
 
 class LawInput(NamedTuple):
-    """The input of a law at a tick; every vector has one number per joint.
+    """The input of a law at a tick; a vector has one number per joint, or per coordinate that sites share.
 
     Attributes:
         k: the tick.
@@ -48,6 +79,21 @@ class LawInput(NamedTuple):
         q_des: reference of Eq. (6), rad.
         qd_des: its derivative, rad/s.
         felt: the torque on the peers' arms as received, weighted by dominance, N m.
+        joints: how many there are.
+        coordinates: how many numbers the vectors of a peer have.
+        tau: the torque of each joint, N m, for the law to write; more than the limit is cut off.
+        peers: the peers in scenario order.
+        received: per peer the vectors that its law sent with the sample in use, by their names; zeros before
+            the first, and of a peer whose law sends no such vector.
+        sent: per peer the vectors that go to it alone, for the law to write; unwritten, they stay.
+        to_all: the vectors that go to all peers, likewise.
+        tau_x: exogenous torque of this tick, N m; the torque ON the arm is its negative.
+        tau_before: torque of the tick before, within its limits, N m; zeros at tick 0.
+        q_before: joint angles of the tick before, rad; the start pose at tick 0.
+        gravity: the torque that holds the arm, N m; zeros where its parameters are unknown.
+        theta_hat: the estimate in the record, for the law to write; unwritten, it stays as it was.
+        inertia: M(q), a row per joint, for a law that `needs_model`; else zeros.
+        bias: C qd + G (of a chain with friction, less the torque of its stops), N m, likewise.
     """
 
     k: int
@@ -58,44 +104,59 @@ class LawInput(NamedTuple):
     q_des: list[float]
     qd_des: list[float]
     felt: list[float]
+    joints: int = 2
+    coordinates: int = 2
+    tau: Any = ()
+    peers: Sequence[PeerView] = ()
+    received: Sequence[Any] = ()
+    sent: Sequence[Any] = ()
+    to_all: Any = None
+    tau_x: Sequence[float] = ()
+    tau_before: Sequence[float] = ()
+    q_before: Sequence[float] = ()
+    gravity: Sequence[float] = ()
+    theta_hat: Any = ()
+    inertia: Sequence[Sequence[float]] = ()
+    bias: Sequence[float] = ()
 
 
 class UserLaw(Protocol):
     """A control law; its class is called with `LawContext` and the keys of its `[control]` table, by name.
 
-    It may have an attribute `theta_hat`, five numbers, which is recorded.
+    All that `torque` needs of the ticks so far is its memory: the attributes that its class names in
+    `remembers`, or what a method `memory()` returns as numbers, from which `recall(memory)` restores it. It
+    may have an attribute `theta_hat`, a number per parameter, which is recorded.
     """
 
-    def torque(self, now: LawInput) -> Sequence[float]:
-        """Returns the torque of each joint, N m; more than the limit is cut off."""
-
-    def memory(self) -> Sequence[float]:
-        """Returns all that `torque` needs of the ticks so far, as numbers."""
-
-    def recall(self, memory: Sequence[float]) -> None:
-        """Restores the state in which `memory` returned these numbers."""
+    def torque(self, now: LawInput) -> Sequence[float] | None:
+        """Returns the torque of each joint, N m, or writes `now.tau`; more than the limit is cut off."""
 
 
 UserLawFactory = Callable[[LawContext], UserLaw]
 
 
 def call_law(
-    law: UserLaw, site: str, now: LawInput, joints: int, parameters: int
+    law: UserLaw, site: str, now: LawInput, take_sent: Callable[[LawInput], None]
 ) -> tuple[list[float], list[float], list[float]]:
-    """Returns torque, estimate and memory of a law at a tick, of an arm with so many joints and parameters.
+    """Returns torque, estimate and memory of a law at a tick; `take_sent` takes in what it sends.
 
     Raises:
         LawFailed: it raised, or its results are not finite numbers of the right count.
     """
     try:
-        torque = [float(value) for value in law.torque(now)]
-        estimate = [float(value) for value in getattr(law, "theta_hat", (0.0,) * parameters)]
-        memory = [float(value) for value in law.memory()]
+        returned = law.torque(now)
+        if returned is None and all(map(math.isnan, now.tau)):
+            raise TypeError("torque returned None and did not write now.tau")
+        torque = [float(value) for value in (now.tau if returned is None else returned)]
+        estimate = [float(value) for value in getattr(law, "theta_hat", now.theta_hat)]
+        memory = read_memory(law)
+        take_sent(now)
     except LawFailed:  # its watchdog has stopped it
         raise
     except (Exception, SystemExit) as error:
         raise _law_error(law, site, now.k, _one_line(error)) from error
-    for name, values, length in (("torque", torque, joints), ("theta_hat", estimate, parameters)):
+    parameters = len(now.theta_hat)
+    for name, values, length in (("torque", torque, now.joints), ("theta_hat", estimate, parameters)):
         if len(values) != length:
             raise _law_error(law, site, now.k, f"{name} has {len(values)} numbers, not {length}")
     if len(memory) > MAX_LAW_MEMORY:
@@ -108,6 +169,43 @@ def call_law(
     return torque, estimate, memory
 
 
+def _flatten(value: Any) -> Iterator[float]:
+    if isinstance(value, float | int):
+        yield float(value)
+        return
+    for one in value:
+        yield from _flatten(one)
+
+
+def _fill(value: Any, numbers: Iterator[float]) -> Any:
+    """Returns a value of the same form as another, of the next numbers."""
+    if isinstance(value, bool):
+        return bool(next(numbers))
+    if isinstance(value, float | int):
+        number = next(numbers)
+        return int(number) if isinstance(value, int) and number.is_integer() else number
+    if isinstance(value, np.ndarray):
+        return np.array([next(numbers) for _ in range(value.size)], value.dtype).reshape(value.shape)
+    return type(value)(_fill(one, numbers) for one in value)
+
+
+def read_memory(law: Any) -> list[float]:
+    """Returns the memory of a law: of the attributes that it remembers, or what it says itself."""
+    if callable(getattr(law, "memory", None)):
+        return [float(value) for value in law.memory()]
+    return [number for name in law.remembers for number in _flatten(getattr(law, name))]
+
+
+def write_memory(law: Any, memory: Sequence[float]) -> None:
+    """Restores a law from its memory."""
+    if callable(getattr(law, "recall", None)):
+        law.recall(memory)
+        return
+    numbers = iter(memory)
+    for name in law.remembers:
+        setattr(law, name, _fill(getattr(law, name), numbers))
+
+
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores a law from the memory in a record.
 
@@ -115,7 +213,7 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
         LawFailed: it raised.
     """
     try:
-        law.recall(memory)
+        write_memory(law, memory)
     except (Exception, SystemExit) as error:
         raise _law_error(law, site, None, _one_line(error)) from error
 

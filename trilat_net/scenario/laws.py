@@ -39,7 +39,6 @@ from .fields import (
 from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
-_METHODS = ("torque", "memory", "recall")
 
 _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
@@ -143,7 +142,8 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
     `needs_theta = True`.
     """
     path = f"sites.{context.site}.control.law"
-    missing = [name for name in _METHODS if not callable(getattr(kind, name, None))]
+    methods = ("torque",) if hasattr(kind, "remembers") else ("torque", "memory", "recall")
+    missing = [name for name in methods if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(f"{code} has no {', '.join(missing)}; see docs/own-controller.md", path=path)
     stated = getattr(kind, "sites", None)

@@ -339,6 +339,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
+            needs_model=getattr(spec.control, "needs_model", False),
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
