@@ -250,7 +250,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
     s.joints, s.shared, s.parameters, s.task = own.joints, own.shared, own.parameters, own.task
     s.external, s.ramps = int(setup.external), 1
-    s.theta_known, s.needs_model = setup.theta_known, setup.needs_model
+    s.theta_known = setup.theta_known
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
     if setup.chain is None:
         s.g, s.lengths = setup.g_m_s2, setup.lengths_m

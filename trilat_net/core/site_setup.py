@@ -237,7 +237,6 @@ class SiteSetup(NamedTuple):
         on_stale: the rule for a stale peer.
         external: true: the arm is outside of the program; it is measured, and nothing is integrated.
         own: makes the user's law, if it is one.
-        needs_model: true: the user's law wants the inertia matrix and the bias torque at every tick.
         theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
         channel: what the site's law sends to its peers.
@@ -263,7 +262,6 @@ class SiteSetup(NamedTuple):
     theta_known: bool = True
     chain: ChainSetup | None = None
     channel: LawChannel = LawChannel()
-    needs_model: bool = False
 
     @property
     def layout(self) -> Layout:

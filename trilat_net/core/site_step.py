@@ -64,6 +64,7 @@ class Site:
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._sends = bool(self._sent.size)
         self._user_law = None if setup.own is None else setup.own(setup.law_context())
+        self._site["needs_model"] = getattr(self._user_law, "needs_model", False)
         self._view = PlainView(setup, self._arrays, self._sent)
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
 from msgspec import Meta, field
 from msgspec.structs import asdict
@@ -44,7 +44,35 @@ _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
 
 
-class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
+class PluggedLaw(Frozen, frozen=True):
+    """A law that is plugged into the core as one class, see docs/own-controller.md; its keys are settings.
+
+    A built-in one names its class.
+    """
+
+    core_class: ClassVar[Any] = None
+
+    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
+        """Returns the gains for the core: none."""
+        return Gains(Law.OWN)
+
+    @property
+    def sends(self) -> SentVectorSpecs:
+        """What the law sends to its peers."""
+        return convert_sends(getattr(self.core_class, "sends", {}), self.core_class.__name__, "control")
+
+    def maker(self, sites: int, scheme: str) -> UserLawFactory:
+        """Returns the factory of the law, for a site of an experiment of so many sites."""
+
+        def make(context: LawContext) -> UserLaw:
+            name = str(self.__struct_config__.tag)
+            _check_class(self.core_class, name, context, sites, scheme)
+            return _make_law(self.core_class, name, context, asdict(self))
+
+        return make
+
+
+class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
     """A user's law.
 
     Attributes:
@@ -58,10 +86,6 @@ class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
     source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     settings: dict[str, Any] = field(default_factory=dict)
     sends: SentVectorSpecs = field(default_factory=dict)
-
-    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains for the core: none."""
-        return Gains(Law.OWN)
 
     def maker(self, sites: int, scheme: str) -> UserLawFactory:
         """Returns the factory of the law, for a site of an experiment of so many sites."""
@@ -77,13 +101,7 @@ class ImportedLaw(Frozen, frozen=True, tag_field="law", tag="own"):
                     f"of that class, and law = {self.code!r} to take what is there",
                     path=f"sites.{context.site}.control.sends",
                 )
-            try:
-                law: UserLaw = kind(context, **self.settings)
-            except (Exception, SystemExit) as error:  # the user's code
-                given = ", ".join(f"{key} = {value!r}" for key, value in self.settings.items())
-                problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-                raise ScenarioError(f"{self.code} {problem}", path=path) from None
-            return law
+            return _make_law(kind, self.code, context, self.settings)
 
         return make
 
@@ -163,6 +181,16 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
             "and leave known out, or choose a law that learns them",
             path=path,
         )
+
+
+def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
+    try:
+        law: UserLaw = kind(context, **settings)
+    except (Exception, SystemExit) as error:  # the user's code
+        given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
+        problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
+        raise ScenarioError(f"{code} {problem}", path=f"sites.{context.site}.control") from None
+    return law
 
 
 def _find_file(code: str, path: str) -> Path:

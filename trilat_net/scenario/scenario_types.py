@@ -30,7 +30,7 @@ from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
 from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
-from .laws import ControlLaw, ImportedLaw
+from .laws import ControlLaw, PluggedLaw
 from .operators import Environment, Operator
 from .sent_vectors import SentVectorSpecs, build_channel
 
@@ -334,12 +334,11 @@ class Scenario(Frozen, frozen=True, dict=True):
             on_stale=spec.on_stale.rule,
             external=spec.plant == "external",
             own=spec.control.maker(len(self.sites), self.scheme)
-            if isinstance(spec.control, ImportedLaw)
+            if isinstance(spec.control, PluggedLaw)
             else None,
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
-            needs_model=getattr(spec.control, "needs_model", False),
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
