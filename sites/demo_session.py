@@ -85,10 +85,13 @@ def run_demo(scenario: Scenario, folder: Path, display: SessionDisplay) -> Sessi
     result = SessionResult(folder / "run.mcap")
     session, clock = demo_session_name(scenario), SystemClock()
     with Interrupt() as interrupt:
-        if not is_core_cached():
-            display.say("compiling, once for this machine ...")
+        layouts = {arm.counts: name for name, arm in scenario.arms.items()}
+        chains = any(arm.chain is not None for arm in scenario.arms.values())
+        if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
+            display.say("compiling, once for this machine and each number of joints ...")
             with interrupt.raising():
-                warm_up(scenario, scenario.names[0])  # once for all children
+                for name in layouts.values():
+                    warm_up(scenario, name)  # once for all children
         endpoints = choose_session_endpoints(session, scenario.names)
         sites, recorder = _start(scenario, folder, session, endpoints)
         for name in scenario.external:

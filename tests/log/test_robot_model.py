@@ -110,7 +110,23 @@ def test_the_description_has_the_links_of_the_file_named_after_the_site_and_shap
     assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
 
 
-def test_planar_arms_have_no_model():
+def test_the_end_of_every_unlike_arm_is_where_its_site_says():
+    """A planar arm among chains has a model too, and bases stand where the scenario places them."""
+    from trilat_net.scenario import load_scenario
+
+    unlike = load_scenario("unlike_arms")
+    for n, (site, spec) in enumerate(unlike.sites.items()):
+        model = build_robot_model(unlike, site)
+        at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+        for origin, own in model.transforms(spec.q0_rad):
+            at = np.add(at, rotate_vector(turned, origin))
+            turned = multiply_quaternions(turned, own)
+        wanted = unlike.arms[site].shared_pose(spec.q0_rad)
+        assert spec.task.scale * (at - [0.0, n * SPACING_M, 0.0]) == pytest.approx(wanted, abs=1e-12)
+    assert model.frames[-1][1] == "s/" + reference_tip("arm7")
+
+
+def test_planar_arms_alone_have_no_model():
     from trilat_net.scenario import load_scenario
 
     assert build_robot_model(load_scenario("two_sites"), "m") is None

@@ -103,10 +103,13 @@ _CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
 
 
 def torque_source_rows(
-    actors: tuple[TorqueSource, ...], joints: int = 2
+    actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns the actors of an arm of so many joints: a row each, and all their tables in one."""
-    rows = np.zeros(len(actors), torque_source_dtype(2 if joints == 2 else max(joints, 3)))
+    """Returns the actors of an arm of so many joints in a space of so many axes, and all their tables in one.
+
+    Each actor has a row.
+    """
+    rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
     tables = [np.zeros((0, 1 + joints))]
     first = 0
     row: Row

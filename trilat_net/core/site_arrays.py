@@ -160,7 +160,7 @@ def build_site_arrays(
     samples = np.zeros((peers, pages), sample_dtype(layout.shared))
     samples["tick"] = -1
     rows, models, points = _build_links(links, spare, layout.shared)
-    actors, table = torque_source_rows(setup.actors, layout.joints)
+    actors, table = torque_source_rows(setup.actors, layout.joints, 3 if layout.chain else 2)
     ramps = np.zeros((1 + len(setup.ramps) + spare, RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
     calendars = np.full((peers, pages), -1, dtype=np.int64)

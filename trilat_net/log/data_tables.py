@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.chain import LINK_PARAMETERS
+from ..core.task_space import PLACE
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
-from ..scenario.arms import ArmModel
+from ..scenario.arms import TASK_AXES, ArmModel
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -50,7 +51,13 @@ SITE_TABLE_KINDS = ("state", "link", "arrivals")
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
 """Statistics in which -1 stands for none."""
 _JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
-"""Vectors of a record with a number per joint."""
+"""Vectors of a record with a number per joint, in joint space."""
+_TASK_VECTORS = {
+    **dict.fromkeys(("q_des", "x"), ("m", "rad")),
+    **dict.fromkeys(("qd_des", "xd"), ("m/s", "rad/s")),
+    "wrench": ("N", "N m"),
+}
+"""Those with a number per coordinate of the task: units of places and of orientations."""
 
 
 class Column(NamedTuple):
@@ -192,8 +199,15 @@ def _make_time_columns(
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     """Yields the vectors of a site's records, a column per joint and per parameter of its arm."""
     docs = read_field_docs(State)
-    for field in _JOINT_VECTORS:
+    task = _TASK_VECTORS if arm.shares_pose else {}
+    for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
         values = getattr(site, field)
+        if field in task:
+            for n, axis in enumerate(TASK_AXES[: arm.counts.shared]):
+                unit, text = task[field][n >= PLACE], f"{docs[field].text}, along {axis}"
+                name = add_unit_suffix(f"{field}_{axis}", unit)
+                yield Column(name, np.ascontiguousarray(values[:, n]), unit, text, f"{field}[{n}]")
+            continue
         units = arm.joint_units(docs[field].unit)
         for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
             text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)

@@ -61,10 +61,10 @@ class _TimedMessages(NamedTuple):
 def export_ros2(log: Log, path: Path, progress: Callable[[int], None] = lambda _: None) -> None:
     """Writes a log as a bag that `ros2 bag` and its like play and read.
 
-    Per site, under its name: `joint_states`, `reference`, `error`, `tau_x`, `theta_hat`, `mode`, and its
-    statistics `link_age`, `link_delay`, `link_offset`, `timing`; of the session `/events` and `/log`. Units
-    and names stand in the channels' metadata and in the labels of dimensions. An arm from a URDF has its
-    `robot_description` and its links' frames in `/tf`.
+    Per site, under its name: `joint_states`, `reference`, `error`, `tau_x`, `theta_hat`, `mode`, in task
+    space `end_effector` and `wrench`; its statistics `link_age`, `link_delay`, `link_offset`, `timing`; of
+    the session `/events` and `/log`. Units and names stand in the channels' metadata and in the labels of
+    dimensions. A chain has its `robot_description` and its links' frames in `/tf`.
 
     An earlier file is replaced; `progress` is called with the number of records written since its last call.
 
@@ -139,10 +139,12 @@ class _SiteMessages:
             row = [column[0] for column in stack_signals([state])]
             messages = [
                 ("joint_states", self._states.pack(stamp_ns, state.q, state.qd, state.tau)),
-                ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)),
+                *self._shapes.end_effector(state),
                 ("error", self._shapes.arrays["error"].pack(*row[self._shapes.error_row])),
                 *self._shapes.slow(row[self._shapes.slow_row]),
             ]
+            if not self._shapes.task:
+                messages.insert(1, ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)))
             if (robot := self._shapes.robot) is not None:
                 if count == 1:
                     messages.append((ROBOT, pack_string(robot.description)))

@@ -71,8 +71,18 @@ def _upright(down: Sequence[float]) -> Quaternion:
     return -y / length, x / length, 0.0, (1.0 - z) / length
 
 
+_PLANAR = """<robot name="planar">
+<link name="base"/><link name="link1"/><link name="link2"/><link name="tip"/>
+<joint name="q1" type="continuous"><parent link="base"/><child link="link1"/><axis xyz="0 0 1"/></joint>
+<joint name="q2" type="continuous"><parent link="link1"/><child link="link2"/><axis xyz="0 0 1"/>
+<origin xyz="{l1_m} 0 0"/></joint>
+<joint name="end" type="fixed"><parent link="link2"/><child link="tip"/><origin xyz="{l2_m} 0 0"/></joint>
+</robot>"""
+"""The planar arm as a chain."""
+
+
 class RobotModel:
-    """The arm of one site that a URDF describes.
+    """The arm of one site that is a chain: that of its URDF, or the planar one.
 
     Attributes:
         description: the URDF, with the names of its links after the site.
@@ -81,7 +91,11 @@ class RobotModel:
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         spec, names = scenario.sites[site].arm, scenario.arms[site].joint_names
-        root, base = ElementTree.fromstring(scenario.urdf[spec.urdf]), read_arm(spec, scenario.urdf).base
+        base, text = "base", _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
+        if spec.urdf:
+            base, text = read_arm(spec, scenario.urdf).base, scenario.urdf[spec.urdf]
+        x, y, z = spec.down if spec.urdf else (0.0, -1.0, 0.0)
+        root = ElementTree.fromstring(text)
         below: dict[str, list[Element]] = {}
         for joint in root.findall("joint"):
             below.setdefault(_link_of(joint, "parent"), []).append(joint)
@@ -94,7 +108,12 @@ class RobotModel:
                 reached.append(child)
                 self.frames.append((f"{site}/{link}", f"{site}/{child}"))
                 self._joints.append(_read_frame(joint, names))
-        self._base = ((0.0, SPACING_M * scenario.names.index(site), 0.0), _upright(spec.down))
+        own = _turned(spec.base_rpy_rad)
+        upright = _upright(rotate_vector(own, (x, y, z)))
+        x, y, z = spec.base_xyz_m
+        x, y, z = rotate_vector(upright, (x, y, z))
+        place = (x, y + SPACING_M * scenario.names.index(site), z)
+        self._base = (place, multiply_quaternions(upright, own))
         self.description = _describe(root, site, scenario.names.index(site))
         self._packer = TransformPacker(self.frames)
 
@@ -118,8 +137,15 @@ class RobotModel:
 
 
 def build_robot_model(scenario: Scenario, site: str) -> RobotModel | None:
-    """Returns the model of a site's arm, or None if no URDF describes it."""
-    return RobotModel(scenario, site) if scenario.sites[site].arm.urdf else None
+    """Returns the model of a site's arm, or None where arms are planar ones alone."""
+    return RobotModel(scenario, site) if scenario.arms[site].chain is not None else None
+
+
+def _turned(rpy: Sequence[float]) -> Quaternion:
+    """Returns the rotation by angles about the fixed axes x, y, z, in this order."""
+    roll, pitch, yaw = rpy
+    turned = multiply_quaternions(_about((0.0, 0.0, 1.0), yaw), _about((0.0, 1.0, 0.0), pitch))
+    return multiply_quaternions(turned, _about((1.0, 0.0, 0.0), roll))
 
 
 def _link_of(joint: Element, end: str) -> str:
@@ -139,9 +165,7 @@ def _vector(element: Element | None, key: str, absent: Vector) -> Vector:
 def _read_frame(joint: Element, names: Sequence[str]) -> _JointFrame:
     """Returns a joint as `read_urdf` has taken it."""
     name, origin = joint.get("name", ""), joint.find("origin")
-    roll, pitch, yaw = _vector(origin, "rpy", (0.0, 0.0, 0.0))
-    turned = multiply_quaternions(_about((0.0, 0.0, 1.0), yaw), _about((0.0, 1.0, 0.0), pitch))
-    turned = multiply_quaternions(turned, _about((1.0, 0.0, 0.0), roll))
+    turned = _turned(_vector(origin, "rpy", (0.0, 0.0, 0.0)))
     axis = _vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
     size = math.hypot(*axis) or 1.0
     unit = (axis[0] / size, axis[1] / size, axis[2] / size)

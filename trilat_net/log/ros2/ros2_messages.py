@@ -11,14 +11,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
+from ...core.task_space import PLACE
 from ...core.ticks import Mode, TickRecord
 from ...errors import LogError
 from ...net.messages import Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
+from ..site_log import find_task_errors
 from .cdr import (
     ENCODING,
     FLOAT64_ARRAY,
@@ -102,16 +105,17 @@ class Ros2SiteChannels:
     Attributes:
         joints: names of its joints: those of its file, or numbered ones of a planar arm.
         arrays: the channels that are arrays, by the last part of their topic.
+        task: the names of those that stand for the end effector, in task space; else ().
         joint_row: of a row of `stack_signals` the joints: q, q_des, qd, tau.
         error_row: the error e = q - q_des, Eq. (9).
         slow_row: the rest: tau_x, theta_hat, mode.
-        robot: the arm for viewers, or None if no URDF describes it.
+        robot: the arm for viewers, or None where arms are planar ones alone.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         arm, self._peers = scenario.arms[site], scenario.peers(site)
         self._arm, n, peers = arm, arm.counts.joints, self._peers
-        shared = arm.counts.shared
+        shared, axes = arm.counts.shared, TASK_AXES[: arm.counts.shared]
         self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 4 * n + shared)
         self.slow_row = slice(4 * n + shared, None)
         self.robot = build_robot_model(scenario, site)
@@ -123,9 +127,9 @@ class Ros2SiteChannels:
         if arm.chain is not None:
             estimate = ("estimate", "kg, kg m, kg m^2")
         self.arrays = {
-            "error": ArrayChannel("q - q_des", self._unit("rad"), labels)
-            if scenario.sites[site].task.space == "joints"
-            else ArrayChannel("x - x_des", "m or rad", TASK_AXES[:shared]),
+            "error": ArrayChannel("x - x_des", "m or rad", axes)
+            if arm.shares_pose
+            else ArrayChannel("q - q_des", self._unit("rad"), labels),
             "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels),
             "theta_hat": ArrayChannel(*estimate, parameters),
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
@@ -136,6 +140,13 @@ class Ros2SiteChannels:
             ),
             "timing": ArrayChannel("largest in the last 100 ms", "us", ("lateness", "computing_time")),
         }
+        self.task = ("reference", "end_effector", "wrench") if arm.shares_pose else ()
+        motion = "m and m/s, rad and rad/s"
+        for name in self.task[:2]:
+            what = "end effector" if name == "end_effector" else "its reference"
+            self.arrays[name] = ArrayChannel(what, motion, ("pose", "derivative"), axes)
+        if self.task:
+            self.arrays["wrench"] = ArrayChannel("tau_x at the end effector", "N or N m", axes)
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
         """Returns a channel of joint states with these names."""
@@ -155,6 +166,12 @@ class Ros2SiteChannels:
             array = self.arrays[name]
             yield name, array.pack(*row[start : start + array.size])
             start += array.size
+
+    def end_effector(self, state: "Record") -> Iterator[tuple[str, bytes]]:
+        """Yields the arrays of one record that stand for the end effector; none in joint space."""
+        rows = (state.q_des, state.qd_des), (state.x, state.xd), (state.wrench,)
+        for name, vectors in zip(self.task, rows, strict=False):
+            yield name, self.arrays[name].pack(*(value for vector in vectors for value in vector))
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields the arrays of one statistics; those of clocks and networks only in a live session."""
@@ -217,6 +234,8 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     here = [*zip(*(m.x for m in records), strict=True)] if task else columns[:n]
     there = [*zip(*(m.q_des for m in records), strict=True)]
     error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)]
+    if len(error) > PLACE and task:
+        error = find_task_errors(*(np.array(columns).T for columns in (here, there))).T.tolist()
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]

@@ -95,10 +95,11 @@ class _SiteBuckets:
         self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
         self.joints = len(shapes.joints)
         self._none = [math.nan] * self.joints  # velocity, effort of a reference: size is dear
-        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in shapes.arrays}
+        arrays = {name: array for name, array in shapes.arrays.items() if name not in shapes.task}
+        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in arrays}
         self.channels: dict[str, Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
-            **{self._topics[name]: array.channel for name, array in shapes.arrays.items()},
+            **{self._topics[name]: array.channel for name, array in arrays.items()},
         }
         if shapes.robot is not None:
             self._topics |= {name: f"{VIZ_ROOT}{site}/{name}" for name in ROBOT_CHANNELS}

@@ -1,0 +1,100 @@
+"""Exports of sites that follow with their end effectors, as other people's programs read them."""
+
+import csv
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.io
+from rosbags.highlevel import AnyReader
+
+import trilat_net
+from tests.log.programs import RERUN, printed, rerun_faults
+from tests.task_arms import planar_task
+from trilat_net.execution.virtual import write_virtual_log
+from trilat_net.log.data_tables import to_data_frame
+from trilat_net.log.log_reader import Log
+from trilat_net.log.ros2.ros2_messages import read_ros2_channels
+from trilat_net.reporting.export import Exporter, ExportFormat
+from trilat_net.reporting.rerun_viewer import ViewerOptions, open_rerun
+from trilat_net.scenario import parse_scenario
+
+HEADS = {
+    "q_des": ("q_des_x_m", "q_des_y_m", "q_des_z_m"),
+    "qd_des": ("qd_des_x_m_s", "qd_des_y_m_s", "qd_des_z_m_s"),
+    "x": ("x_x_m", "x_y_m", "x_z_m"),
+    "xd": ("xd_x_m_s", "xd_y_m_s", "xd_z_m_s"),
+    "wrench": ("wrench_x_n", "wrench_y_n", "wrench_z_n"),
+}
+
+
+@cache
+def log() -> Log:
+    hands = '[[sites.s.hands]]\nkind = "tip_spring"\nto_m = [1.0, 1.0, 0.0]\nstiffness_n_m = 50\n[dominance]'
+    return trilat_net.simulate(parse_scenario(planar_task(0.2).replace("[dominance]", hands)))
+
+
+def exported(form: str, folder: Path) -> Path:
+    path = folder / ("out.mcap" if form == "ros2" else f"out.{form}")
+    Exporter(ExportFormat(form), path).export(log())
+    return path
+
+
+def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
+    folder = exported("csv", tmp_path)
+    with (folder / "s_state.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    frame = pl.read_csv(folder / "s_state.csv")
+    for field, heads in HEADS.items():
+        wanted = getattr(log()["s"], field)
+        assert np.array_equal([[float(row[head]) for head in heads] for row in rows], wanted)
+        assert np.array_equal(frame.select(heads).to_numpy(), wanted)
+    assert np.abs(log()["s"].wrench).max() > 1.0
+    columns = json.loads((folder / "about.json").read_text())["tables"]["s_state.csv"]["columns"]
+    assert columns["wrench_x_n"]["unit"] == "N"
+    assert columns["x_z_m"]["source"] == "x[2]"
+    assert "q_des1_rad" not in columns
+
+
+def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
+    site = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)["m"]
+    (table,) = (one for one in log().tables() if one.label == "m_state")
+    frame = to_data_frame(table)
+    for field, heads in HEADS.items():
+        wanted = getattr(log()["m"], field)
+        assert np.array_equal(np.stack([site[head] for head in heads], axis=1), wanted)
+        assert np.array_equal(frame.select(heads).to_numpy(), wanted)
+
+
+def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
+    path = exported("ros2", tmp_path)
+    found: dict[str, list[list[float]]] = {}
+    with AnyReader([path]) as bag:
+        for connection, _, data in bag.messages():
+            if connection.topic.startswith("/s/") and connection.msgtype.endswith("Float64MultiArray"):
+                message = bag.deserialize(data, connection.msgtype)
+                found.setdefault(connection.topic, []).append(message.data.tolist())
+        types = {connection.topic: connection.msgtype for connection in bag.connections}
+    part = log()["s"]
+    assert found["/s/reference"] == np.hstack([part.q_des, part.qd_des]).tolist()
+    assert found["/s/end_effector"] == np.hstack([part.x, part.xd]).tolist()
+    assert found["/s/wrench"] == part.wrench.tolist()
+    assert found["/s/error"] == part.e.tolist()
+    assert types["/s/joint_states"] == "sensor_msgs/msg/JointState"
+    assert types["/s/robot_description"] == "std_msgs/msg/String"
+    assert types["/tf"] == "tf2_msgs/msg/TFMessage"
+
+
+@pytest.mark.long
+def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
+    source, saved = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    with source.open("wb") as stream:
+        write_virtual_log(log().scenario, stream)
+    assert rerun_faults(source) == []
+    assert rerun_faults(exported("ros2", tmp_path)) == []
+    open_rerun([source], log, ViewerOptions(save=saved), lambda _: None)
+    text = printed(*RERUN, "rrd", "print", "-vvv", str(saved))
+    assert [name for name in read_ros2_channels(source) if name not in text] == []
