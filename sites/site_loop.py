@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
-from trilat_net.core.site_setup import Layout
+from trilat_net.core.site_setup import Layout, LinkSetup
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
@@ -37,9 +37,11 @@ class PeerInbox:
         boots: Sequence[int],
         monitors: Sequence[LinkTimingMonitor],
         dropped: Counter[str],
+        links: Sequence[LinkSetup],
         layout: Layout,
     ) -> None:
-        self._layout = layout
+        self._links = links
+        self._layouts = [layout._replace(sent=link.channel.floats) for link in links]
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = boots, monitors, dropped
         self._last = [-1] * len(peers)
@@ -56,7 +58,7 @@ class PeerInbox:
 
     def _read(self, index: int, payload: bytes, arrived_ns: int, since_epoch_ns: int) -> Arrival | None:
         try:
-            sample = decode(payload, PeerSample, layout=self._layout)
+            sample = decode(payload, PeerSample, layout=self._layouts[index])
         except WireError as error:
             self._dropped[error.reason] += 1
             return None
@@ -71,7 +73,9 @@ class PeerInbox:
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].take(sample, arrived_ns)
-        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x)
+        link, delay_us = self._links[index], delay_ns // 1000
+        ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
+        return Arrival(index, sample.tick, sample.q, sample.qd, delay_us, sample.tau_x, ch)
 
 
 BLOCKS_PER_S = 100

@@ -58,6 +58,7 @@ class SiteParts:
     """One site's parts; attributes of the same names as the arguments, and those made here.
 
     Attributes:
+        setup: what the site is built from.
         site: the site, at its start.
         rings: the peers' records as they arrive.
         watchdog: steps the site under a user's law; None without one.
@@ -80,7 +81,8 @@ class SiteParts:
         self.scenario, self.name, self.options = scenario, name, options
         self.bus, self.clock, self.interrupt = bus, clock, interrupt
         self.say: Callable[[str], None] = lambda text: say(f"{name}: {text}")
-        self.site, self.boot = Site(scenario.setup(name)), new_boot()
+        self.setup = scenario.setup(name)
+        self.site, self.boot = Site(self.setup), new_boot()
         peers, session = self.site.peers, options.session
         self.rates = [scenario.sites[peer].rate_hz for peer in peers]
         self.stats = LoopStats(self.site, self.boot, self.rates)
@@ -155,7 +157,9 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(WARM_UP_TICKS):
         arrivals = [
-            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0)) for j, link in enumerate(setup.links) if k > 0
+            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0), ch=(0.0,) * link.channel.received)
+            for j, link in enumerate(setup.links)
+            if k > 0
         ]
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]

@@ -133,7 +133,14 @@ class RunningSite:
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
         boots = [epoch.boots[peer] for peer in site.peers]
         self._inbox = PeerInbox(
-            site.peers, parts.rings, parts.rates, boots, self._timing.meters, parts.stats.dropped, site.layout
+            site.peers,
+            parts.rings,
+            parts.rates,
+            boots,
+            self._timing.meters,
+            parts.stats.dropped,
+            parts.setup.links,
+            site.layout,
         )
         publisher.update(
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots

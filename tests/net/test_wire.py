@@ -63,7 +63,8 @@ outputs = st.builds(
     rx_crc=st.integers(0, 2**32 - 1),
     cmd=st.lists(st.text(max_size=20), max_size=2),
     mem=st.lists(finite, max_size=3),
-    **dict.fromkeys((*TASK_VECTORS, "ch"), st.just(())),
+    ch=st.one_of(st.just(()), row(3)),
+    **dict.fromkeys(TASK_VECTORS, st.just(())),
     **{name: row(length) for name, length in STATE_VECTORS.items()},
 )
 arrivals = st.lists(
@@ -153,7 +154,8 @@ def test_each_field_of_a_sample_is_bit_for_bit_one_of_the_record_of_its_tick(
         of_state = {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
         ours, theirs = getattr(small, name), getattr(state, of_state)
         assert ours == theirs
-        assert name not in ("q", "qd", "tau_x") or bits(ours) == bits(theirs)
+        assert name not in ("q", "qd", "tau_x", "ch") or bits(ours) == bits(theirs)
+    assert bits(state.ch) == bits(output.ch)
     assert b"wrench" in encode_state("m1", 3, PEERS, output, [], 0, 0) or not task[0]
 
 
@@ -213,6 +215,21 @@ def test_what_is_not_finite_is_refused_at_both_ends(
         with pytest.raises(WireError) as refused:
             encode_sample("m1", 1, output._replace(**{name: numbers}), 0, [])
         assert refused.value.reason == "not finite"
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_a_law_sends_as_many_numbers_as_it_declares_each_finite(count: int) -> None:
+    numbers = [0.5] * count
+    for kind, data in {State: payload(ch=numbers), PeerSample: sample(ch=numbers)}.items():
+        assert decode(data, kind, layout=Layout(sent=count)).ch == numbers
+        with pytest.raises(WireError, match=f"ch has {count} numbers, not {count + 1}"):
+            decode(data, kind, layout=Layout(sent=count + 1))
+    output = decode(payload(), State)
+    output = TickRecord(7, 0, Mode.RUN, *[output.q] * 6, output.theta_hat, [], 0, [], [], ch=[math.inf])
+    with pytest.raises(WireError, match="not finite"):
+        encode_sample("m1", 1, output, 0, [])
+    with pytest.raises(WireError, match="not finite"):
+        decode(sample(ch=[math.nan]), PeerSample)
 
 
 @pytest.mark.parametrize("name", sorted(STATE_VECTORS))

@@ -18,8 +18,10 @@ from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import exact_offset
 from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SentStamps
 from trilat_net.net.wire import MAX_BYTES
+from trilat_net.scenario import load_scenario
 
 PEERS = ("m2", "s")
+LINKS = load_scenario("paper").setup("m1").links
 BOOTS = (11, 12)
 RATE_HZ = 1000
 
@@ -47,7 +49,7 @@ class Desk:
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, Layout())
+        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, LINKS, Layout())
 
     def wait(self, until_ns: int) -> None:
         """Time goes on, to an instant since the epoch."""

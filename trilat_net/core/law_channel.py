@@ -6,11 +6,13 @@ that go to that peer alone. A receiver takes the first part and its own; what it
 the sender's record.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 MAX_SENT = 16
 """Most numbers per joint that a law sends to a peer."""
+MAX_RECORD_SENT = 1024
+"""Most numbers that a law sends to all its peers together, which are in the record of every tick."""
 
 
 class SentVector(NamedTuple):
@@ -27,6 +29,28 @@ class SentVector(NamedTuple):
     unit: str
     length: int
     per_peer: bool = False
+
+
+class SentEntry(NamedTuple):
+    """One number of what a law sends.
+
+    Attributes:
+        vector: the vector that it belongs to.
+        peer: the peer that it goes to, or "": to all.
+        place: its place in the vector.
+    """
+
+    vector: SentVector
+    peer: str
+    place: int
+
+    @property
+    def key(self) -> str:
+        """The vector's name, and in brackets the peer that it goes to alone: "E", "u[m2]"."""
+        return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
+
+    def __str__(self) -> str:
+        return f"{self.key}[{self.place}]"
 
 
 class LawChannel(NamedTuple):
@@ -65,6 +89,14 @@ class LawChannel(NamedTuple):
             for vector in vectors
             for n in range(vector.length)
         ]
+
+    def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
+        """Yields what each number of a record is, in order; `peers` are the names of the site's peers."""
+        for per_peer, places in ((False, ("",)), (True, peers)):
+            for peer in places:
+                for vector in self.vectors:
+                    if vector.per_peer is per_peer:
+                        yield from (SentEntry(vector, peer, n) for n in range(vector.length))
 
     def part(self, sent: Sequence[float], place: int) -> Sequence[float]:
         """Returns what the peer at a place among the sender's peers gets of a record's numbers."""

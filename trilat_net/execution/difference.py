@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from ..core.law_channel import LawChannel
 from ..core.ticks import TickRecord
 from ..errors import LawFailed
 from ..net.messages import STATE_VECTORS, State
@@ -55,7 +56,7 @@ def _equal_lists(a: Sequence[float], b: Sequence[float], equal: NumberEquality) 
 
 def _pack(a: State | TickRecord) -> bytes:
     return array(
-        "d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat, *a.x, *a.xd, *a.wrench]
+        "d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat, *a.x, *a.xd, *a.wrench, *a.ch]
     ).tobytes()
 
 
@@ -73,30 +74,43 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
 
 
 def find_first_difference(
-    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality
+    logged: State,
+    computed: TickRecord,
+    peers: tuple[str, ...],
+    equal: NumberEquality,
+    channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Returns the first field in which a record differs from an execution, or None."""
-    for field, a, b, same in _compare_fields(logged, computed, peers, equal):
+    """Returns the first field in which a record differs from an execution, or None.
+
+    `channel` has the names of what the site's law sends.
+    """
+    for field, a, b, same in _compare_fields(logged, computed, peers, equal, channel):
         if not same:
             return RecordDifference(logged.site, logged.tick, field, a, b)
     return None
 
 
 def _compare_fields(
-    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality
+    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality, channel: LawChannel
 ) -> Iterator[tuple[str, Any, Any, bool]]:
     """Yields every field with both values, and whether they agree."""
     mode = computed.mode.name.lower()
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
     yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns
     yield "mode", logged.mode, mode, logged.mode == mode
+    sent = [f"ch.{entry}" for entry in channel.entries(peers)]
     for field in STATE_VECTORS:
-        for n, (a, b) in enumerate(zip(getattr(logged, field), getattr(computed, field), strict=True)):
-            yield f"{field}[{n}]", float(a), b, equal(float(a), b)
+        before, now = getattr(logged, field), getattr(computed, field)
+        if len(before) != len(now):
+            yield f"{field} (how many numbers)", len(before), len(now), False
+            continue
+        for n, (a, b) in enumerate(zip(before, now, strict=True)):
+            name = sent[n] if field == "ch" and n < len(sent) else f"{field}[{n}]"
+            yield name, float(a), b, equal(float(a), b)
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
-        before, now = logged.used.get(peer), used.get(peer)
-        yield f"used[{peer}]", before, now, before == now
+        a, b = logged.used.get(peer), used.get(peer)
+        yield f"used[{peer}]", a, b, a == b
     yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
     yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
     yield "mem", logged.mem, computed.mem, _equal_lists(logged.mem, computed.mem, equal)

@@ -114,7 +114,12 @@ def compare_site_rerun(
     before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
     after = SiteLog(
-        site.name, before.peers, rate_hz, [tick.payload for tick in executed], "rerun", layout=before.layout
+        site.name,
+        before.peers,
+        rate_hz,
+        [tick.payload for tick in executed],
+        "rerun",
+        layout=request.scenario.layout(site.name),
     )
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     last = executed[-1] if executed else None

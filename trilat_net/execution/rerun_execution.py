@@ -73,7 +73,8 @@ class RerunSite:
         self.first: RecordDifference | None = None
         self.lacking = 0
         self.diverged = False
-        self._site = Site(scenario.setup(part.name))
+        setup = scenario.setup(part.name)
+        self._site, self._channel = Site(setup), setup.channel
         self._part, self._deliveries, self._changed, self._inputs = part, deliveries, changed, inputs
         self._last = min(deliveries.last, scenario.ticks(part.name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
@@ -139,7 +140,7 @@ class RerunSite:
             if not same and not self._changed and self._inputs.in_doubt(state, output):
                 return self._keep(n)
             if not same and self.first is None:
-                self.first = find_first_difference(state, comparable, peers, equal_bits)
+                self.first = find_first_difference(state, comparable, peers, equal_bits, self._channel)
         self.output = output
         payload = encode_state(self.name, self._boot, self._part.peers, output, arrivals[:MAX_ARRIVALS], 0, 0)
         return RerunTick(self.name, output.tick, output.t_ns, output.mode, payload, same, False, stats)
@@ -176,7 +177,13 @@ class RerunExecution:
                 request.scenario,
                 log[name],
                 self.deliveries[name],
-                RecordedInputs(log[name], samples, log.last_ticks, log.commands(name)),
+                RecordedInputs(
+                    log[name],
+                    samples,
+                    log.last_ticks,
+                    log.commands(name),
+                    request.scenario.setup(name).links,
+                ),
                 changed=bool(request.changes),
             )
             for name in request.replaced

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Generic, TypeVar
 
 from ..core.delay import MAX_DELAY_US
+from ..core.site_setup import LinkSetup
 from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
 from ..log.site_log import SiteLog
@@ -49,14 +50,23 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
         state.x,
         state.xd,
         state.wrench,
+        state.ch,
     )
 
 
 def make_arrival(peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0) -> Arrival:
-    """Returns the arrival of a peer's sample, whose numbers are those of its record."""
+    """Returns the arrival of a peer's sample, whose numbers are those of its record, see `take_parts`."""
     if isinstance(sample, Arrival) or not sample.x:
-        return Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x)
-    return Arrival(peer, tick, sample.x, sample.xd, latency_us, sample.wrench)
+        return Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x, sample.ch)
+    return Arrival(peer, tick, sample.x, sample.xd, latency_us, sample.wrench, sample.ch)
+
+
+def take_parts(arrivals: Sequence[Arrival], links: Sequence[LinkSetup]) -> list[Arrival]:
+    """Returns the arrivals of whole samples as a site takes them in: without what is for other peers."""
+    return [
+        one._replace(ch=links[one.peer].channel.part(one.ch, links[one.peer].place)) if one.ch else one
+        for one in arrivals
+    ]
 
 
 class RecordedInputs(Generic[Change]):
@@ -73,8 +83,9 @@ class RecordedInputs(Generic[Change]):
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
         ends: Mapping[str, int],
         changes: Mapping[int, Sequence[Change]],
+        links: Sequence[LinkSetup],
     ) -> None:
-        self._part = part
+        self._part, self._links = part, links
         self.samples = [samples[peer] for peer in part.peers]
         self.ends = [ends[peer] for peer in part.peers]
         self._changes = sorted(changes.items(), reverse=True)
@@ -101,7 +112,7 @@ class RecordedInputs(Generic[Change]):
                 missing.append(entry)
             else:
                 arrivals.append(make_arrival(peer, tick, sample, latency_us))
-        return arrivals, missing
+        return take_parts(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
         """Notes samples that arrived and whose own record is missing."""
@@ -124,7 +135,7 @@ class RecordedInputs(Generic[Change]):
         waiting: list[Arrival] = []
         for j, used in enumerate(last.used):
             sample = self.samples[j].get(used)
-            in_use.append(None if sample is None else make_arrival(j, used, sample))
+            in_use += [None] if sample is None else take_parts([make_arrival(j, used, sample)], self._links)
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))

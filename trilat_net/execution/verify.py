@@ -149,14 +149,15 @@ class SiteVerifier:
         ends: Mapping[str, int],
         result: VerifyResult,
     ) -> None:
-        self._site = Site(scenario.setup(site_log.name))
+        setup = scenario.setup(site_log.name)
+        self._site, self._channel = Site(setup), setup.channel
         self._scenario, self._log, self._result = scenario, site_log, result
         self._external = site_log.name in scenario.external
         self._law_failed = False
         self._own_end = ends[site_log.name]
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
-        self._inputs = RecordedInputs(site_log, by_tick, ends, changes)
+        self._inputs = RecordedInputs(site_log, by_tick, ends, changes, setup.links)
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
@@ -219,7 +220,7 @@ class SiteVerifier:
             output = output._replace(rx_crc=state.rx_crc)
         difference = invalid_change or invalid or difference
         if difference is None and not equal_record(state, output, peers):
-            difference = find_first_difference(state, output, peers, self._equal)
+            difference = find_first_difference(state, output, peers, self._equal, self._channel)
             if difference is not None and self._inputs.in_doubt(state, output):
                 result.unjudged += 1
                 self._certain = False

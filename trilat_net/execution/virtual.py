@@ -26,6 +26,7 @@ from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.laws import ImportedLaw
 from ..scenario.validate import refuse_external_arms
+from .resumption import take_parts
 from .site_channels import SiteChannels, describe_accounts
 from .virtual_network import Network, PromptNetwork
 
@@ -79,7 +80,8 @@ def execute_virtual(
     """
     refuse_external_arms(scenario, measured)
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
-    sites = [Site(scenario.setup(name)) for name in scenario.names]
+    setups = [scenario.setup(name) for name in scenario.names]
+    sites = [Site(setup) for setup in setups]
     ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
     # (t_ns, order, k) of each site's next tick
     pending = [(0, index, 0) for index in range(len(sites)) if ticks[index]]
@@ -90,7 +92,7 @@ def execute_virtual(
             place = next((n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0)
         t_ns, index, k = pending.pop(place)
         site = sites[index]
-        arrivals = joined.deliver(site.name, k)
+        arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
         ordered, arm = commands.get(site.name, {}), measured.get(site.name, {})
         output = site.step(TickInput(k, arrivals, ordered.get(k, ()), arm.get(k)))
         joined.send(site.name, output)

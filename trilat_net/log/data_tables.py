@@ -223,12 +223,24 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
         yield Column(name, np.ascontiguousarray(site.theta_hat[:, n]), unit, text, source)
 
 
+def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
+    """Yields what the site's law sends, a column per number."""
+    for n, entry in enumerate(site.channel.entries(site.peers)):
+        (name, unit, length, _), peer = entry.vector, entry.peer
+        stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.place + 1}" * (length > 1)
+        suffix = UNIT_SUFFIXES.get(unit) or _to_word(unit).strip("_")
+        text = f"{name} that the law sends to {peer or 'all'}" + f", number {entry.place + 1}" * (length > 1)
+        values = np.ascontiguousarray(site.ch[:, n])
+        yield Column(f"{stem}_{suffix}" if suffix else stem, values, unit, text, f"ch.{entry}")
+
+
 def build_state_table(site: SiteLog, arm: ArmModel, peer_rates_hz: Mapping[str, int]) -> Table:
     """Returns the records of a site with its arm, a row each, in order of their ticks."""
     docs = read_field_docs(State)
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
     columns += _make_vector_columns(site, arm)
+    columns += _make_sent_columns(site)
     for peer, rate_hz in peer_rates_hz.items():
         used = site.used[peer]
         known: NDArray[np.bool_] = used >= 0

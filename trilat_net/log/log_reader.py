@@ -240,7 +240,8 @@ class Log:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
             peers, layout = self.scenario.peers(site), self.scenario.layout(site)
-            part = SiteLog(site, peers, rate_hz, channel.payloads, self.source, times, layout)
+            sent = self.scenario.channel(site)
+            part = SiteLog(site, peers, rate_hz, channel.payloads, self.source, times, layout, sent)
             most, last = self.scenario.ticks(site), part.last_tick
             if last >= most:  # a tick of others is nothing to count up to
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")

@@ -54,8 +54,14 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in one pass."""
+    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in one pass.
+
+    Of what records of this layout leave out the length is 0.
+    """
     lengths = layout.lengths()
+    if absent := {field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths}:
+        there = [field for field in fields if field in lengths]
+        return absent | (decode_vectors(payloads, layout, *there) if there else {})
     counts = [lengths[field] for field in fields]
     values = chain.from_iterable(_decode_fields(payloads, *fields, layout=layout))
     if len(fields) > 1:

@@ -12,6 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 import numpy as np
 
 from .. import process
+from ..core.law_channel import LawChannel
 from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
@@ -159,6 +160,7 @@ class SiteLog:
         source: the file's name in errors.
         times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
         layout: how many numbers the vectors of its records have; n joints, m shared, P parameters.
+        channel: what the site's law sends to its peers.
 
     Attributes:
         payloads: the records as published, in tick order.
@@ -178,7 +180,9 @@ class SiteLog:
         source: str,
         times: tuple[Ints, Ints] | None = None,
         layout: Layout = Layout(),  # noqa: B008
+        channel: LawChannel = LawChannel(),  # noqa: B008
     ) -> None:
+        self.channel = channel
         self.name, self.peers, self.rate_hz, self.layout = name, peers, rate_hz, layout
         self._source = source
         self.payloads = payloads
@@ -266,6 +270,7 @@ class SiteLog:
     x = _RecordVector("In task space the end effector's place and orientation, shape (K, m), m and rad.")
     xd = _RecordVector("Its derivative, shape (K, m).")
     wrench = _RecordVector("What tau_x amounts to there, shape (K, m), N and N m.")
+    ch = _RecordVector("All that the site's law sends, shape (K, C); `sent` has it by name.")
     t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
     late_us = _RecordField(
         record_columns.decode_ints, "Wake-up minus deadline, shape (K,), us; 0 in virtual time."
@@ -287,6 +292,14 @@ class SiteLog:
         The error of an orientation is the turn from the reference to the end effector, rad.
         """
         return find_task_errors(self.x, self.q_des) if self.layout.task else self.q - self.q_des
+
+    @cached_property
+    def sent(self) -> dict[str, Array]:
+        """What the law sends, shape (K, length) each: by name, as in "E", or name and peer, as in "u[m2]"."""
+        places: dict[str, list[int]] = {}
+        for n, entry in enumerate(self.channel.entries(self.peers)):
+            places.setdefault(entry.key, []).append(n)
+        return {key: self.ch[:, columns] for key, columns in places.items()}
 
     @cached_property
     def busy_us(self) -> Ints:

@@ -101,7 +101,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What peers need of a tick, sent at every tick; each field is bit for bit that of the tick's `State`.
 
-    In task space its q, qd and tau_x are x, xd and wrench of the `State`.
+    In task space its q, qd and tau_x are x, xd and wrench of the `State`. Of `ch` a peer takes what is for
+    all, and what is for itself.
     """
 
     v: int
@@ -305,7 +306,7 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 TASK_VECTORS = ("x", "xd", "wrench")
-STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS)
+STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch")
 """The vectors of a record; their lengths are those of the site's `Layout`."""
 
 

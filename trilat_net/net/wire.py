@@ -20,7 +20,7 @@ from ..core.site_setup import Layout
 from ..core.ticks import Arrival, Mode, TickRecord
 from ..errors import WireError
 from .messages import (
-    TASK_VECTORS,
+    STATE_VECTORS,
     VERSION,
     Event,
     Info,
@@ -49,9 +49,9 @@ _MODE_NAMES = {mode: mode.name.lower() for mode in Mode}
 def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
     """Returns the lengths of a message's vectors."""
     if kind is State:
-        return layout.lengths() | ({} if layout.task else dict.fromkeys(TASK_VECTORS, 0))
+        return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:
-        return dict.fromkeys(("q", "qd", "tau_x"), layout.shared)
+        return dict.fromkeys(("q", "qd", "tau_x"), layout.shared) | {"ch": layout.sent}
     return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
 
 
@@ -127,22 +127,22 @@ def encode_sample(
     Raises:
         WireError: a number is not finite.
     """
-    q, qd, tau_x = output.shared()
-    if not _isfinite(sum(q) + sum(qd) + sum(tau_x)) and not all(map(_isfinite, [*q, *qd, *tau_x])):
+    (q, qd, tau_x), ch = output.shared(), output.ch
+    total = sum(q) + sum(qd) + sum(tau_x) + sum(ch)
+    if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
         raise WireError("not finite", f"{site} at tick {output.tick}")
-    return _encode(
-        {
-            "v": VERSION,
-            "site": site,
-            "boot": boot,
-            "tick": output.tick,
-            "q": q,
-            "qd": qd,
-            "tau_x": tau_x,
-            "sent_ns": sent_ns,
-            "echo": echo,
-        }
-    )
+    fields = {
+        "v": VERSION,
+        "site": site,
+        "boot": boot,
+        "tick": output.tick,
+        "q": q,
+        "qd": qd,
+        "tau_x": tau_x,
+        "sent_ns": sent_ns,
+        "echo": echo,
+    }
+    return _encode({**fields, "ch": ch} if ch else fields)
 
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from ..files import import_extra
 from ..log.ros2.cdr import JOINT_STATE, TRANSFORMS
 from ..log.ros2.robot_model import WORLD
-from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, Ros2Channel
+from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, SENT_PREFIX, Ros2Channel
 
 Ros2Channels = Mapping[str, Ros2Channel]
 
@@ -78,6 +78,13 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
         name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
         for name, rows in _PAGES.items()
     }
+    sent = {  # in the order in which a law declares it
+        name: (channel.about["content"], channel.about["unit"].strip("-"))
+        for topic, channel in channels.items()
+        if (name := topic.rpartition("/")[2]).startswith(SENT_PREFIX)
+    }
+    rows = [[*_row(channels, roots, what, unit, ((name, ""),))] for name, (what, unit) in sent.items()]
+    pages["Sent by laws"] = rows
     lines = next((topic for topic in session if topic.endswith(f"/{LINES}")), "")
     arms = any(channel.kind == TRANSFORMS for channel in channels.values())
     return PlotLayout({name: page for name, page in pages.items() if page}, lines, arms)

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from ..core.chain import MAX_JOINTS
-from ..core.law_channel import MAX_SENT, LawChannel, SentVector
+from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..core.site_setup import Layout
 from ..errors import ScenarioError
 from .fields import Frozen, reword_problem
@@ -69,6 +69,12 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         raise ScenarioError(problem, path=f"{path}.sends.{name}")
     if (count := channel.received) > (most := MAX_SENT * joints):
         problem = f"sends {count} numbers to each peer, and at most {most} are taken, {MAX_SENT} per joint"
+        raise ScenarioError(problem, path=f"{path}.sends")
+    if channel.floats > MAX_RECORD_SENT:
+        count, most = channel.floats, MAX_RECORD_SENT
+        problem = (
+            f"sends {count} numbers to {channel.peers} peers together, and a record holds at most {most}"
+        )
         raise ScenarioError(problem, path=f"{path}.sends")
 
 

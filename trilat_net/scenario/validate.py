@@ -136,6 +136,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
+    _check_received(scenario)
     for name, link in scenario.links.items():
         if found := link.find_problem():
             raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
@@ -191,6 +192,21 @@ def _check_joint_space(scenario: Scenario) -> None:
                 "armature_kg_m2",
                 path=f"sites.{name}.control",
             )
+
+
+def _check_received(scenario: Scenario) -> None:
+    """Refuses vectors of one name and of several lengths that a site would get of its peers."""
+    for site in scenario.names:
+        lengths: dict[str, tuple[str, int]] = {}
+        for peer in scenario.peers(site):
+            for name, _, length, _ in scenario.channel(peer).vectors:
+                first, other = lengths.setdefault(name, (peer, length))
+                if other != length:
+                    raise ScenarioError(
+                        f"has {length} numbers, and {name} of {first} has {other}; {site} gets both: give "
+                        "them one length or two names",
+                        path=f"sites.{peer}.control.sends.{name}",
+                    )
 
 
 def _check_start_poses(scenario: Scenario) -> None:

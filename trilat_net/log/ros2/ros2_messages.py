@@ -39,8 +39,8 @@ from .robot_model import build_robot_model
 
 EVENTS, LINES = "events", "log"
 """Channels of a whole session: events as plain text, and as lines with a time and a level."""
-SLOW_ARRAYS = ("tau_x", "theta_hat", "mode")
-"""Arrays of a record besides its joints and their error, in order."""
+SENT_PREFIX = "sent_"
+"""Of the names of arrays that hold what a law sends: "sent_E", "sent_u_to_m2"."""
 
 
 ROBOT, FRAMES = "robot_description", "tf"
@@ -108,7 +108,7 @@ class Ros2SiteChannels:
         task: the names of those that stand for the end effector, in task space; else ().
         joint_row: of a row of `stack_signals` the joints: q, q_des, qd, tau.
         error_row: the error e = q - q_des, Eq. (9).
-        slow_row: the rest: tau_x, theta_hat, mode.
+        slow_row: the rest: tau_x, theta_hat, what the law sends, mode.
         robot: the arm for viewers, or None where arms are planar ones alone.
     """
 
@@ -126,12 +126,23 @@ class Ros2SiteChannels:
         estimate = ("estimate of Eq. (24)", "kg m^2, kg m^2, kg m^2, kg m, kg m")
         if arm.chain is not None:
             estimate = ("estimate", "kg, kg m, kg m^2")
+        sent = {
+            f"{SENT_PREFIX}{vector.name}" + f"_to_{peer}" * bool(peer): ArrayChannel(
+                f"{vector.name} that the law sends to {peer or 'all'}",
+                vector.unit or "-",
+                [f"{vector.name}{n + 1}" for n in range(vector.length)],
+            )
+            for vector, peer, place in scenario.channel(site).entries(peers)
+            if not place
+        }
+        self._slow = ("tau_x", "theta_hat", *sent, "mode")
         self.arrays = {
             "error": ArrayChannel("x - x_des", "m or rad", axes)
             if arm.shares_pose
             else ArrayChannel("q - q_des", self._unit("rad"), labels),
             "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels),
             "theta_hat": ArrayChannel(*estimate, parameters),
+            **sent,
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
             "link_age": ArrayChannel("age of the sample in use", "ms", peers),
             "link_delay": ArrayChannel("one-way delay, last 100 ms", "ms", peers, spread),
@@ -160,9 +171,9 @@ class Ros2SiteChannels:
         return " or ".join(dict.fromkeys(self._arm.joint_units(unit)))
 
     def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one record, from all their numbers in the order of `SLOW_ARRAYS`."""
+        """Yields the arrays of one record, from the numbers of its `slow_row`."""
         start = 0
-        for name in SLOW_ARRAYS:
+        for name in self._slow:
             array = self.arrays[name]
             yield name, array.pack(*row[start : start + array.size])
             start += array.size
@@ -222,13 +233,15 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x, theta_hat, mode.
+    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x, theta_hat, ch, mode.
 
     A column may be shorter where all of its numbers are the same. In task space no joint has a reference: its
     own angle stands there, and e is x - x_des.
     """
     task = bool(records[0].x)
-    rows = [(*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat) for m in records]
+    rows = [
+        (*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat, *m.ch) for m in records
+    ]
     columns: list[SignalRow] = [*zip(*rows, strict=True)]
     n = len(records[0].q)
     here = [*zip(*(m.x for m in records), strict=True)] if task else columns[:n]

@@ -41,6 +41,8 @@ FULL_RATE_HZ = math.inf
 
 MAX_PENDING_BYTES = 1 << 13
 """Most bytes that the channels of a site have still to write, per two joints of its arm."""
+SENT_PENDING_BYTES = 512
+"""And per number that its law sends, which may be an array of its own."""
 
 PutMessage = Callable[[str, bytes, int, int], None]
 """Writes one message: topic, bytes, publish time and log time, Unix ns."""
@@ -93,8 +95,9 @@ class _SiteBuckets:
         self._shapes = shapes = Ros2SiteChannels(scenario, site)
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
-        self.joints = len(shapes.joints)
-        self._none = [math.nan] * self.joints  # velocity, effort of a reference: size is dear
+        joints, sent = len(shapes.joints), scenario.channel(site).floats
+        self.most_pending_bytes = MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
+        self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
         arrays = {name: array for name, array in shapes.arrays.items() if name not in shapes.task}
         self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in arrays}
         self.channels: dict[str, Ros2Channel] = {
@@ -263,7 +266,7 @@ class VizChannels:
     @property
     def most_bytes(self) -> int:
         """Most bytes that are still to be written."""
-        return sum(MAX_PENDING_BYTES * -(-buckets.joints // 2) for buckets in self._buckets)
+        return sum(buckets.most_pending_bytes for buckets in self._buckets)
 
 
 def decimate_min_max(columns: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
