@@ -20,7 +20,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, SiteTiming
-from trilat_net.net.wire import decode, encode, encode_sample, encode_state
+from trilat_net.net.wire import encode, encode_sample, encode_state, make_decoder
 
 
 class PeerInbox:
@@ -41,7 +41,8 @@ class PeerInbox:
         layout: Layout,
     ) -> None:
         self._links = links
-        self._layouts = [layout._replace(sent=link.channel.floats) for link in links]
+        layouts = [layout._replace(sent=link.channel.floats) for link in links]
+        self._decoders = [make_decoder(PeerSample, layout=own) for own in layouts]
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = boots, monitors, dropped
         self._last = [-1] * len(peers)
@@ -58,7 +59,7 @@ class PeerInbox:
 
     def _read(self, index: int, payload: bytes, arrived_ns: int, since_epoch_ns: int) -> Arrival | None:
         try:
-            sample = decode(payload, PeerSample, layout=self._layouts[index])
+            sample: PeerSample = self._decoders[index](payload)
         except WireError as error:
             self._dropped[error.reason] += 1
             return None
@@ -161,9 +162,8 @@ def run_loop(
 ) -> TickRecord | None:
     """Runs a site in real time, from tick 0, and returns its last record; None without a tick."""
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
-    busy_us, mode, last = 0, Mode.RUN, None
+    busy_us, mode, last, deadline_ns = 0, Mode.RUN, None, timing.schedule.deadline(0)
     for k in range(ticks):
-        deadline_ns = timing.schedule.deadline(k)
         clock.sleep_until(deadline_ns)
         if io.should_stop():
             break
@@ -178,9 +178,10 @@ def run_loop(
         io.publish_sample(encode_sample(site.name, boot, output, sent_ns, echo))
         states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
         stats.tick(late_us, busy_us)
-        if states.due(k) or stats.due(k):  # statistics say that these records exist
+        stats_due = stats.due(k)
+        if stats_due or states.due(k):  # statistics say that these records exist
             states.flush()
-        if stats.due(k):
+        if stats_due:
             io.publish_link(encode(stats.take(output, timing.measured(woke_ns))))
             io.attend(k, output.t_ns)
         if output.mode is Mode.DIVERGED:
@@ -188,7 +189,8 @@ def run_loop(
         if output.cmd or output.mode is not mode:
             mode = output.mode
             io.report(output)
-        if timing.schedule.deadline(k + 1) - clock.monotonic_ns() > quarter_ns:
+        deadline_ns = timing.schedule.deadline(k + 1)
+        if deadline_ns - clock.monotonic_ns() > quarter_ns:
             io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000
     states.flush()

@@ -59,6 +59,14 @@ _OPTIONS: Any = {"_nrt": False}
 """No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
 
 
+def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
+    """Returns a leaf for arguments of the types of these; it does not look at types any more."""
+    if _config.DISABLE_JIT:
+        return function
+    compiled: Any = function
+    return cast(Callable[P, R], compiled.compile(tuple(map(numba.typeof, arguments))))
+
+
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
     if _CACHE is None:

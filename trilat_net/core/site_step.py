@@ -9,12 +9,13 @@ the same bits.
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from .channel import LOST
 from .delay import DelayKind
+from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
 from .law_view import PlainView, update_law_view
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
@@ -58,7 +59,9 @@ class Site:
         arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
         self._pack_arrival, self._arrival_size = arrival.pack_into, arrival.size
         self._tick_arrays = (*self._arrays, *self._buffers)
+        self._tick: Callable[..., None] | None = None  # of a user's law the stages are called
         self._site, self._links = self._arrays.site, self._arrays.links
+        self._mode, self._used = self._site["mode"], self._links["used"]
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
@@ -105,7 +108,9 @@ class Site:
         t_ns = tick.k * NS_PER_S // self.rate_hz
         memory: list[float] = []
         if self._user_law is None:
-            site_tick(tick.k, t_ns, count, *self._tick_arrays)
+            if self._tick is None:
+                self._tick = bind_leaf(site_tick, tick.k, t_ns, count, *self._tick_arrays)
+            self._tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
             sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
             a = self._arrays
@@ -114,7 +119,7 @@ class Site:
             act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
         q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
-        mode = self._site["mode"].item()
+        mode = self._mode.item()
         record = TickRecord(
             tick.k,
             t_ns,
@@ -126,7 +131,7 @@ class Site:
             row[tau],
             row[tau_x],
             row[theta_hat],
-            self._links["used"].tolist(),
+            self._used.tolist(),
             self._crc(packed, count),
             [command.text for command in tick.commands],
             [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,

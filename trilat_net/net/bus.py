@@ -111,16 +111,18 @@ def matches_key(expression: str, key: str) -> bool:
     return _compile_expression(expression).fullmatch("/" + key) is not None
 
 
-class _Ring(Generic[T]):
-    """A bounded ring; on overflow it drops the oldest entry."""
+class BoundedRing(Generic[T]):
+    """A bounded ring; on overflow it drops the oldest entry. `put` may run in another thread than `poll`."""
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
+        """Adds the newest entry."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:
+        """See `PolledRing`."""
         return self._entries.popleft() if self._entries else None
 
 
@@ -146,9 +148,9 @@ class StampingRing:
 
     def poll(self) -> tuple[bytes, int] | None:
         """See `StampedInbox`."""
-        try:
-            return self._entries.popleft()
-        except IndexError:
+        try:  # an exception costs ten times a look
+            return self._entries.popleft() if self._entries else None
+        except IndexError:  # `take` has dropped it since the look
             return None
 
 
@@ -157,7 +159,7 @@ class _LocalQuery(NamedTuple):
 
     key: str
     payload: bytes
-    replies: _Ring[tuple[str, bytes]]
+    replies: BoundedRing[tuple[str, bytes]]
 
     def answer(self, payload: bytes) -> None:
         self.replies.put((self.key, payload))
@@ -183,7 +185,7 @@ class LocalBus:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
         self._responders: list[tuple[str, Callable[[_LocalQuery], None]]] = []
-        self._presence_rings: list[tuple[str, _Ring[tuple[str, bool]]]] = []
+        self._presence_rings: list[tuple[str, BoundedRing[tuple[str, bool]]]] = []
         self._tokens: list[str] = []
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
@@ -199,7 +201,7 @@ class LocalBus:
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """See `Bus`."""
-        ring = _Ring[tuple[str, bytes]](capacity)
+        ring = BoundedRing[tuple[str, bytes]](capacity)
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
@@ -215,7 +217,7 @@ class LocalBus:
 
     def questions(self, key: str) -> QueryInbox:
         """See `Bus`."""
-        ring = _Ring[Query]()
+        ring = BoundedRing[Query]()
         self._responders.append((key, ring.put))
         return ring
 
@@ -231,7 +233,7 @@ class LocalBus:
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
-        replies = _Ring[tuple[str, bytes]]()
+        replies = BoundedRing[tuple[str, bytes]]()
         for member in self._network.members:
             for answered, take in member._responders:
                 if member is not self and matches_key(key, answered):
@@ -245,7 +247,7 @@ class LocalBus:
 
     def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
-        ring = _Ring[tuple[str, bool]]()
+        ring = BoundedRing[tuple[str, bool]]()
         for member in self._network.members:
             for token in member._tokens:
                 if member is not self and matches_key(key, token):

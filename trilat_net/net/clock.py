@@ -31,13 +31,8 @@ class Clock(Protocol):
 class SystemClock:
     """The machine's clocks."""
 
-    def monotonic_ns(self) -> int:
-        """See `Clock`."""
-        return time.monotonic_ns()
-
-    def unix_ns(self) -> int:
-        """See `Clock`."""
-        return time.time_ns()
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
         """See `Clock`. CPython sleeps to an absolute deadline of its own, so signals do not shorten it."""

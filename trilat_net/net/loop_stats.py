@@ -34,8 +34,10 @@ class LoopStats:
 
     def tick(self, late_us: int, busy_us: int) -> None:
         """Counts one tick: its lateness, and the computing time of the one before."""
-        self._late_max_us = max(self._late_max_us, late_us)
-        self._busy_max_us = max(self._busy_max_us, busy_us)
+        if late_us > self._late_max_us:
+            self._late_max_us = late_us
+        if busy_us > self._busy_max_us:
+            self._busy_max_us = busy_us
         self.overruns += late_us >= self._period_us
 
     def due(self, k: int) -> bool:

@@ -8,6 +8,7 @@ Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of t
 echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the echo.
 """
 
+from array import array
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -64,18 +65,17 @@ class SentStamps:
 
     def __init__(self, capacity: int = 1 << 14) -> None:
         self._capacity = capacity
-        self._ticks = [-1] * capacity
-        self._instants = [0] * capacity
+        self._entries = array("q", [-1, 0]) * capacity  # tick, time
 
     def put(self, tick: int, at_ns: int) -> None:
         """Notes the time of sending of a record, on the own clock."""
-        slot = tick % self._capacity
-        self._ticks[slot], self._instants[slot] = tick, at_ns
+        slot = 2 * (tick % self._capacity)
+        self._entries[slot], self._entries[slot + 1] = tick, at_ns
 
     def at(self, tick: int) -> int | None:
         """Returns the time of sending of a record, or None if it is no longer known."""
-        slot = tick % self._capacity
-        return self._instants[slot] if self._ticks[slot] == tick else None
+        slot = 2 * (tick % self._capacity)
+        return self._entries[slot + 1] if self._entries[slot] == tick else None
 
 
 class PeerClock(NamedTuple):
@@ -113,6 +113,7 @@ class LinkTimingMonitor:
         self.worst_ns = 0
         self.contradicted = False
         self._epoch_ns, self._place, self._sent = peer.epoch_ns, peer.place, sent
+        self._shared_ns = peer.estimate.offset_ns if peer.estimator is None else None
         self._delays: list[int] = []
         self._rtt_ns = _FAR_NS
         self._windows = 0
@@ -126,7 +127,7 @@ class LinkTimingMonitor:
 
     def take(self, sample: PeerSample, arrived_ns: int) -> int:
         """Takes the stamps of one sample that arrived on the own clock; returns its one-way delay, ns."""
-        offset_ns = self.offset.at(arrived_ns)
+        offset_ns = self.offset.at(arrived_ns) if self._shared_ns is None else self._shared_ns
         sent_ns = sample.sent_ns + self._epoch_ns
         delay_ns = arrived_ns - sent_ns + offset_ns
         self._delays.append(delay_ns)

@@ -55,15 +55,6 @@ def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
     return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
 
 
-@cache
-def _checks(
-    kind: type[msgspec.Struct], layout: Layout | None
-) -> tuple[Callable[[Any], tuple[list[float], ...]], tuple[int, ...] | None] | None:
-    """Returns what takes the vectors out of a message, and their lengths if known; None without any."""
-    vectors = _vectors(kind, layout or Layout())
-    return (attrgetter(*vectors), tuple(vectors.values()) if layout else None) if vectors else None
-
-
 def encode_state(
     site: str,
     boot: int,
@@ -198,28 +189,40 @@ def decode(
     Raises:
         WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
     """
-    limit = _LIMITS.get(kind, MAX_BYTES)
-    if len(payload) > limit:
-        raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
-    try:
-        message: Any = _DECODERS[kind].decode(payload)
-    except (ValueError, RecursionError) as error:
-        raise WireError("malformed", str(error)) from None
-    if message.v not in versions:
-        raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-    check = _checks(kind, layout)
-    if check is not None:
-        vectors_of, lengths = check
-        vectors = vectors_of(message)
-        if layout is not None and tuple(map(len, vectors)) != lengths:
-            _check_lengths(vectors, _vectors(kind, layout))
-        # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
-        if not _isfinite(sum(map(sum, vectors))):
-            for name, vector in zip(_vectors(kind, layout or Layout()), vectors, strict=True):
-                if not all(map(_isfinite, vector)):
-                    number = message.n if kind is ArmMeasurement else message.tick
-                    raise WireError("not finite", f"{name} of {message.site} at {number}")
-    return message  # type: ignore[no-any-return]
+    return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
+
+
+@cache
+def make_decoder(
+    kind: type[msgspec.Struct], versions: tuple[int, ...] = (VERSION,), layout: Layout | None = None
+) -> Callable[[bytes], Any]:
+    """Returns `decode` for one kind of message, with all that it needs at hand."""
+    limit, parse = _LIMITS.get(kind, MAX_BYTES), _DECODERS[kind].decode
+    names = _vectors(kind, layout or Layout())
+    vectors_of, lengths = attrgetter(*names) if names else None, list(names.values()) if layout else None
+
+    def read(payload: bytes) -> Any:
+        if len(payload) > limit:
+            raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
+        try:
+            message: Any = parse(payload)
+        except (ValueError, RecursionError) as error:
+            raise WireError("malformed", str(error)) from None
+        if message.v not in versions:
+            raise WireError("version", f"schema version {message.v}, this is {VERSION}")
+        if vectors_of is not None:
+            vectors = vectors_of(message)
+            if lengths is not None and [*map(len, vectors)] != lengths:
+                _check_lengths(vectors, names)
+            # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
+            if not _isfinite(sum(map(sum, vectors))):
+                for name, vector in zip(names, vectors, strict=True):
+                    if not all(map(_isfinite, vector)):
+                        number = message.n if kind is ArmMeasurement else message.tick
+                        raise WireError("not finite", f"{name} of {message.site} at {number}")
+        return message
+
+    return read
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:

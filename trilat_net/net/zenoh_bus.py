@@ -4,8 +4,10 @@ Invariant: nothing here waits for the network. A publisher drops a message rathe
 (except a patient one), queries go into a ring, and a session that cannot open yet raises an error.
 """
 
+import ctypes
 import json
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -15,7 +17,7 @@ import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
 from ..errors import SessionError, UsageError
-from .bus import RING_CAPACITY, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
+from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 ASK_TIMEOUT_S = 3.0
@@ -44,6 +46,22 @@ class _ZenohRing(Generic[T]):
         except zenoh.ZError:  # every answer to a query has arrived: the channel is closed
             pass
         return None
+
+
+def _handle_samples(take: Callable[[Any], None]) -> Any:
+    """Returns a handler that calls `take` in Zenoh's threads, each of which keeps its Python state.
+
+    Else CPython makes that state anew for every message, and unmaps it. A thread asks for the interpreter
+    once more than it gives it back, so its state lives as long as the process.
+    """
+    kept = threading.local()
+
+    def handle(sample: Any) -> None:
+        take(sample)
+        if not hasattr(kept, "state"):
+            kept.state = ctypes.pythonapi.PyGILState_Ensure()
+
+    return handlers.Callback(handle, indirect=False)
 
 
 def _read_sample(sample: Any) -> tuple[str, bytes]:
@@ -101,6 +119,7 @@ class ZenohBus:
             congestion_control=CongestionControl.BLOCK if patient else CongestionControl.DROP,
             priority=Priority.REAL_TIME,
             express=False,
+            allowed_destination=Locality.REMOTE,
         )
         self._kept.append(publisher)
         put: Callable[[bytes], None] = publisher.put
@@ -119,17 +138,22 @@ class ZenohBus:
     def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
         """See `Bus`."""
         ring = StampingRing(now_ns, capacity)
-        self.tap(key, lambda _key, payload: ring.take(payload))
+        take = ring.take
+        handler = _handle_samples(lambda sample: take(sample.payload.to_bytes()))
+        self._kept.append(self._subscribe(key, handler))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
-        handler: Any = handlers.Callback(lambda sample: callback(*_read_sample(sample)), indirect=False)
+        handler = _handle_samples(lambda sample: callback(*_read_sample(sample)))
         self._kept.append(self._subscribe(key, handler))
 
     def questions(self, key: str) -> QueryInbox:
-        """See `Bus`."""
-        return _ZenohRing(self._serve(key, handlers.RingChannel(64)), lambda query: _ZenohQuery(query, key))
+        """See `Bus`; a look into a ring of our own costs a loop less than one into Zenoh's."""
+        ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
+        handler: Any = handlers.Callback(lambda query: ring.put(_ZenohQuery(query, key)), indirect=False)
+        self._kept.append(self._serve(key, handler))
+        return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
