@@ -1,17 +1,26 @@
 """What laws send to their peers: it comes to whom it is for, stands in the records, and is executed again."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from tests.execution.deliveries import SITES, TICKS
 from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.errors import LogError
+from trilat_net.execution import virtual
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.ros2.ros2_messages import read_ros2_channels
+from trilat_net.log.ros2.viz_channels import FULL_RATE_HZ
+from trilat_net.reporting.plot_layout import build_plot_layout
+from trilat_net.scenario import load_scenario
 
 LAW = "tests.channel_law:Talking"
 DELAY_TICKS = 20
@@ -99,6 +108,25 @@ def test_a_record_whose_law_sent_more_or_less_cannot_be_read() -> None:
     log = opened(edited(talk(), record=record))
     with pytest.raises(LogError, match="ch has 4 numbers, not 5"):
         log["m1"].ch  # noqa: B018
+
+
+def test_viewers_get_a_channel_per_vector_with_its_unit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
+    channels = read_ros2_channels(path)
+    about = {topic.rpartition("/")[2]: one.about for topic, one in channels.items() if "/viz/m2/" in topic}
+    sent = {name: one["unit"] for name, one in about.items() if name.startswith("sent_")}
+    assert sent == {"sent_energy": "J", "sent_target_to_m1": "rad", "sent_target_to_s": "rad"}
+    log = open_log(path)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        shown = [[*one[3].data] for one in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])]
+    assert shown == log["m2"].sent["target[s]"].tolist()
+    page = build_plot_layout(channels).pages["Sent by laws"]
+    assert [plot.title for plot in page[0]] == [
+        f"{site}: energy that the law sends to all (J)" for site in SITES
+    ]
+    assert page[1][0].curves[0].names == ("target1", "target2")
 
 
 def test_tables_name_what_was_sent_with_its_unit() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from .processes import Stage
+from .processes import PLAIN, Stage
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -13,6 +13,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.live)
             item.add_marker(pytest.mark.skipif(sys.platform != "linux", reason="live sites run on Linux"))
+
+
+@pytest.fixture(autouse=True)
+def laws_of_tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLAIN, "PYTHONPATH", str(Path(__file__).parents[2]))
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from trilat_net.net.connection import find_free_endpoints
 PAPER = ("m1", "m2", "s")
 BEGUN = "the session begins"
 PATIENCE_S = 60.0
+TALKING = ("--set", "control.law=tests.channel_law:Talking")
+"""Options of a session whose laws send to all and to each."""
 
 
 class Process:

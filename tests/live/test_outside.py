@@ -26,11 +26,6 @@ class Law(Adaptive):
 """
 
 
-@pytest.fixture(autouse=True)
-def laws_of_tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLAIN, "PYTHONPATH", str(Path(__file__).parents[2]))
-
-
 def test_a_law_that_is_too_slow_ends_the_session_in_order(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,9 +47,9 @@ def test_a_law_that_is_too_slow_ends_the_session_in_order(
 
 
 def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -> None:
-    """One of them with a law that is none of ours either."""
+    """All with a law that is none of ours either, and that sends to all and to each."""
     options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "2")
-    options = (*options, "--set", "sites.m1.control.law=tests.laws:Adaptive")
+    options = (*options, "--set", "control.law=tests.channel_law:Talking")
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
     session.all()
     session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
@@ -72,4 +67,5 @@ def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -
     log = whole(session.log)
     executed_again(log)
     assert compare_with_virtual(log).fed.identical == 6000
+    assert log["m1"].sent["target[s]"].any()
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations

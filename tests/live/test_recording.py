@@ -12,7 +12,7 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import Process, Session, Stage, executed_again, whole
+from .processes import TALKING, Process, Session, Stage, executed_again, whole
 
 S = 1_000_000_000
 
@@ -62,8 +62,11 @@ def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_e
     assert recorder.text().count(" from its memory") == 2
 
 
-def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_start(stage: Stage) -> None:
-    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
+@pytest.mark.parametrize("law", [(), pytest.param(TALKING, marks=pytest.mark.long)])
+def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_start(
+    law: tuple[str, ...], stage: Stage
+) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50", *law)
     session.all()
     session.recording()
     killed = session.processes["recorder"]

@@ -13,12 +13,23 @@ from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 
-from .processes import BEGUN, PAPER, Session, Stage, connections, equal_to_virtual_time, executed_again, whole
+from .processes import (
+    BEGUN,
+    PAPER,
+    TALKING,
+    Session,
+    Stage,
+    connections,
+    equal_to_virtual_time,
+    executed_again,
+    whole,
+)
 
 
 @pytest.mark.long  # on a push `make live` does the same with the commands
-def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(stage: Stage) -> None:
-    session = Session(stage, "paper", PAPER, "--duration", "3")
+@pytest.mark.parametrize("law", [(), TALKING], ids=["its law", "a law that sends"])
+def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, ...], stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "3", *law)
     session.all()
     log = session.is_reproduced()
     assert sum(len(log[name]) for name in PAPER) == 9_000

@@ -141,7 +141,7 @@ def computed(state: State) -> bytes:
     return msgpack.packb(
         [
             *(state.site, state.tick, state.t_ns, state.mode, state.q, state.qd, state.q_des, state.qd_des),
-            *(state.tau, state.tau_x, state.theta_hat, state.used),
+            *(state.tau, state.tau_x, state.theta_hat, state.used, state.ch),
         ]
     )
 

@@ -32,6 +32,13 @@ def test_a_law_that_repeats_the_papers_is_virtual_time_and_the_papers_bit_for_bi
     assert verdict.identical == verdict.records == 1000
 
 
+def test_what_laws_send_each_other_is_that_of_virtual_time(tmp_path: Path) -> None:
+    log, _ = lived(tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3)
+    assert in_log(log) == in_virtual_time(log.scenario)
+    assert verify(log).identical == 900
+    assert log["m1"].sent["target[s]"].any()
+
+
 @pytest.mark.parametrize("how", ["nan", "raises"])
 def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) -> None:
     control = {"law": "tests.laws:Failing", "how": how, "at": 250}

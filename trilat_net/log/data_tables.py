@@ -2,8 +2,9 @@
 
 Invariant: every number is the record's own, or follows from it exactly (an age is a difference of
 stamps). A column's name ends in its unit; a missing value is null, never a number in its place. Units
-come from the schema, meanings from the docstrings of the message types: there is no second list. A number out
-of range, or an arrival of a peer that a site does not have, is a `LogError` that names the file (`source`).
+come from the schema, meanings from the docstrings of the message types, and of what a law sends from its
+declaration: there is no second list. A number out of range, or an arrival of a peer that a site does not
+have, is a `LogError` that names the file (`source`).
 """
 
 import dataclasses

@@ -126,15 +126,7 @@ class Ros2SiteChannels:
         estimate = ("estimate of Eq. (24)", "kg m^2, kg m^2, kg m^2, kg m, kg m")
         if arm.chain is not None:
             estimate = ("estimate", "kg, kg m, kg m^2")
-        sent = {
-            f"{SENT_PREFIX}{vector.name}" + f"_to_{peer}" * bool(peer): ArrayChannel(
-                f"{vector.name} that the law sends to {peer or 'all'}",
-                vector.unit or "-",
-                [f"{vector.name}{n + 1}" for n in range(vector.length)],
-            )
-            for vector, peer, place in scenario.channel(site).entries(peers)
-            if not place
-        }
+        sent = _make_sent_channels(scenario, site)
         self._slow = ("tau_x", "theta_hat", *sent, "mode")
         self.arrays = {
             "error": ArrayChannel("x - x_des", "m or rad", axes)
@@ -197,6 +189,19 @@ class Ros2SiteChannels:
         offsets = [by.get(peer, math.nan) / 1e3 for peer in peers for by in (stats.offset_us, stats.bound_us)]
         yield "link_offset", arrays["link_offset"].pack(*offsets)
         yield "timing", arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
+
+
+def _make_sent_channels(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
+    """Returns a channel for each vector that a site's law sends, in the order of its record."""
+    return {
+        f"{SENT_PREFIX}{vector.name}" + f"_to_{peer}" * bool(peer): ArrayChannel(
+            f"{vector.name} that the law sends to {peer or 'all'}",
+            vector.unit or "-",
+            [f"{vector.name}{n + 1}" for n in range(vector.length)],
+        )
+        for vector, peer, place in scenario.channel(site).entries(scenario.peers(site))
+        if not place
+    }
 
 
 def _ms(us: int) -> float:
