@@ -1,75 +1,89 @@
 """An arm outside of the program: what the driver of a real robot would be, with a simulated one in its place.
 
-It stands in for the slave of `two_sites`. Its arm is heavier than the scenario's and has friction, which no
-model here knows; it is stepped by the code below and by nothing of trilat-net. Three terminals:
+It stands in for an arm of any scenario: a tenth heavier than the scenario's and with friction, which no model
+of the session knows, and somebody leans on its first joint. Three terminals:
 
     trilat site m --scenario two_sites --set sites.s.plant=external --set sites.s.arm.known=false
     trilat site s --scenario two_sites --set sites.s.plant=external --set sites.s.arm.known=false
     python examples/external_arm.py s --connect tcp/127.0.0.1:PORT    # the place that site s names
 
-`trilat record --session two_sites` in a fourth one makes a log, which `trilat verify` executes again.
+`--scenario seven_joints` makes it an arm of seven joints; `--sensor` sends the torque that it measures. A
+fourth one with `trilat record --session two_sites` makes a log, which `trilat verify` executes again.
 """
 
 import argparse
 import math
 import time
 
+import numpy as np
+
+from trilat_net.core.chain import MAX_JOINTS, build_chain, find_acceleration, place_joints
 from trilat_net.net.arm_port import ArmPort
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.arms import build_arm
 
 PERIOD_S = 0.001
-M1, M2, L1, L2, G = 1.2, 1.1, 1.0, 1.0, 9.81  # point masses at the ends of the links
-VISCOUS, COULOMB = 0.4, 0.6  # N m s/rad, N m
+HEAVIER = 1.1
+VISCOUS, COULOMB = 0.1, 0.2  # N m s/rad and N m per kg m^2 of a joint's inertia at the start
+LEAN_NM = 0.5
 
 
 class Robot:
-    """Two links with friction and a brake."""
+    """A chain of joints with friction, a brake, and sensors of the torque from outside."""
 
-    def __init__(self) -> None:
-        self.q, self.qd = [0.0, 0.0], [0.0, 0.0]
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        spec = scenario.sites[site]
+        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True)  # a planar one as a chain of two
+        assert arm.chain is not None
+        self.q, self.qd = np.array(spec.q0_rad), np.zeros(arm.counts.joints)
+        self.tau_x = np.zeros_like(self.q)
+        self._joints = build_chain(arm.chain.joints, MAX_JOINTS)
+        self._theta, self._gravity = HEAVIER * arm.theta, np.array(arm.chain.gravity_m_s2)
+        self._size = np.diag(arm.inertia(self.q))
+        self._accelerations = np.zeros_like(self.q)
+        self._moved_s = 0.0
+        self._accelerate(np.zeros_like(self.q))  # compiles
 
-    def accelerations(self, tau: tuple[float, ...], damping: float) -> tuple[float, float]:
-        """Solves the equation of motion for the accelerations of both joints."""
-        (q1, q2), (w1, w2) = self.q, self.qd
-        c2, s2 = math.cos(q2), math.sin(q2)
-        m22 = M2 * L2**2
-        m12 = m22 + M2 * L1 * L2 * c2
-        m11 = M1 * L1**2 + M2 * L1**2 + m22 + 2.0 * M2 * L1 * L2 * c2
-        h = M2 * L1 * L2 * s2
-        g2 = M2 * G * L2 * math.cos(q1 + q2)
-        g1 = (M1 + M2) * G * L1 * math.cos(q1) + g2
-        f1, f2 = (damping * w + COULOMB * math.tanh(w / 0.01) for w in (w1, w2))
-        b1 = tau[0] + h * (2.0 * w1 * w2 + w2 * w2) - g1 - f1
-        b2 = tau[1] - h * w1 * w1 - g2 - f2
-        det = m11 * m22 - m12 * m12
-        return (m22 * b1 - m12 * b2) / det, (m11 * b2 - m12 * b1) / det
+    def _accelerate(self, torque: np.ndarray) -> None:
+        place_joints(self._joints, self.q)
+        find_acceleration(
+            self._joints, self._theta, self._gravity, self.q, self.qd, torque, self._accelerations
+        )
 
     def apply(self, tau: tuple[float, ...] | None) -> None:
         """Moves on by a period under a torque; None: the brakes hold it."""
         if tau is None:
-            self.qd = [0.0, 0.0]
+            self.qd[:] = 0.0
             return
-        accelerations = self.accelerations(tau, VISCOUS)
-        self.qd = [w + PERIOD_S * a for w, a in zip(self.qd, accelerations, strict=True)]
-        self.q = [q + PERIOD_S * w for q, w in zip(self.q, self.qd, strict=True)]
+        self._moved_s += PERIOD_S
+        self.tau_x[0] = -LEAN_NM * math.sin(self._moved_s)  # the torque ON the arm is its negative
+        friction = self._size * (VISCOUS * self.qd + COULOMB * np.tanh(self.qd / 0.01))
+        self._accelerate(np.array(tau) - self.tau_x - friction)
+        self.qd += PERIOD_S * self._accelerations
+        self.q += PERIOD_S * self.qd
 
 
 def main() -> None:
     """Drives the robot until the site's run is over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("site", help="whose arm this is")
-    parser.add_argument("--session", default="two_sites")
+    parser.add_argument("--scenario", default="two_sites", help="of the session, for the arm's joints")
+    parser.add_argument("--session", help="its name, if it is not the scenario's")
     parser.add_argument("--connect", required=True, help="where that site listens")
+    parser.add_argument("--sensor", action="store_true", help="send the torque that the joints measure")
     options = parser.parse_args()
 
-    robot = Robot()
-    with ArmPort.connected(options.session, options.site, [options.connect]) as port:
+    scenario = load_scenario(options.scenario)
+    robot = Robot(scenario, options.site)
+    session = options.session or scenario.name
+    with ArmPort.connected(session, options.site, [options.connect]) as port:
         next_s = time.monotonic()
         while not port.over:
-            port.send(robot.q, robot.qd)
+            port.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())
             robot.apply(port.torque())
             next_s += PERIOD_S
             time.sleep(max(0.0, next_s - time.monotonic()))
-    print(f"over: the arm is at {robot.q[0]:.3f}, {robot.q[1]:.3f} rad")
+    print(f"over: the arm is at {', '.join(f'{q:.3f}' for q in robot.q)} rad")
 
 
 if __name__ == "__main__":

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from trilat_net.execution.virtual import execute_virtual
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
+from trilat_net.scenario import load_scenario
 
 from .processes import PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
 
@@ -53,19 +55,51 @@ def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
     session.all()
     session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
-    place = session.endpoints[2]
-    done = subprocess.run(
-        [sys.executable, str(ARM), "s", "--session", "t", "--connect", place],
-        env=PLAIN,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=True,
-    )
-    assert done.stdout.startswith("over: the arm is at ")
+    assert drive_arm(session, "two_sites").startswith("over: the arm is at ")
     session.ends_well()
     log = whole(session.log)
     executed_again(log)
     assert compare_with_virtual(log).fed.identical == 6000
     assert log["m1"].sent["target[s]"].any()
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations
+    assert not log["s"].tau_x.any()  # it measured none
+
+
+def drive_arm(session: Session, scenario: str, *options: str) -> str:
+    """Runs the program of the example until it ends; what it printed."""
+    words = ("s", "--scenario", scenario, "--session", "t", "--connect", session.endpoints[-1], *options)
+    done = subprocess.run(
+        [sys.executable, str(ARM), *words],
+        env=PLAIN,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
+    return done.stdout
+
+
+@pytest.mark.long
+def test_an_arm_of_seven_joints_that_feels_a_push_after_one_of_six_was_told_its_mistake(stage: Stage) -> None:
+    """The wrong arm goes on sending until it is ended; the right one may begin where it did not."""
+    next(execute_virtual(load_scenario("seven_joints")))  # compiles, once for all processes
+    options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "3")
+    session = Session(stage, "seven_joints", ("m1", "m2", "s"), *options)
+    session.all()
+    site = session.processes["s"]
+    site.prints("waiting for its arm on trilat/t/s/measured")
+    words = ("s", "--scenario", "six_joints", "--session", "t", "--connect", session.endpoints[-1])
+    wrong = subprocess.Popen([sys.executable, str(ARM), *words], env=PLAIN)
+    try:
+        site.prints("its arm sends measurements of 6 joints; the scenario has 7")
+    finally:
+        wrong.kill()
+        wrong.wait()
+    assert drive_arm(session, "seven_joints", "--sensor").count(",") == 6
+    session.ends_well()
+    log = whole(session.log)
+    executed_again(log)
+    assert compare_with_virtual(log).fed.identical == 9000
+    felt = log["s"].tau_x
+    assert -0.5 <= felt[:, 0].min() < -0.1  # somebody leans on the first joint with a half sine of 0.5 N m
+    assert not felt[:, 1:].any()
