@@ -13,9 +13,11 @@ from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.reporting import charts
 from trilat_net.reporting.figure_size import REPORT_SIZE, make_print_size
-from trilat_net.reporting.figures import arm_poses, joint_motion
+from trilat_net.reporting.figures import arm_poses, contact_force, joint_motion
 from trilat_net.reporting.style import arrange_joints
 from trilat_net.scenario import parse_scenario
+
+from .test_registry import misplaced
 
 SIX = """
 name = "six"
@@ -85,15 +87,54 @@ def test_panels_of_joints_fill_their_rows():
         (joint_motion.draw_control_torques, 6),
         (joint_motion.draw_parameter_estimates, 60),
         (joint_motion.draw_phase_portrait, 6),
+        (joint_motion.draw_end_effector_paths, 3),
         (arm_poses.draw_arms, None),
     ],
 )
 def test_every_joint_has_its_panel(form, draw, panels):
     figure = draw(six(), form)
     assert panels in (None, len(figure.axes))
+    assert misplaced(figure) == []
     words = " ".join(axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes)
     if panels in (6, 7):
         assert all(f"{n}: {name}" in words for n, name in enumerate(JOINTS, 1))
+
+
+def test_paths_are_those_of_the_end_effectors_in_three_planes():
+    log = six()
+    panels = joint_motion.draw_end_effector_paths(log, REPORT_SIZE).axes
+    names = [(axes.get_xlabel()[0], axes.get_ylabel()[0]) for axes in panels]
+    assert names == [("x", "y"), ("x", "z"), ("y", "z")]
+    for site, line in (("m", 0), ("s", 3)):  # a path, its ring and its disc
+        part = log[site]
+        points = arm_poses.joint_positions_m(log.scenario.arms[site], part.q[[0, -1]])[:, -1]
+        for axes, plane in zip(panels, ([0, 1], [0, 2], [1, 2]), strict=True):
+            path = axes.lines[line].get_xydata()
+            assert path[[0, -1]] == pytest.approx(points[:, plane], abs=1e-12)
+
+
+def test_the_force_of_a_wall_in_space_is_what_the_record_says_of_the_arm():
+    """Its torque is the force times what the end effector moves along the normal, by differences of poses."""
+    arm = six().scenario.arms["s"]
+    start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[0, -1]
+    normal = np.array([0.6, -0.3, 0.74])
+    wall = {"kind": "wall", "point_m": (start + 0.01 * normal).tolist(), "normal": normal.tolist()}
+    push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
+    log = simulate_scenario(parse_scenario(SIX, "six.toml", push))
+    part = log["s"]
+    force_panel, depth_panel = contact_force.draw_contact(log).axes
+    t_s, force = force_panel.lines[0].get_data()
+    rows = np.rint(t_s * part.rate_hz).astype(int)
+    assert force.max() > 5.0
+    across = normal / np.linalg.norm(normal)
+    lever = np.empty((len(rows), 6))
+    for joint, off in enumerate(1e-6 * np.eye(6)):
+        ends = [arm_poses.joint_positions_m(arm, part.q[rows] + s * off)[:, -1] for s in (1, -1)]
+        lever[:, joint] = (ends[0] - ends[1]) @ across / 2e-6
+    assert force[:, None] * lever == pytest.approx(-part.tau_x[rows], abs=1e-5)
+    at = arm_poses.joint_positions_m(arm, part.q[rows])[:, -1]
+    depth_mm = 1e3 * np.maximum((start + 0.01 * normal - at) @ across, 0.0)
+    assert depth_panel.lines[0].get_ydata() == pytest.approx(depth_mm, abs=1e-9)
 
 
 def test_columns_and_messages_name_joints_and_links():

@@ -73,7 +73,8 @@ def render_sites(log: Log, facts: JsonObject) -> str:
         counts = [str(site["records"]), str(site["missing"]), _format_numbers(site["q_end_rad"])]
         cells = [*counts, *(format_cell(site[key]) for key in motion)]
         rows.append([_label_site(log, name), *cells, _format_numbers(site["hands_moved_max_rad"])])
-    return render_html_table(headers, rows)
+    many = any(len(facts["sites"][name]["q_end_rad"] or ()) > 3 for name in log.sites)
+    return render_html_table(headers, rows, words=[3, 9] if many else [])
 
 
 def render_loops(log: Log, facts: JsonObject) -> str:

@@ -152,7 +152,7 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(chart.log ? { splits: rungs } : {}) })],
+      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs } : {}) })],
       hooks: {
         drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
         draw: chart.links ? [horizontals(lines)] : [],

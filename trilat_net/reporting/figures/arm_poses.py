@@ -166,7 +166,8 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[fl
             (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0})
             for s in log.sites
         ]
-        style.add_legend(figure, [*sites, ("desired", _DESIRED), ("base", _BASE)])
+        shadow = [] if planar else [("shadow", _SHADOW)]
+        style.add_legend(figure, [*sites, ("desired", _DESIRED), ("base", _BASE), *shadow])
     return figure
 
 
@@ -198,8 +199,13 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float = 1.0) -> str:
             drawn = pose_at(log, site, t)
             scaled = None if drawn is None else ArmPose(*(factor * points for points in drawn))
             cells.append(_render_picture(scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"))
+    note = "Gray: the shadow on a floor at the base; up is where gravity does not pull."
+    chains = any(arm.chain for arm in log.scenario.arms.values())
     columns = f"grid-template-columns: max-content repeat({len(times)}, 1fr)"
-    return f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+    return (
+        f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+        + f'<p class="note">{note}</p>' * chains
+    )
 
 
 def _render_picture(drawn: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:

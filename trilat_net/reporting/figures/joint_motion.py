@@ -6,11 +6,13 @@ those of `analysis.site_signals`.
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.site_signals import (
     SETTLED_ERROR_RAD,
     controller_torques,
@@ -40,6 +42,7 @@ _ACROSS = {"col": "row", "none": "none"}
 """What shares an axis of values if rows and columns change places."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
 """Lower end of the axis of errors, rad."""
+_PLANES = ((0, 1), (0, 2), (1, 2))
 _LOOP_PT = 0.8
 """Width of a line that crosses itself."""
 _STEP = 0.01
@@ -95,8 +98,10 @@ def _draw_joints(
             for limit in sorted({float(each[joint]) for each in limits if joint < len(each)}):
                 axes.axhline(limit, **style.LIMIT_LINE)
                 axes.axhline(-limit, **style.LIMIT_LINE)
-        for axes in panels.joints[:: panels.columns]:
-            axes.set_ylabel(label)
+        if rows == 1:
+            panels.joints[0].set_ylabel(label)
+        else:
+            plot.figure.supylabel(label, fontsize=panels.joints[0].yaxis.label.get_fontsize())
         entries = [("limit", style.LIMIT_LINE)] if limits else []
         plot.finish(panels.lowest, [*style.site_legend_entries(log, sites), *entries])
     return plot.figure
@@ -269,16 +274,11 @@ def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Fi
             plot.mark(axes, sites, numbered=False)
             link, _, symbol = name.rpartition(".")
             axes.set_title(
-                f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})", fontsize=5.5, pad=2.0
+                f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})", fontsize=5.5, pad=3.5
             )
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
             style.flatten_rounding(axes)
-            if form.narrow:  # no room for numbers beside the panels
-                axes.margins(y=0.25)
-                axes.tick_params(axis="y", pad=-2.0)
-                for number in axes.get_yticklabels():
-                    number.set(ha="left", va="bottom")
             if not index % LINK_PARAMETERS:
                 style.label_row(axes, f"{1 + index // LINK_PARAMETERS}: {link}", form)
         entries = [*style.site_legend_entries(log, sites), ("true value", style.LIMIT_LINE)]
@@ -316,11 +316,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             part, line = log[site], style.site_line(log, site, _LOOP_PT)
             e, ed = joint_errors(part), joint_error_rates(part)
             for joint, axes in enumerate(row[: e.shape[1]] if len(part) else ()):
-                path = thin_path(np.stack([e[:, joint], ed[:, joint]], axis=1))
-                axes.plot(*path.T, **line)
-                ends = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": line["color"]}
-                axes.plot(*path[0], **{**ends, "markerfacecolor": "white"}, zorder=3)
-                axes.plot(*path[-1], **ends, zorder=3)
+                _draw_path(axes, np.stack([e[:, joint], ed[:, joint]], axis=1), line)
         style.title_joints(log, row)
         for axes in row:
             axes.set_xlabel("error (rad)")
@@ -330,6 +326,37 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             axes.set_ylabel("its rate (rad/s)")
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
+
+
+def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the paths of the end effectors of chains, m, in three planes of the frame that all sites share.
+
+    A ring marks the start of a site, a disc its end.
+    """
+    places = style.arrange_joints(len(_PLANES), form.narrow)
+    height_in = 0.9 * form.width_in / len(places[0])
+    with style.styled_figure(form, 0.4 + len(places) * height_in) as figure:
+        panels = figure.subplot_mosaic([[*row] for row in places])
+        for site in log.sites:
+            part, line = log[site], style.site_line(log, site)
+            path = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd).at
+            for axes, plane in zip(panels.values() if len(part) else (), _PLANES, strict=False):
+                _draw_path(axes, path[:, plane], line)
+        for axes, (across, up) in zip(panels.values(), _PLANES, strict=True):
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)")
+            axes.locator_params(nbins=4)
+        style.add_legend(figure, style.site_legend_entries(log, log.sites))
+    return figure
+
+
+def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
+    """Draws a path, shape (K, 2), K > 0, with a ring at its start and a disc at its end."""
+    path = thin_path(path)
+    axes.plot(*path.T, **line)
+    ends = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": line["color"]}
+    axes.plot(*path[0], **{**ends, "markerfacecolor": "white"}, zorder=3)
+    axes.plot(*path[-1], **ends, zorder=3)
 
 
 def thin_path(path: Array) -> Array:

@@ -117,6 +117,11 @@ FIGURES = {
         _no_functional,
     ),
     "arms": _ReportEntry("the arms at a few instants", draw_arms),
+    "paths": _ReportEntry(
+        "paths of the end effectors in three planes",
+        joint_motion.draw_end_effector_paths,
+        _unless(lambda log: all(arm.chain for arm in log.scenario.arms.values()), "its arms are planar"),
+    ),
     "sample_age": _ReportEntry("age of the samples in use, per link", draw_sample_age),
     "delay_distributions": _ReportEntry(
         "distributions of delays and ages",
