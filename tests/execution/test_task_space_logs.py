@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.errors import LogError, ScenarioError
+from tests.task_arms import planar_task
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.figures.registry import list_drawable_figures
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.theory.operating_point import derive_operating_conditions
 
 SHORT = {"duration_s": 1.0}
@@ -33,13 +34,56 @@ def test_its_records_are_those_of_the_fused_run(log: Log) -> None:
 def test_its_error_is_that_of_the_place(log: Log) -> None:
     for part in (log[name] for name in log.sites):
         assert part.e.shape[1] == 3
-        assert np.array_equal(part.e, part.x - part.q_des)
+        followed = [0, 2] if part.name != "s" else [0, 1, 2]
+        assert np.array_equal(part.e[:, followed], (part.x - part.q_des)[:, followed])
+        assert (part.e[:, 1] == 0.0).all() or part.name == "s"
     assert np.abs(log["s"].e[-1]).max() < np.abs(log["s"].e[500]).max()
 
 
-def test_what_compares_joint_by_joint_is_refused_in_a_sentence(log: Log) -> None:
-    assert "tracking_errors" not in list_drawable_figures(log)
-    with pytest.raises(LogError, match="joint by joint"):
-        compute_log_metrics(log)
+def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
+    metrics = compute_log_metrics(log)
+    for site in log.sites:
+        own, part = metrics.sites[site], log[site]
+        assert own["rms_error_m"].value == pytest.approx(np.sqrt((part.e**2).mean(axis=0)).max())
+        assert not own["rms_error_rad"].applies
+        assert own["unaccounted_j"].value < 1e-6
+    apart = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
+    assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= apart
+    assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))
+
+
+def test_linear_analysis_says_why_it_has_none(log: Log) -> None:
     with pytest.raises(ScenarioError, match="not in task space"):
         derive_operating_conditions(log.scenario)
+
+
+TOUCH = """[[sites.m.hands]]
+kind = "tip_spring"
+to_m = [1.1, 1.3, 0.0]
+stiffness_n_m = 300
+damping_n_s_m = 20
+[[sites.s.environment]]
+kind = "wall"
+point_m = [0.8, 0.0, 0.0]
+normal = [-1.0, 0.0, 0.0]
+stiffness_n_m = 2000
+damping_n_s_m = 20
+"""
+
+
+def test_a_wall_is_felt_at_the_end_effector_as_shares_say() -> None:
+    """P+d holds e by K along each axis, so that the wrenches of two sites that rest cancel."""
+    text = planar_task(8.0)
+    head, rest = text.split("[control]")
+    text = head + '[control]\nlaw = "p_d"\nK = 60.0\nd = 12.0\n[task]' + rest.split("[task]")[1]
+    log = trilat_net.simulate(parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]")))
+    metrics = compute_log_metrics(log)
+    pair = next(one for one in metrics.sharing_ratios if one.by_wall)
+    assert (metrics.label(pair.joint), metrics.unit("N m", pair.joint)) == ("x", "N")
+    assert pair.expected_nm.value is not None
+    assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)
+    assert pair.pushed_nm == pytest.approx(-log["s"].wrench[-500:, 0].mean(), rel=1e-2)
+    assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(-pair.pushed_nm, rel=1e-2)
+    entry = next(one for one in metrics_to_json(log, metrics)["force_sharing"] if one["axis"] == "x")
+    assert entry["felt_n"] == pair.felt_nm
+    assert "felt_nm" not in entry

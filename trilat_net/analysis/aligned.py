@@ -22,7 +22,7 @@ from ..log.site_log import SiteLog, find_task_errors
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-_TASK_COLUMNS = ("x", "xd")
+_TASK_COLUMNS = ("x", "xd", "wrench")
 _NONE: Array = np.zeros((0, 0))
 
 
@@ -42,6 +42,8 @@ class AlignedRecords(NamedTuple):
         theta_hat: estimate, shape (K, P).
         used: per peer the tick of the sample in use; -1 before the first.
         x, xd: in task space the end effector's place or pose and its derivative, shape (K, m); else empty.
+        wrench: what tau_x amounts to there, likewise.
+        axes: see `SiteLog`.
     """
 
     site: str
@@ -59,6 +61,8 @@ class AlignedRecords(NamedTuple):
     used: dict[str, Ints]
     x: Array = _NONE
     xd: Array = _NONE
+    wrench: Array = _NONE
+    axes: tuple[float, ...] = ()
 
     @property
     def shared(self) -> Array:
@@ -89,7 +93,7 @@ class AlignedRecords(NamedTuple):
     @property
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
-        return find_task_errors(self.x, self.q_des) if self.x.size else self.q - self.q_des
+        return find_task_errors(self.x, self.q_des, self.axes) if self.x.size else self.q - self.q_des
 
     @property
     def ed(self) -> Array:
@@ -161,7 +165,9 @@ def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Align
             else np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
         )
     used = {peer: part.used[peer][rows][before] for peer in part.peers}
-    return AlignedRecords(part.name, part.rate_hz, first, known, follows, used=used, **columns)
+    return AlignedRecords(
+        part.name, part.rate_hz, first, known, follows, used=used, axes=part.axes, **columns
+    )
 
 
 class PeerMotion(NamedTuple):

@@ -10,14 +10,14 @@ reference velocity and its derivative are
 so that J v = -Lambda e - damping y: what is missed where the pose is nearly singular.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..core.vectors import Array
 from ..log.record_columns import Ints
-from .arm_rows import ChainArmRows
+from .arm_rows import ArmRows, PlanarArmRows
 
 Rows = slice | Ints
 _LEAST_EIGENVALUE = 1e-12
@@ -40,6 +40,10 @@ class JointFollowing(NamedTuple):
     def push(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
         """Returns the torque of a force along what sites share, shape (K, n)."""
         return force
+
+    def without_posture(self) -> "JointFollowing":
+        """Returns the same without a motion that no error asks for."""
+        return self
 
     def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Returns what damping near singular poses leaves of J r and of the reference acceleration: 0."""
@@ -94,6 +98,15 @@ class TaskFollowing:
         torque: Array = np.einsum("kij,ki->kj", self.J[rows], force)
         return torque
 
+    def project(self, torque: Array) -> Array:
+        """Returns what a torque of every row amounts to at the end effector, shape (K, m), N."""
+        return self._solve(slice(None), np.einsum("kij,kj->ki", self.J, torque))
+
+    def without_posture(self) -> "TaskFollowing":
+        """Returns the same without a motion that no error asks for: linear in e and ed."""
+        still = np.zeros_like(self.psi)
+        return replace(self, psi=still, psi_rate=still)
+
     def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:
         """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing is damped."""
         damping, rate = self.damping[rows, np.newaxis], self.damping_rate[rows, np.newaxis]
@@ -106,10 +119,11 @@ class TaskFollowing:
 Following = JointFollowing | TaskFollowing
 
 
-def follow_with_end_effector(arm: ChainArmRows, q: Array, qd: Array, Lambda: Array) -> TaskFollowing:
-    """Returns how a site follows in task space along rows of its joints, shape (K, n)."""
+def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
+    """Returns how a site follows along rows of its joints, shape (K, n)."""
     task = arm.task
-    assert task is not None
+    if isinstance(arm, PlanarArmRows) or task is None:
+        return JointFollowing(Lambda)
     place = arm.place_end_effector(q, qd)
     axes = np.array(task.axes)[:, np.newaxis]
     J, Jd = (axes * task.scale * x for x in (place.J, arm.jacobian_rate(q, qd)))

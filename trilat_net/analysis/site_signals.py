@@ -15,7 +15,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 
 SETTLED_ERROR_RAD = 1e-2
-"""A site has settled once no joint's error exceeds this any more, rad."""
+"""A site has settled once no joint's error exceeds this any more, rad, or none along an axis, m."""
 
 
 Signal = Callable[[SiteLog], Array]
@@ -36,13 +36,18 @@ def reference_angles(part: SiteLog) -> Array:
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """True if sites follow with their end effectors: then no joint has an error of its own."""
+    """True if sites follow with their end effectors: an axis has an error then, and no joint."""
     return any(arm.shares_pose for arm in log.scenario.arms.values())
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s."""
-    return part.qd - part.qd_des
+    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s; in task space xd - xd_des, shape (K, m)."""
+    return (part.xd - part.qd_des) * np.array(part.axes) if part.layout.task else part.qd - part.qd_des
+
+
+def shared_unit(log: Log) -> str:
+    """Returns the unit of what sites share and of their errors: "rad", "m", or of poses both."""
+    return {"joints": "rad", "position": "m"}.get(log.scenario.sites[log.sites[0]].task.space, "m, rad")
 
 
 def external_torques(part: SiteLog) -> Array:

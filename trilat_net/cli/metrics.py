@@ -76,12 +76,14 @@ def _print_group(
 
 def _print_statics(found: "LogMetrics") -> None:
     if found.sharing_ratios:
-        heads = ("at rest", "joint", "ON the arm of", "N m", "felt at", "N m", "expected", "off")
+        joint, nm = ("axis", found.unit("N m", 1)) if found.axes else ("joint", "N m")
+        heads = ("at rest", joint, "ON the arm of", nm, "felt at", nm, "expected", "off")
         rows = []
         for pair in found.sharing_ratios:
             pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
             off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %"
-            row = [f"{pair.from_s:.1f} - {pair.to_s:.1f} s", str(pair.joint), pushed, _number(pair.pushed_nm)]
+            when, which = f"{pair.from_s:.1f} - {pair.to_s:.1f} s", found.label(pair.joint)
+            row = [when, which, pushed, _number(pair.pushed_nm)]
             rows.append([*row, pair.holds, _number(pair.felt_nm), _cell(pair.expected_nm), off])
         _print(heads, rows, words=1)
         for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
@@ -91,9 +93,11 @@ def _print_statics(found: "LogMetrics") -> None:
         rows = []
         for one in found.stiffness:
             stiffness = _NO_NUMBER if one.stiffness_nm_rad is None else _number(one.stiffness_nm_rad)
-            row = [f"{one.from_s:.1f} to {one.to_s:.1f} s", str(one.joint), one.site]
+            row = [f"{one.from_s:.1f} to {one.to_s:.1f} s", found.label(one.joint), one.site]
             rows.append([*row, _number(one.torque_nm), _number(one.angle_rad), stiffness])
-        _print(("stiffness felt", "joint", "by", "N m more", "rad further", "N m/rad"), rows, words=1)
+        nm, rad, ratio = (found.unit(unit, 1) for unit in ("N m", "rad", "N m/rad"))
+        joint = "axis" if found.axes else "joint"
+        _print(("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio), rows, words=1)
 
 
 def _print_impedance(found: "LogMetrics") -> None:
@@ -102,10 +106,11 @@ def _print_impedance(found: "LogMetrics") -> None:
         return
     rows = []
     for one in found.responses:
-        what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, joint {one.joint}"
+        where = f"{'along' if found.axes else 'joint'} {found.label(one.joint)}"
+        what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, {where}"
         step = -(-len(one.spectrum) // _MAX_LINES) or 1
         for n, ratio in enumerate(one.spectrum[::step] if len(one.spectrum) > 1 else [one.ratio]):
-            head = ["" if n else what, one.unit]
+            head = ["" if n else what, found.unit(one.unit, one.joint)]
             if ratio.gain is None:
                 rows.append([*head, "", "", "", "", ratio.why])
                 continue

@@ -113,14 +113,9 @@ def compare_site_rerun(
     """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
     before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
-    after = SiteLog(
-        site.name,
-        before.peers,
-        rate_hz,
-        [tick.payload for tick in executed],
-        "rerun",
-        layout=request.scenario.layout(site.name),
-    )
+    payloads, layout = [tick.payload for tick in executed], request.scenario.layout(site.name)
+    axes = request.scenario.arms[site.name].axes
+    after = SiteLog(site.name, before.peers, rate_hz, payloads, "rerun", layout=layout, axes=axes)
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     last = executed[-1] if executed else None
     effect = SiteEffect(

@@ -240,8 +240,9 @@ class Log:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
             peers, layout = self.scenario.peers(site), self.scenario.layout(site)
-            sent = self.scenario.channel(site)
-            part = SiteLog(site, peers, rate_hz, channel.payloads, self.source, times, layout, sent)
+            sent, axes = self.scenario.channel(site), self.scenario.arms[site].axes
+            payloads, source = channel.payloads, self.source
+            part = SiteLog(site, peers, rate_hz, payloads, source, times, layout, sent, axes)
             most, last = self.scenario.ticks(site), part.last_tick
             if last >= most:  # a tick of others is nothing to count up to
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")

@@ -43,14 +43,18 @@ _PLACE = 3
 """Numbers of an end effector's place; those of its orientation follow."""
 
 
-def find_task_errors(x: Array, x_des: Array) -> Array:
-    """Returns x - x_des of places, and of orientations the turn from one to the other, shape (K, m)."""
+def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
+    """Returns x - x_des of places, and of orientations the turn from one to the other, shape (K, m).
+
+    It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
+    """
     e: Array = x - x_des
     if e.shape[1] > _PLACE and len(e):
         from scipy.spatial.transform import Rotation  # a fifth of a second, which few logs need
 
         here, there = (Rotation.from_rotvec(v[:, _PLACE:]) for v in (x, x_des))
         e[:, _PLACE:] = (here * there.inv()).as_rotvec()
+    e *= np.array(axes)
     return e
 
 
@@ -161,6 +165,7 @@ class SiteLog:
         times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
         layout: how many numbers the vectors of its records have; n joints, m shared, P parameters.
         channel: what the site's law sends to its peers.
+        axes: in task space per coordinate 1 if the site follows along it, else 0.
 
     Attributes:
         payloads: the records as published, in tick order.
@@ -181,9 +186,10 @@ class SiteLog:
         times: tuple[Ints, Ints] | None = None,
         layout: Layout = Layout(),  # noqa: B008
         channel: LawChannel = LawChannel(),  # noqa: B008
+        axes: tuple[float, ...] = (),
     ) -> None:
         self.channel = channel
-        self.name, self.peers, self.rate_hz, self.layout = name, peers, rate_hz, layout
+        self.name, self.peers, self.rate_hz, self.layout, self.axes = name, peers, rate_hz, layout, axes
         self._source = source
         self.payloads = payloads
         self.tick = self._read(record_columns.decode_ticks)
@@ -291,7 +297,7 @@ class SiteLog:
 
         The error of an orientation is the turn from the reference to the end effector, rad.
         """
-        return find_task_errors(self.x, self.q_des) if self.layout.task else self.q - self.q_des
+        return find_task_errors(self.x, self.q_des, self.axes) if self.layout.task else self.q - self.q_des
 
     @cached_property
     def sent(self) -> dict[str, Array]:

@@ -5,7 +5,7 @@ third of their length as text.
 """
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -95,9 +95,9 @@ class Charts:
             tables = self._tables_of(site_signals.external_torques, operated)
             yield from self._per_joint("torques", "operator torque on the arm", "N m", tables)
         yield from self._positions()
-        if not site_signals.follows_in_task_space(log):
-            tables = self._tables_of(site_signals.joint_errors)
-            yield from self._per_joint("errors", "tracking error", "rad", tables)
+        tables, unit = self._tables_of(site_signals.joint_errors), site_signals.shared_unit(log)
+        axes = style.name_shared(log) if site_signals.follows_in_task_space(log) else self._titles
+        yield from self._per_joint("errors", "tracking error", unit, tables, axes)
         yield from self._estimates()
         if self._twin is not None:
             moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites}
@@ -122,9 +122,14 @@ class Charts:
         return [self._series(site, self._table(site, tick, t_s, one[:, np.newaxis]), 0) for one in values.T]
 
     def _per_joint(
-        self, section: str, title: str, unit: str, tables: dict[str, list[JsonObject]]
+        self,
+        section: str,
+        title: str,
+        unit: str,
+        tables: dict[str, list[JsonObject]],
+        titles: Sequence[str] = (),
     ) -> Iterator[JsonObject]:
-        for joint, name in enumerate(self._titles):
+        for joint, name in enumerate(titles or self._titles):
             series = [columns[joint] for columns in tables.values() if joint < len(columns)]
             yield _chart(section, f"{title}, {name}", unit, series)
 

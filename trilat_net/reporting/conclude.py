@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.site_signals import shared_unit
 from ..errors import LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import CheckLine, check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
@@ -70,7 +71,8 @@ def conclude(
         made = write_report(
             log, folder, twin=twin, certificate=certificate, verdicts=verdicts(), progress=progress
         )
-    table = TextTable(_HEADERS, [_site_row(log, site) for site in log.sites], align="lr")
+    heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
+    table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
     return Conclusion(table, notes, lines, [*map(Path, log.sources), *made])
 
 
@@ -86,13 +88,13 @@ def _run_without_operators(log: Log) -> Log | None:
         return None
 
 
-_HEADERS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99", "max|e| end rad")
+_HEADERS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _site_row(log: Log, site: str) -> tuple[str, ...]:
     part = log[site]
     if not len(part):
-        return (site, "0", *("",) * (len(_HEADERS) - 2))
+        return (site, "0", *("",) * (len(_HEADERS) - 1))
     missing = max(log.last_ticks[site], part.last_tick) + 1 - len(part)
     late = np.percentile(part.late_us, (50, 99, 100))
     busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)

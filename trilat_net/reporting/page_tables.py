@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.json_values import JsonObject
+from ..analysis.site_signals import shared_unit
 from ..execution.log_checks import CheckLine
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario
@@ -43,9 +44,10 @@ def render_description(scenario: Scenario) -> str:
 def render_run_facts(log: Log, facts: JsonObject) -> str:
     """Returns the table of the run."""
     scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
+    unit = shared_unit(log)
     settled = "not within the run"
     if facts["settle_s"] is not None:
-        settled = f"every |e| below {facts['settle_below_rad']:g} rad from {facts['settle_s']:.3f} s on"
+        settled = f"every |e| below {facts['settle_below_rad']:g} {unit} from {facts['settle_s']:.3f} s on"
     dominance = "; ".join(
         f"{site} follows " + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
         for site, shares in scenario.dominance.items()
@@ -55,7 +57,7 @@ def render_run_facts(log: Log, facts: JsonObject) -> str:
         ("driven by", _describe_driver(log)),
         ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}"),
         ("records", f"{facts['records']}, {facts['missing']} missing{torn}"),
-        ("largest error at the end", f"{format_cell(facts['max_error_end_rad'])} rad in the last second"),
+        ("largest error at the end", f"{format_cell(facts['max_error_end_rad'])} {unit} in the last second"),
         ("settled", settled),
         ("dominance", dominance),
         ("diverged", "yes" if facts["diverged"] else "no"),
@@ -64,7 +66,8 @@ def render_run_facts(log: Log, facts: JsonObject) -> str:
 
 def render_sites(log: Log, facts: JsonObject) -> str:
     """Returns the table of the sites: their records and their motion."""
-    headers = ["site", "records", "missing", "q at the end (rad)", "max |e| (rad)", "max |e|, last 1 s (rad)"]
+    error = [f"max |e| ({shared_unit(log)})", f"max |e|, last 1 s ({shared_unit(log)})"]
+    headers = ["site", "records", "missing", "q at the end (rad)", *error]
     headers += ["settled (s)", "max |τ| (N\u00a0m)", "ticks at the limit", "moved by operators, max (rad)"]
     motion = ("max_error_rad", "max_error_end_rad", "settle_s", "peak_tau_nm", "saturated_ticks")
     rows = []

@@ -26,6 +26,7 @@ from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
+from ..scenario.arms import TASK_AXES
 from .figure_size import REPORT_SIZE, FigureSize
 
 AxesGrid = NDArray[np.object_]
@@ -153,9 +154,15 @@ def name_joints(log: Log) -> list[str]:
     return [title + " (m, N)" * (unit == "m") for title, unit in zip(titles, units, strict=True)]
 
 
-def title_joints(log: Log, row: Sequence[Axes]) -> None:
-    """Titles panels, one per joint."""
-    for title, axes in zip(name_joints(log), row, strict=True):
+def name_shared(log: Log) -> list[str]:
+    """Returns the titles of what sites share: joints, or axes of the task."""
+    arm = log.scenario.arms[log.sites[0]]
+    return [*TASK_AXES[: arm.counts.shared]] if arm.shares_pose else name_joints(log)
+
+
+def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
+    """Titles panels, one per joint, or with other titles."""
+    for title, axes in zip(titles or name_joints(log), row, strict=True):
         axes.set_title(title)
 
 

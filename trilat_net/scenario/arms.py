@@ -196,6 +196,12 @@ class ArmModel(NamedTuple):
         """True if its site follows with the end effector, in task space."""
         return self.chain is not None and self.chain.task is not None
 
+    @property
+    def axes(self) -> tuple[float, ...]:
+        """Per coordinate of the task 1 if its site follows along it, else 0; () in joint space."""
+        task = None if self.chain is None else self.chain.task
+        return () if task is None else task.axes
+
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
         """Returns what a site shares of a pose: its joint angles, or its end effector's place or pose."""
         if self.chain is None or self.chain.task is None:

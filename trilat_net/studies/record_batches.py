@@ -77,8 +77,8 @@ class BatchedRun(NamedTuple):
 class _PendingRecords:
     """Records of one site that were not passed on yet."""
 
-    def __init__(self, take: Callable[[RecordBatch], None]) -> None:
-        self._take = take
+    def __init__(self, take: Callable[[RecordBatch], None], axes: Sequence[float]) -> None:
+        self._take, self._axes = take, axes
         self._t_ns, self._used, self._floats = array("q"), array("q"), array("d")
         self._lengths: tuple[int, ...] = ()
 
@@ -102,7 +102,7 @@ class _PendingRecords:
         rows = np.array(self._floats).reshape(len(t_ns), -1)
         vectors = np.split(rows, np.cumsum(self._lengths)[:-1], axis=1)
         q, qd, q_des, tau, tau_x, x = map(np.ascontiguousarray, vectors)
-        e = find_task_errors(x, q_des) if x.size else q - q_des
+        e = find_task_errors(x, q_des, self._axes) if x.size else q - q_des
         self._take(RecordBatch(t_ns, q, qd, e, tau, tau_x, used))
         for column in (self._t_ns, self._used, self._floats):
             del column[:]
@@ -110,7 +110,7 @@ class _PendingRecords:
 
 def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]) -> BatchedRun:
     """Runs a scenario in virtual time and passes every site's records on, batch by batch."""
-    pending = {name: _PendingRecords(taker) for name, taker in take.items()}
+    pending = {name: _PendingRecords(taker, scenario.arms[name].axes) for name, taker in take.items()}
     sites: dict[str, Site] = {}
     diverged_at_s: float | None = None
     with process.pause_gc():

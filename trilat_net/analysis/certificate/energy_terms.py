@@ -26,9 +26,9 @@ from ...log.record_columns import Ints
 from ...scenario import Scenario, SiteSpec
 from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
-from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
+from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
-from ..following import Following, JointFollowing, follow_with_end_effector
+from ..following import Following, follow_rows
 from ..torque_sources import TorqueSplit
 
 
@@ -151,9 +151,7 @@ class SiteMotion:
     def follows(self) -> Following:
         """How an error of the reference becomes motion and torque of the joints."""
         at, c = self.records, self.constants
-        if isinstance(c.arm, PlanarArmRows) or c.arm.task is None:
-            return JointFollowing(c.Lambda)
-        return follow_with_end_effector(c.arm, at.q, at.qd, c.Lambda)
+        return follow_rows(c.arm, at.q, at.qd, c.Lambda)
 
     @cached_property
     def r(self) -> Array:

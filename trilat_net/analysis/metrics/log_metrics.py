@@ -13,10 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import LogError
+from ...core.task_space import PLACE
 from ...log.log_reader import Log
+from ...scenario import Scenario
+from ...scenario.arms import TASK_AXES
 from ..aligned import align_records
+from ..arm_rows import build_arm_rows
 from ..dominance_history import trace_dominance
+from ..following import JointFollowing, follow_rows
 from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
 from ..site_signals import follows_in_task_space
@@ -74,6 +78,10 @@ def measure_loop(log: Log, site: str) -> MetricValues:
     }
 
 
+_ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
+"""Units along an axis in place of those of a joint."""
+
+
 class LogMetrics(NamedTuple):
     """All metrics of a log.
 
@@ -84,6 +92,7 @@ class LogMetrics(NamedTuple):
         joint_loads: the loaded joints in them, with the torques of all loaded sites.
         sharing_ratios: the force sharing of those at which two sites are loaded.
         responses: impedances and reflections over frequency.
+        axes: names of what sites share in task space, where a joint's number is that of an axis; else ().
     """
 
     run: MetricValues
@@ -96,6 +105,15 @@ class LogMetrics(NamedTuple):
     sharing_ratios: list[SharingRatio]
     stiffness: list[StiffnessEstimate]
     responses: list[ImpedanceEstimate]
+    axes: tuple[str, ...] = ()
+
+    def label(self, number: int) -> str:
+        """Returns what the number of a joint stands for, from 1: "1", or the name of an axis."""
+        return self.axes[number - 1] if self.axes else str(number)
+
+    def unit(self, of_joint: str, number: int) -> str:
+        """Returns the unit of a joint's quantity, or of that along an axis of a place."""
+        return _ALONG_AXES.get(of_joint, of_joint) if self.axes and number <= PLACE else of_joint
 
     def places(self, quantity: Quantity) -> dict[str, Metric]:
         """Returns a quantity of every place that has it; of the run by the name ""."""
@@ -131,10 +149,6 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 
 
 def _measure(log: Log) -> LogMetrics:
-    if follows_in_task_space(log):
-        raise LogError(
-            f"{log.scenario.name}: its sites follow in task space, and metrics compare joint by joint"
-        )
     scenario, specs = log.scenario, log.scenario.sites
     runs = {
         site: SiteRun(own, attribute_torque(own, scenario), trace_dominance(log, site, own.t_s))
@@ -142,7 +156,8 @@ def _measure(log: Log) -> LogMetrics:
     }
     absent = [site for site in log.sites if site not in runs]
     estimates = {site: motion.read_parameter_estimates(scenario, run.records) for site, run in runs.items()}
-    windows = [] if absent else static_windows.find_static_windows(runs)
+    shared = {site: _view_shared(scenario, run) for site, run in runs.items()}
+    windows = [] if absent else static_windows.find_static_windows(shared)
     loads = static_windows.find_joint_loads(scenario, windows)
     ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
     return LogMetrics(
@@ -169,8 +184,32 @@ def _measure(log: Log) -> LogMetrics:
         loads,
         ratios,
         static_windows.estimate_stiffness(windows),
-        estimate_impedances(runs),
+        estimate_impedances(shared),
+        TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
     )
+
+
+def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
+    """Returns a site's run as what sites share: in task space places for angles, and forces for torques.
+
+    What an operator was to do is turned into forces in the first pose, so that what stands still does.
+    """
+    records, torque, dominance = run
+    arm = build_arm_rows(scenario, records.site)
+    follows = follow_rows(arm, records.q, records.qd, np.array(records.axes))
+    if isinstance(follows, JointFollowing):
+        return run
+    axes, script = np.array(records.axes), torque.script
+    forces = torque._replace(
+        operator_now=follows.project(torque.operator_now),
+        operator_held=follows.project(torque.operator_held),
+        environment_now=follows.project(torque.environment_now),
+        environment_held=follows.project(torque.environment_held),
+    )
+    if script is not None:
+        script = script @ (follows.inverse[0] @ follows.J[0]).T
+    places = records._replace(q=axes * records.x, qd=axes * records.xd, tau_x=axes * records.wrench)
+    return SiteRun(places, forces._replace(script=script), dominance)
 
 
 def _measure_site(
@@ -219,7 +258,11 @@ def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
     """Returns what is no single number: loads, force sharing, stiffness, responses."""
-    return {
+
+    def units(one: ImpedanceEstimate) -> str:
+        return metrics.unit(one.unit, one.joint)
+
+    found = {
         "levers": [
             load._asdict() | {"weight": _values(load.weight)} | _value_and_why("imbalance", load.imbalance)
             for load in metrics.joint_loads
@@ -232,12 +275,26 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         "felt": [
             {
                 **one._asdict(),
-                "ratio": _response_to_json(one.ratio, one.unit),
-                "spectrum": [_response_to_json(line, one.unit) for line in one.spectrum],
+                "ratio": _response_to_json(one.ratio, units(one)),
+                "spectrum": [_response_to_json(line, units(one)) for line in one.spectrum],
             }
             for one in metrics.responses
         ],
     }
+    if not metrics.axes:
+        return found
+    return {name: [_name_axis(metrics, one) for one in entries] for name, entries in found.items()}
+
+
+def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
+    """Returns an entry of a joint as that of an axis: with its name, and keys that end in other units."""
+    number = entry.pop("joint")
+    endings = (("_nm_rad", "_n_m"), ("_nm", "_n"), ("_rad", "_m")) if number <= PLACE else ()
+    renamed = {}
+    for key, value in entry.items():
+        ending = next((pair for pair in endings if key.endswith(pair[0])), ("", ""))
+        renamed[key.removesuffix(ending[0]) + ending[1]] = value
+    return {"axis": metrics.label(number), **renamed}
 
 
 def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:

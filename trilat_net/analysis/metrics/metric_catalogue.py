@@ -5,11 +5,13 @@ docs/metrics.md.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.task_space import PLACE
 from ..aligned import AlignedRecords
 from ..dominance_history import DominanceHistory
 from ..torque_sources import TorqueSplit
@@ -48,6 +50,22 @@ def metric(value: float | None, why: str = "it is no finite number") -> Metric:
 def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
     """Returns the quantities of a group, or those of it that are `of` a kind of place, without a number."""
     return {q.key: Metric(None, why, applies) for q in QUANTITIES if q.group == group and of in ("", q.of)}
+
+
+def measure_shared(group: str, space: str, measure: Callable[[slice], dict[str, Metric]]) -> MetricValues:
+    """Returns the quantities of a group of what sites share: angles, rad, or places, m, or both of a pose.
+
+    `measure` takes the columns of what is shared, and gives the quantities by their keys without the unit.
+    """
+    found = unavailable(group, "sites share angles, not places", applies=False)
+    if space == "joints":
+        parts = [("rad", slice(None))]
+    else:
+        found = unavailable(group, "sites share places, not angles", applies=False)
+        parts = [("m", slice(0, PLACE)), ("rad", slice(PLACE, None))][: 1 + (space == "pose")]
+    for unit, columns in parts:
+        found |= {f"{key}_{unit}": one for key, one in measure(columns).items()}
+    return found
 
 
 def rms(values: ArrayLike) -> float:
@@ -93,12 +111,21 @@ QUANTITIES = (
     Quantity("rms_error_rad", "site", TRACKING, "RMS e", "rad"),
     Quantity("max_error_rad", "site", TRACKING, "peak |e|", "rad"),
     Quantity("max_error_end_rad", "site", TRACKING, "peak |e|, last 1 s", "rad"),
+    Quantity("rms_error_m", "site", TRACKING, "RMS e", "m"),
+    Quantity("max_error_m", "site", TRACKING, "peak |e|", "m"),
+    Quantity("max_error_end_m", "site", TRACKING, "peak |e|, last 1 s", "m"),
     Quantity("spread_rms_rad", "run", SPREAD, "RMS spread, undelayed", "rad"),
     Quantity("spread_max_rad", "run", SPREAD, "largest spread", "rad"),
     Quantity("spread_end_rad", "run", SPREAD, "largest spread, last 1 s", "rad"),
+    Quantity("spread_rms_m", "run", SPREAD, "RMS spread, undelayed", "m"),
+    Quantity("spread_max_m", "run", SPREAD, "largest spread", "m"),
+    Quantity("spread_end_m", "run", SPREAD, "largest spread, last 1 s", "m"),
     Quantity("following_rms_rad", "link", FOLLOWING, "RMS q_m(t-T) - q_s", "rad"),
     Quantity("following_max_rad", "link", FOLLOWING, "peak |q_m(t-T) - q_s|", "rad"),
     Quantity("following_end_rad", "link", FOLLOWING, "the same, last 1 s", "rad"),
+    Quantity("following_rms_m", "link", FOLLOWING, "RMS x_m(t-T) - x_s", "m"),
+    Quantity("following_max_m", "link", FOLLOWING, "peak |x_m(t-T) - x_s|", "m"),
+    Quantity("following_end_m", "link", FOLLOWING, "the same, last 1 s", "m"),
     Quantity("effort_nm2_s", "site", EFFORT, "effort, int |tau|^2", "N²m²s", "sum"),
     Quantity("rms_tau_nm", "site", EFFORT, "RMS tau", "N m"),
     Quantity("peak_tau_nm", "site", EFFORT, "peak |tau|", "N m"),

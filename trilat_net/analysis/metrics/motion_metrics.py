@@ -16,6 +16,7 @@ from ...core.exogenous import TorqueSource
 from ...core.site_setup import Law
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...log.site_log import find_task_errors
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
@@ -34,6 +35,7 @@ from .metric_catalogue import (
     Metric,
     MetricValues,
     SiteRun,
+    measure_shared,
     metric,
     peak,
     rms,
@@ -49,43 +51,58 @@ def measure_tracking(log: Log, site: str) -> MetricValues:
     part = log[site]
     if not len(part):
         return unavailable(TRACKING, f"no records of {site}")
-    errors = site_signals.joint_errors(part)
-    unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} rad in the last record"
+    e, space = site_signals.joint_errors(part), log.scenario.sites[site].task.space
+    unit = "rad" if space == "joints" else "m" if space == "position" else "m or rad"
+    unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
+
+    def measure(columns: slice) -> MetricValues:
+        errors = e[:, columns]
+        return {
+            "rms_error": metric(rms(errors)),
+            "max_error": metric(peak(errors)),
+            "max_error_end": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
+        }
+
     return {
+        **measure_shared(TRACKING, space, measure),
         "settle_s": metric(site_signals.settling_time_s(part), unsettled),
-        "rms_error_rad": metric(rms(errors)),
-        "max_error_rad": metric(peak(errors)),
-        "max_error_end_rad": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
     }
 
 
 def measure_spread(log: Log, runs: Mapping[str, SiteRun]) -> MetricValues:
     """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
 
-    Instants are the ticks of the first site at which every other site has its own latest tick recorded.
+    In task space between their places, along axes that all follow. Instants are the ticks of the first site
+    at which every other site has its own latest tick recorded.
     """
     absent = [site for site in log.sites if site not in runs]
     if absent:
         return unavailable(SPREAD, f"no records of {', '.join(absent)}")
-    if len({run.records.q.shape[1] for run in runs.values()}) > 1:
-        return unavailable(SPREAD, "its arms have different joints", applies=False)
     first = runs[log.sites[0]].records
     known, poses = first.known.copy(), []
     for records in (run.records for run in runs.values()):
         row, recorded = find_latest_rows(records, first.t_s)
         known &= recorded
-        poses.append(records.q[row])
+        poses.append(records.shared[row])
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
-    spread = np.ptp(np.stack(poses)[:, known], axis=0)
+    apart = np.ptp(np.stack(poses)[:, known], axis=0)
+    axes = [run.records.axes for run in runs.values()]
+    if all(axes):
+        apart = apart * np.prod(axes, axis=0)
     end_s = min(float(run.records.t_s[-1]) for run in runs.values())
-    last = spread[first.t_s[known] > end_s - END_WINDOW_S]
+    last = first.t_s[known] > end_s - END_WINDOW_S
     none = "no instant of the last second of which every site has a record"
-    return {
-        "spread_rms_rad": metric(rms(spread)),
-        "spread_max_rad": metric(peak(spread)),
-        "spread_end_rad": metric(peak(last), none),
-    }
+
+    def measure(columns: slice) -> MetricValues:
+        spread = apart[:, columns]
+        return {
+            "spread_rms": metric(rms(spread)),
+            "spread_max": metric(peak(spread)),
+            "spread_end": metric(peak(spread[last]), none),
+        }
+
+    return measure_shared(SPREAD, log.scenario.sites[log.sites[0]].task.space, measure)
 
 
 def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
@@ -100,22 +117,24 @@ def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: st
     if absent:
         return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
     master, slave = runs[peer].records, runs[site].records
-    if master.q.shape[1] != slave.q.shape[1]:
-        return unavailable(FOLLOWING, "its arms have different joints", applies=False)
     row = slave.used[peer] - master.first
     inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
     row = np.clip(row, 0, len(master.known) - 1)
     known = slave.known & inside & master.known[row]
     if not known.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
-    off = (master.q[row] - slave.q)[known]
-    return {
-        "following_rms_rad": metric(rms(off)),
-        "following_max_rad": metric(peak(off)),
-        "following_end_rad": metric(
-            peak(off[slave.known_at_end(END_WINDOW_S)[known]]), "no sample in the last second"
-        ),
-    }
+    there = master.shared[row]
+    apart = find_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
+    off, last = apart[known], slave.known_at_end(END_WINDOW_S)[known]
+
+    def measure(columns: slice) -> MetricValues:
+        return {
+            "following_rms": metric(rms(off[:, columns])),
+            "following_max": metric(peak(off[:, columns])),
+            "following_end": metric(peak(off[last, columns]), "no sample in the last second"),
+        }
+
+    return measure_shared(FOLLOWING, log.scenario.sites[site].task.space, measure)
 
 
 def measure_effort(log: Log, site: str) -> MetricValues:

@@ -19,6 +19,7 @@ from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
 from ..arm_rows import ArmRows, build_arm_rows
+from ..following import follow_rows
 from .metric_catalogue import ENERGY, Metric, MetricValues, SiteRun, metric, unavailable
 
 _NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
@@ -137,17 +138,20 @@ def _delay_torque(
     late = view.seen.q - view.now.q
     off = alpha * late
     off_rate = alpha * (view.seen.qd - view.now.qd) + rate * late
+    every, axes = slice(None), np.array(records.axes or 1.0)
+    follows = follow_rows(arm, records.q, records.qd, axes * np.array(gains.Lambda)).without_posture()
+    Kd = axes * np.array(gains.Kd)
     if gains.law is Law.ADAPTIVE:
-        Lambda = np.array(gains.Lambda)
-        model = arm.weightless()
-        torque = model.law_torque(records.theta_hat, records.q, records.qd, Lambda * off, Lambda * off_rate)
-        added: Array = torque + np.array(gains.Kp) * Lambda * off + np.array(gains.Kd) * off_rate
+        v, a = follows.reference(every, -off, -off_rate)
+        torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
+        added: Array = torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
         return added
-    added = np.array(gains.K) * off + np.array(gains.Kd) * off_rate
+    pull = axes * np.array(gains.K) * off + Kd * off_rate
     if np.any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
         used = records.used[other.site]
         row = np.clip(used - other.first, 0, len(other.known) - 1)
-        came = np.where((used >= 0)[:, None], -other.tau_x[row], 0.0)
-        now = [np.interp(records.t_s, other.t_s, -column) for column in other.tau_x.T]
-        added = added + np.array(gains.k_f) * alpha * (came - np.stack(now, axis=1))
-    return added
+        pushed = other.wrench if other.wrench.size else other.tau_x
+        came = np.where((used >= 0)[:, None], -pushed[row], 0.0)
+        now = [np.interp(records.t_s, other.t_s, -column) for column in pushed.T]
+        pull = pull + axes * np.array(gains.k_f) * alpha * (came - np.stack(now, axis=1))
+    return follows.push(every, pull)

@@ -224,7 +224,7 @@ def _weigh_load(
     if isinstance(weights, str):
         why = Metric(None, weights)
         return JointLoad(window.from_s, window.to_s, joint + 1, torque, dict.fromkeys(torque, why), why)
-    column = weights[:, joint] / weights[:, joint].max()
+    column = weights[:, joint] / np.nanmax(weights[:, joint])
     weight = dict(zip(window.torque, column.tolist(), strict=True))
     moments = [weight[site] * value for site, value in torque.items()]
     largest = max(map(abs, moments))
@@ -292,10 +292,13 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     if np.any(gains.k_f):
         return none, "it reflects force: e is not all that its law goes by"
     adaptive, gravity = gains.law is Law.ADAPTIVE, arm.gravity_parameters
+    if adaptive and arm.task is not None:
+        return none, "in task space what holds the e of this law changes with the pose: J+'Kp J+ Lambda"
     estimate = np.array(gains.theta_hat0 if adaptive else gains.known)
     if adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
         return none, "gravity is learnt: the estimates take up the load"
     if np.any((estimate != arm.theta) & gravity) and spec.arm.g_m_s2 > 0.0:
         return none, "gravity is not known exactly"
     K = np.array(gains.Kp) * np.array(gains.Lambda) if adaptive else np.array(gains.K)
-    return K, "" if (K > 0.0).all() else "nothing holds its e"
+    free = np.array(scenario.arms[site].axes or 1.0) == 0.0
+    return np.where(free, np.nan, K), "" if ((K > 0.0) | free).all() else "nothing holds its e"

@@ -253,7 +253,8 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     there = [*zip(*(m.q_des for m in records), strict=True)]
     error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)]
     if len(error) > PLACE and task:
-        error = find_task_errors(*(np.array(columns).T for columns in (here, there))).T.tolist()
+        x, x_des = (np.array(columns).T for columns in (here, there))
+        error = find_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]

@@ -25,6 +25,7 @@ from ...analysis.site_signals import (
     parameter_estimates,
     reference_angles,
     settling_time_s,
+    shared_unit,
     sites_with_operator,
     true_parameters,
 )
@@ -179,18 +180,19 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it settles.
 
-    The lowest panel shows, at every time, the largest error of any joint that is still to come: where it
-    crosses the dashed line, the site has settled.
+    In task space it is that of the place along each axis, m. The lowest panel shows, at every time, the
+    largest error of any joint that is still to come: where it crosses the dashed line, the site has settled.
     """
-    count = len(style.name_joints(log))
+    titles, unit = style.name_shared(log), shared_unit(log)
+    count = len(titles)
     rows = len(style.arrange_joints(count, form.narrow))
     with time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
         panels = style.add_joint_panels(plot.figure, count, form, below=["all"])
         settling = panels.wide["all"]
-        style.title_joints(log, panels.joints)
+        style.title_joints(log, panels.joints, titles)
         plot.joint_row(panels.joints, log.sites, site_records(log, joint_errors))
         for axes in panels.joints[:: panels.columns]:
-            axes.set_ylabel("tracking error (rad)")
+            axes.set_ylabel(f"tracking error ({unit})")
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             remaining = largest_remaining_error(log[site])
@@ -198,9 +200,11 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             plot.trace(settling, site, positive)
             low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
         settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
-        settling.set(yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel="largest error\nstill to come (rad)")
+        settling.set(
+            yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel=f"largest error\nstill to come ({unit})"
+        )
         plot.mark(settling, log.sites)
-        limit = (f"settled: {SETTLED_ERROR_RAD:g} rad", style.LIMIT_LINE)
+        limit = (f"settled: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)
         plot.finish([*panels.lowest, settling], [*style.site_legend_entries(log, log.sites), limit])
     return plot.figure
 
@@ -229,9 +233,13 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             when = "not settled" if settled is None else f"settled at {settled:.1f} s"
             entries.append((f"{site}: {when}", line))
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
-        axes.set(yscale="log", ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high), ylabel="largest error (rad)")
+        axes.set(
+            yscale="log",
+            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
+            ylabel=f"largest error ({shared_unit(log)})",
+        )
         plot.mark(axes, log.sites)
-        plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} rad", style.LIMIT_LINE)])
+        plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {shared_unit(log)}", style.LIMIT_LINE)])
     return plot.figure
 
 
@@ -307,7 +315,8 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A ring marks the start of a site, a disc its end.
     """
-    places = style.arrange_joints(len(style.name_joints(log)), form.narrow)
+    titles, unit = style.name_shared(log), shared_unit(log)
+    places = style.arrange_joints(len(titles), form.narrow)
     height_in = 0.72 * form.width_in / len(places[0])
     with style.styled_figure(form, 1.0 + len(places) * height_in) as figure:
         panels = figure.subplot_mosaic([[*row] for row in places])
@@ -317,13 +326,13 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             e, ed = joint_errors(part), joint_error_rates(part)
             for joint, axes in enumerate(row[: e.shape[1]] if len(part) else ()):
                 _draw_path(axes, np.stack([e[:, joint], ed[:, joint]], axis=1), line)
-        style.title_joints(log, row)
+        style.title_joints(log, row, titles)
         for axes in row:
-            axes.set_xlabel("error (rad)")
+            axes.set_xlabel(f"error ({unit})")
             if form.narrow:
                 axes.locator_params(axis="x", nbins=3)
         for axes in row[:: len(places[0])]:
-            axes.set_ylabel("its rate (rad/s)")
+            axes.set_ylabel(f"its rate ({unit.replace(',', '/s,')}/s)")
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
 

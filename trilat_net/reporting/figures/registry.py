@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from ...analysis.certificate.premises import check_scenario_premises
 from ...analysis.certificate.stability_certificate import certify
-from ...analysis.site_signals import follows_in_task_space, sites_with_operator
+from ...analysis.site_signals import sites_with_operator
 from ...errors import UsageError
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log
@@ -54,10 +54,6 @@ explain_absent_operator = _unless(sites_with_operator, NO_OPERATOR)
 """Returns why there is no torque of an operator to draw; "" if there is one."""
 
 
-def _no_joint_errors(log: Log) -> str:
-    return "its sites follow with their end effectors" if follows_in_task_space(log) else ""
-
-
 def _has_script(log: Log) -> bool:
     return any(site.hands for site in log.scenario.sites.values())
 
@@ -84,12 +80,9 @@ FIGURES = {
     "tracking_errors": _ReportEntry(
         "errors, and the largest one still to come (Fig. 5)",
         joint_motion.draw_tracking_errors,
-        _no_joint_errors,
     ),
-    "settling": FigureEntry(
-        "size of the errors on a log axis, settling times", joint_motion.draw_settling, _no_joint_errors
-    ),
-    "phase": FigureEntry("errors against their rates", joint_motion.draw_phase_portrait, _no_joint_errors),
+    "settling": FigureEntry("size of the errors on a log axis, settling times", joint_motion.draw_settling),
+    "phase": FigureEntry("errors against their rates", joint_motion.draw_phase_portrait),
     "parameter_estimates": _ReportEntry(
         "estimates and true values (Fig. 6)",
         joint_motion.draw_parameter_estimates,
