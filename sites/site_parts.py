@@ -22,7 +22,7 @@ from trilat_net.net.offset import OffsetEstimator, OffsetLimit
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.laws import ImportedLaw
+from trilat_net.scenario.imported_law import ImportedLaw
 
 from .change_server import ChangeServer
 from .external_arm import MEASUREMENTS_KEPT, ExternalArm

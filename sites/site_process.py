@@ -19,7 +19,7 @@ from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.laws import ImportedLaw
+from trilat_net.scenario.imported_law import ImportedLaw
 
 from . import realtime
 from .shutdown import LeavingSite

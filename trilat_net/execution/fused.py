@@ -17,7 +17,7 @@ from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, tick_ns
 from ..core.vectors import Array, Row, RowArray
 from ..errors import ScenarioError
 from ..scenario import Scenario
-from ..scenario.laws import ImportedLaw
+from ..scenario.imported_law import ImportedLaw
 from ..scenario.operators import Wall
 from ..scenario.validate import refuse_external_arms
 

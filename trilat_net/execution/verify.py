@@ -29,7 +29,7 @@ from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, parse_core_change
-from ..scenario.laws import ImportedLaw
+from ..scenario.imported_law import ImportedLaw
 from .difference import (
     RecordDifference,
     describe_law_failure,

@@ -24,7 +24,7 @@ from ..net import topics
 from ..net.loop_stats import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
-from ..scenario.laws import ImportedLaw
+from ..scenario.imported_law import ImportedLaw
 from ..scenario.validate import refuse_external_arms
 from .resumption import take_parts
 from .site_channels import SiteChannels, describe_accounts

@@ -14,6 +14,8 @@ import numpy as np
 
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from .arms import read_arm
+from .imported_law import PluggedLaw
+from .law_conditions import LawSituation, StabilityCondition, find_link_delays
 from .laws import Adaptive, AdaptiveBox, ControlLaw, ProportionalDamped, ProportionalDerivativeDamped
 from .scenario_types import Scenario
 
@@ -39,6 +41,26 @@ def _exchanges_positions(law: ControlLaw) -> bool:
     return isinstance(law, ProportionalDamped | ProportionalDerivativeDamped) and law.gravity == 1.0
 
 
+def describe_law_conditions(scenario: Scenario) -> list[str]:
+    """Returns what the stability of the sites' laws rests on, a line for sites of whom the same holds."""
+    rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
+    delay_s = find_link_delays(scenario.links, rates_hz)
+    laws = tuple(site.control for site in scenario.sites.values())
+    owners: dict[StabilityCondition, list[str]] = {}
+    for n, (name, site) in enumerate(scenario.sites.items()):
+        if isinstance(law := site.control, PluggedLaw):
+            limits = np.atleast_1d(site.limits.tau_limit_nm).tolist()
+            situation = LawSituation(
+                n, scenario.names, laws, scenario.alpha, delay_s, tuple(limits), site.rate_hz
+            )
+            if found := law.condition(situation):
+                owners.setdefault(found, []).append(f"{law.__struct_config__.tag} at {name}")
+    words = {True: "holds", False: "does not hold", None: "is not decided here"}
+    return [
+        f"condition of {', '.join(where)} {words[one.holds]}: {one.text}" for one, where in owners.items()
+    ]
+
+
 def describe_scenario(scenario: Scenario) -> list[str]:
     """Returns the facts of a valid scenario and their consequences, as lines."""
     beta = scenario.beta
@@ -57,6 +79,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
+        *describe_law_conditions(scenario),
         *_describe_arms(scenario),
         *(f"assumed: {text}" for text in scenario.assumed),
         *(

@@ -26,6 +26,7 @@ MAX_QUANTITY = 1e9
 
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
 _PER_JOINT = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"})
 _PER_PARAMETER = Meta(min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"})

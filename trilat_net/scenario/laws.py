@@ -1,28 +1,14 @@
-"""The control laws that a scenario can choose, their gains, and laws imported from a user's module.
+"""The control laws that a scenario can choose, and their gains; laws imported from a user's module aside.
 
 Invariant: each law states its source and the condition of its stability, and says if that condition is
 only sufficient. Symbols are the paper's; gains are diagonal, one number per joint or parameter.
-
-A user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that defines
-it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even the
-package that contains it; building a site imports it, and only if that file defines a class of that name.
 """
 
-import ast
-import hashlib
-import importlib
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib.machinery import ModuleSpec
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, get_args
+from typing import get_args
 
-from msgspec import Meta, field
 from msgspec.structs import asdict
 
 from ..core.site_setup import Gains, Law
-from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from .fields import (
@@ -36,230 +22,8 @@ from .fields import (
     PositiveCoordinates,
     PositiveJoints,
 )
-from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
-
-LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
-
-_imported: dict[str, str] = {}
-"""Per imported module of a law the hash of its file at that time."""
-
-
-class PluggedLaw(Frozen, frozen=True):
-    """A law that is plugged into the core as one class, see docs/own-controller.md; its keys are settings.
-
-    A built-in one names its class.
-    """
-
-    core_class: ClassVar[Any] = None
-
-    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains for the core: none."""
-        return Gains(Law.OWN)
-
-    @property
-    def sends(self) -> SentVectorSpecs:
-        """What the law sends to its peers."""
-        return convert_sends(getattr(self.core_class, "sends", {}), self.core_class.__name__, "control")
-
-    def maker(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns the factory of the law, for a site of an experiment of so many sites."""
-
-        def make(context: LawContext) -> UserLaw:
-            name = str(self.__struct_config__.tag)
-            _check_class(self.core_class, name, context, sites, scheme)
-            return _make_law(self.core_class, name, context, asdict(self))
-
-        return make
-
-
-class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
-    """A user's law.
-
-    Attributes:
-        code: its place, as in "package.module:Law".
-        source_sha256: hash of the file of that module.
-        settings: the arguments of its class, by name.
-        sends: what it sends to its peers, as its class declares it.
-    """
-
-    code: Annotated[str, Meta(pattern=LAW_PATH_PATTERN, max_length=200)]
-    source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
-    settings: dict[str, Any] = field(default_factory=dict)
-    sends: SentVectorSpecs = field(default_factory=dict)
-
-    def maker(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns the factory of the law, for a site of an experiment of so many sites."""
-
-        def make(context: LawContext) -> UserLaw:
-            path = f"sites.{context.site}.control"
-            kind = _import_class(self.code, f"{path}.law")
-            _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
-            declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
-            if [*declared.items()] != [*self.sends.items()]:
-                raise ScenarioError(
-                    f"{self.code} sends other vectors than the scenario names: write sends out in the body "
-                    f"of that class, and law = {self.code!r} to take what is there",
-                    path=f"sites.{context.site}.control.sends",
-                )
-            return _make_law(kind, self.code, context, self.settings)
-
-        return make
-
-    def check_unchanged(self, site: str) -> None:
-        """Refuses to start with another law than the scenario names.
-
-        Raises:
-            ScenarioError: the law's file is missing, or has another hash.
-        """
-        path = f"sites.{site}.control"
-        if hash_law_source(self.code, f"{path}.law") != self.source_sha256:
-            raise ScenarioError(
-                f"the file of {self.code} is not the one that the scenario names by this hash; put that one "
-                f"there, or write law = {self.code!r} to take the one that is",
-                path=f"{path}.source_sha256",
-            )
-
-    def changed(self) -> str | None:
-        """Returns the difference of the law's file from the one that the scenario names, or None.
-
-        Raises:
-            ScenarioError: there is no such file.
-        """
-        now = hash_law_source(self.code, "control.law")
-        if now == self.source_sha256:
-            return None
-        return f"its sha256 is {now[:16]}, and was {self.source_sha256[:16]}"
-
-
-def hash_law_source(code: str, path: str) -> str:
-    """Returns the SHA-256 of the file that defines a law; errors call the key `path`.
-
-    Raises:
-        ScenarioError: there is no such file.
-    """
-    file = _find_file(code, path)
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
-
-
-def read_law_sends(code: str, path: str) -> SentVectorSpecs:
-    """Returns what a law declares that it sends; errors call the key `path`.
-
-    Raises:
-        ScenarioError: there is no such file, or no such declaration can be read from it.
-    """
-    return read_sends(_find_file(code, path), code, path)
-
-
-def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
-    """Refuses a class that is no law, before anything of it runs; a log can name any class.
-
-    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
-    `needs_theta = True`.
-    """
-    path = f"sites.{context.site}.control.law"
-    methods = ("torque",) if hasattr(kind, "remembers") else ("torque", "memory", "recall")
-    missing = [name for name in methods if not callable(getattr(kind, name, None))]
-    if missing:
-        raise ScenarioError(f"{code} has no {', '.join(missing)}; see docs/own-controller.md", path=path)
-    stated = getattr(kind, "sites", None)
-    ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
-    if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(n, int) for n in ends)):
-        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
-    least, most = ends
-    if not least <= sites <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
-    if scheme not in (schemes := getattr(kind, "schemes", None) or (scheme,)):
-        wanted = " or ".join(map(repr, schemes))
-        raise ScenarioError(f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path)
-    if getattr(kind, "needs_theta", False) and not context.theta:
-        raise ScenarioError(
-            f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "
-            "and leave known out, or choose a law that learns them",
-            path=path,
-        )
-
-
-def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
-    try:
-        law: UserLaw = kind(context, **settings)
-    except (Exception, SystemExit) as error:  # the user's code
-        given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-        raise ScenarioError(f"{code} {problem}", path=f"sites.{context.site}.control") from None
-    return law
-
-
-def _find_file(code: str, path: str) -> Path:
-    module = code.partition(":")[0]
-    with _searching_here():
-        spec = _find_spec(module)
-    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
-        raise ScenarioError(
-            f"there is no module {module}, where {code} is; install it, or be in the folder that it lies in "
-            "(PYTHONPATH counts too)",
-            path=path,
-        )
-    return Path(spec.origin)
-
-
-def _find_spec(module: str) -> ModuleSpec | None:
-    """Finds a module as an import would, without running the packages that it is in."""
-    spec = None
-    folders = None
-    parts = module.split(".")
-    for depth in range(1, len(parts) + 1):
-        name = ".".join(parts[:depth])
-        try:
-            found = (finder.find_spec(name, folders) for finder in sys.meta_path)
-            spec = next((one for one in found if one is not None), None)
-        except (ImportError, ValueError, AttributeError):
-            return None
-        folders = None if spec is None else spec.submodule_search_locations
-        if spec is None or (folders is None and name != module):
-            return None
-    return spec
-
-
-def _import_class(code: str, path: str) -> Any:
-    """Returns the class of a law from its file as it is now; refuses a file that does not define it."""
-    module, _, name = code.partition(":")
-    file = _find_file(code, path)
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
-    if not any(isinstance(node, ast.ClassDef) and node.name == name for node in tree.body):
-        raise ScenarioError(f"{file} defines no class {name}; see docs/own-controller.md", path=path)
-    now = hash_law_source(code, path)
-    with _searching_here():
-        try:
-            found = importlib.import_module(module)
-            if _imported.setdefault(module, now) != now:  # edited while this program runs
-                found = importlib.reload(found)
-                _imported[module] = now
-        except (Exception, SystemExit) as error:  # the user's code
-            problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
-            raise ScenarioError(problem, path=path) from None
-    return getattr(found, name)
-
-
-@contextmanager
-def _searching_here() -> Iterator[None]:
-    """Lets modules be found in the working directory."""
-    here = str(Path.cwd())
-    if here in sys.path:
-        yield
-        return
-    sys.path.insert(0, here)
-    importlib.invalidate_caches()  # a file may be a moment old
-    try:
-        yield
-    finally:
-        sys.path.remove(here)
+from .imported_law import ImportedLaw
+from .plugged_laws import FourChannels, SixChannels
 
 
 class AdaptiveGains(Frozen, frozen=True):
@@ -394,6 +158,7 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
 
 
 KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting
-ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | ImportedLaw
+PluggedLaws = FourChannels | SixChannels
+ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | PluggedLaws | ImportedLaw
 LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

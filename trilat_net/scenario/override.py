@@ -12,7 +12,8 @@ from typing import Any
 from ..errors import ScenarioError
 from .delay_models import DELAY_MODELS
 from .fields import TomlTable, check_keys, field_names, suggest_nearest
-from .laws import LAWS, ImportedLaw
+from .imported_law import ImportedLaw
+from .laws import LAWS
 from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
 

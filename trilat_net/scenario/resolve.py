@@ -37,7 +37,8 @@ from .fields import (
     reword_problem,
     suggest_nearest,
 )
-from .laws import LAW_PATH_PATTERN, LAWS, hash_law_source, read_law_sends
+from .imported_law import LAW_PATH_PATTERN, hash_law_source, read_law_sends
+from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import SITE_GROUPS, Change, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS

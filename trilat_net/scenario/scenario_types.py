@@ -30,7 +30,8 @@ from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
 from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
-from .laws import ControlLaw, PluggedLaw
+from .imported_law import PluggedLaw
+from .laws import ControlLaw
 from .operators import Environment, Operator
 from .sent_vectors import SentVectorSpecs, build_channel
 

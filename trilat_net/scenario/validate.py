@@ -19,7 +19,8 @@ from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
 from .fields import TomlTable, reword_problem
-from .laws import AdaptiveBox, ForceReflecting, ImportedLaw, KnownGravityLaw
+from .imported_law import ImportedLaw, PluggedLaw
+from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
 from .operators import (
     EndEffectorSpring,
     Environment,
@@ -89,6 +90,12 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
         raise ScenarioError(
             f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more of "
             "them the contact that a site feels is ambiguous; choose p_d, pd_d or adaptive, or two sites",
+            path=f"{path}.control.law",
+        )
+    if isinstance(law, PluggedLaw) and law.core_class is not None and site.task.space != "joints":
+        raise ScenarioError(
+            f"{law.__struct_config__.tag} compares joint by joint, and the space of this task is "
+            f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f there",
             path=f"{path}.control.law",
         )
     if isinstance(law, KnownGravityLaw) and not site.arm.known and law.gravity * site.arm.g_m_s2 > 0.0:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..scenario import Scenario, load_scenario
-from ..scenario.describe import IRREVERSIBLE_SHARES, lacks_detailed_balance
+from ..scenario.describe import IRREVERSIBLE_SHARES, describe_law_conditions, lacks_detailed_balance
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
@@ -76,7 +76,7 @@ class LinearAnalysis:
             )
         if lacks_detailed_balance(self.scenario):
             notes.append(IRREVERSIBLE_SHARES)
-        return tuple(notes)
+        return (*notes, *describe_law_conditions(self.scenario))
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or less."""

@@ -25,7 +25,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
-from ..scenario.laws import ImportedLaw
+from ..scenario.imported_law import ImportedLaw, PluggedLaw
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .site_dynamics import SiteRates, evaluate_site_rates
@@ -101,9 +101,11 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
     Raises:
         ScenarioError: a law is imported, an arm is external, or a link is measured.
     """
-    _refuse_unknown_equations(scenario)
+    gains = _find_linear_gains(scenario)
     notes: list[str] = []
-    sites = tuple(_select_final_actors(scenario, name, notes) for name in scenario.names)
+    sites = tuple(
+        _select_final_actors(scenario, name, notes)._replace(gains=gains[name]) for name in scenario.names
+    )
     alpha = _final_dominance(scenario, sites, notes)
     age_s, varying = np.zeros_like(alpha), []
     for i, j in zip(*np.nonzero(alpha), strict=True):
@@ -128,7 +130,9 @@ def is_constant_link(link: LinkBase) -> bool:
     return link.core().kind == DelayKind.CONSTANT and not link.loss and not link.measured
 
 
-def _refuse_unknown_equations(scenario: Scenario) -> None:
+def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
+    """Returns the gains of every site, of a plugged law those of its small motions."""
+    found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
         if spec.task.space != "joints":
             raise ScenarioError(
@@ -136,14 +140,19 @@ def _refuse_unknown_equations(scenario: Scenario) -> None:
                 path=f"sites.{name}.task.space",
                 source=scenario.name,
             )
-        if isinstance(spec.control, ImportedLaw):
+        law, theta = spec.control, scenario.arms[name].theta
+        gains = law.linear_gains(theta) if isinstance(law, PluggedLaw) else law.gains(theta)
+        if gains is None:
+            code = f"{law.code} is an imported law" if isinstance(law, ImportedLaw) else "is a law"
             raise ScenarioError(
-                f"{spec.control.code} is an imported law, whose equations are unknown here; adaptive, "
-                "adaptive_box, p_d, pd_d and p_f can be linearised",
+                f"{code}, whose equations are unknown here; adaptive, adaptive_box, p_d, pd_d and p_f can be "
+                "linearised, and some others, see docs/laws.md",
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
+        found[name] = gains
     refuse_external_arms(scenario)
+    return found
 
 
 def _final_age(scenario: Scenario, peer: str, site: str, notes: list[str]) -> EffectiveDelay:

@@ -13,7 +13,7 @@ from ...errors import TrilatError
 from ...execution import virtual
 from ...net.clock import SystemClock
 from ...scenario import Scenario
-from ...scenario.laws import ImportedLaw
+from ...scenario.imported_law import ImportedLaw
 from ..executor import MAX_LOSSES, Workers, open_worker_pool
 from .trial import Trial, TrialResult, trials
 from .trial_report import TrialReport

@@ -1,0 +1,173 @@
+"""The four- and the six-channel law against their loops in the frequency domain, and runs in time."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.transmission import rightmost_root, transmitted
+from tests.unit_arm import hand, unit_scenario
+from tests.virtual_runs import trajectories
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.describe import describe_law_conditions
+from trilat_net.scenario.plugged_laws import complementary_shares, complementary_weights
+from trilat_net.theory.delay_margin import set_common_delay
+from trilat_net.theory.linear_analysis import analyse_linear_loop
+
+PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ideal": {"acceleration": 1.0},
+    "without qdd": {},
+    "three": {"force_peer": (1.0, 0.0), "force_own": (0.0, -1.0), "acceleration": 1.0},
+    "no forces": {"force_peer": 0.0},
+}
+TABLE = {
+    ("ideal", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
+    ("ideal", 0.001): (1.0, 0.992, 0.979, 0.970, 0.938),
+    ("ideal", 0.02): (0.990, 0.840, 0.686, 0.580, 0.720),
+    ("ideal", 0.2): (0.802, 0.234, 0.041, 3.14, 1.00),
+    ("without qdd", 0.0): (0.999, 0.980, 0.921, 0.690, 0.976),
+    ("without qdd", 0.001): (0.999, 0.973, 0.904, 0.667, 1.004),
+    ("without qdd", 0.02): (0.990, 0.832, 0.650, 0.350, 1.75),
+    ("without qdd", 0.2): (0.802, 0.234, 0.034, 3.62, 0.976),
+    ("three", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
+    ("three", 0.001): (1.0, 0.999, 0.997, 0.987, 0.903),
+    ("three", 0.02): (0.999, 0.984, 0.936, 0.766, 2.35),
+    ("three", 0.2): (0.989, 0.764, 0.708, 1.55, 1.00),
+    ("no forces", 0.0): (0.167, 0.177, 0.200, 0.244, 2.38),
+    ("no forces", 0.001): (0.167, 0.177, 0.199, 0.245, 2.42),
+    ("no forces", 0.02): (0.167, 0.175, 0.191, 0.313, 2.95),
+    ("no forces", 0.2): (0.167, 0.193, 0.333, 0.491, 2.38),
+}
+"""Transmitted over true impedance at 0.1, 0.5, 1, 2 and 5 Hz, per variant and delay, s."""
+SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; rightmost root; beta_s / beta
+    0.0: ((0.201, 0.278, 0.201, 0.278), (0.999, 0.921, 1.0, 1.0), -5.858, (np.inf, 1.0)),
+    0.25: ((0.195, 0.257, 0.195, 0.277), (0.373, 0.448, 0.373, 0.513), -5.989, (1.857, 0.867)),
+    0.5: ((0.232, 0.293, 0.232, 0.332), (0.232, 0.293, 0.232, 0.332), -6.044, (1.0, 1.0)),
+    1.0: ((0.999, 0.921, 1.0, 1.0), (0.201, 0.278, 0.201, 0.278), -5.858, (1.0, np.inf)),
+}
+USERS = [(50.0, 10.0), (50.0, 10.0), (500.0, 5.0)]
+WALL = hand(0.0, 500.0, 5.0)
+DRIVE = {"kind": "multisine", "amplitude_nm": [2.0, 1.0], "frequencies_hz": [1.0], "end_s": 1000.0}
+
+
+def printed(value: float) -> Any:
+    """A printed number: within half of its last digit, of three."""
+    return pytest.approx(value, rel=2e-3, abs=6e-4)
+
+
+def two_sites(variant: str, delay_s: float, **more: Any) -> Scenario:
+    def one(at: int) -> dict[str, Any]:
+        law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
+        return {key: value[at] if isinstance(value, tuple) else value for key, value in law.items()}
+
+    sites = {
+        "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},
+        "s": {"hands": [WALL], "control": one(1)},
+    }
+    link = {"model": "constant", "delay_ms": 1e3 * delay_s}
+    return unit_scenario(sites, {}, link=link, duration_s=9.0)
+
+
+def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:
+    hands = [[DRIVE] if driven == n else [] for n in (0, 1)]
+    names = ("u1", "u2", "s")
+    alpha = complementary_shares(a).tolist()
+    shares = {
+        i: {j: x for j, x in zip(names, row, strict=True) if j != i}
+        for i, row in zip(names, alpha, strict=True)
+    }
+    sites = {name: {"hands": acting} for name, acting in zip(names, (*hands, [WALL]), strict=True)}
+    control = {"law": "six_channel", "K": 100.0, "B": 20.0, **more}
+    link = {"model": "constant", "delay_ms": 0.0}
+    return unit_scenario(sites, control, dominance=shares, link=link, duration_s=duration_s)
+
+
+def measured(scenario: Scenario, site: str) -> float:
+    """The same as `transmitted` at 1 Hz, of a run in time: over its last whole second."""
+    run = trajectories(scenario).sites[site]
+    last = slice(-1000, None)
+    turn = np.exp(-2j * np.pi * run.t_s[last])
+    response = (run.tau_x[last, 0] @ turn) / (run.qd[last, 0] @ turn)
+    return float(abs(response) / abs(500.0 / (2j * np.pi) + 5.0))
+
+
+@pytest.mark.parametrize(("variant", "delay_s"), TABLE)
+def test_two_sites_transmit_what_the_literature_says(variant: str, delay_s: float) -> None:
+    found = [
+        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
+    ]
+    assert found == [printed(value) for value in TABLE[variant, delay_s]]
+
+
+@pytest.mark.parametrize("a", SHARED)
+def test_the_dominance_factor_shares_out_what_users_feel(a: float) -> None:
+    alpha = complementary_shares(a)
+    *users, root, ratios = SHARED[a]
+    for at, values in enumerate(users):
+        found = [transmitted(hz, alpha, at, acceleration=qdd) for qdd in (0.0, 1.0) for hz in (0.1, 1.0)]
+        assert found == [printed(value) for value in values]
+    assert rightmost_root(alpha, USERS) == pytest.approx(root, abs=5e-4)
+    beta = np.array(complementary_weights(a))
+    assert beta @ (np.eye(3) - alpha) == pytest.approx(0.0, abs=1e-15)
+    with np.errstate(divide="ignore"):
+        assert (beta[2] / beta[:2]).tolist() == [pytest.approx(value, abs=5e-4) for value in ratios]
+
+
+@pytest.mark.parametrize(
+    ("a", "user", "felt"),
+    [
+        (0.5, 0, 0.2905),
+        pytest.param(0.5, 1, 0.2905, marks=pytest.mark.long),
+        pytest.param(1.0, 0, 0.8968, marks=pytest.mark.long),
+        pytest.param(1.0, 1, 0.2782, marks=pytest.mark.long),
+        pytest.param(0.0, 0, 0.2782, marks=pytest.mark.long),
+        pytest.param(0.0, 1, 0.8968, marks=pytest.mark.long),
+    ],
+)
+def test_a_run_of_the_six_channel_law_transmits_as_much(a: float, user: int, felt: float) -> None:
+    assert measured(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(felt, abs=6e-5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("delay_s", [0.001, 0.02])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_run_of_the_four_channel_law_transmits_as_its_loop_says(variant: str, delay_s: float) -> None:
+    """With nine tenths of the acceleration: all of it is unstable."""
+    law = VARIANTS[variant]
+    less = {**law, "acceleration": 0.9 * law.get("acceleration", 0.0)}
+    expected = transmitted(1.0, PAIR, 0, delay_s=delay_s, **less)
+    found = measured(two_sites(variant, delay_s, acceleration=less["acceleration"]), "m")
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.long
+def test_all_of_the_acceleration_is_unstable_a_tick_late() -> None:
+    speeds = np.abs(trajectories(three_sites(0.5, 0, acceleration=1.0)).sites["s"].qd).max()
+    assert speeds > 100.0
+    assert "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
+
+
+def test_the_linear_loop_has_the_law_without_acceleration() -> None:
+    loop = analyse_linear_loop(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
+    A = set_common_delay(loop, 0.0).A
+    alpha = complementary_shares(0.25)
+    assert np.linalg.eigvals(A).real.max() == pytest.approx(
+        rightmost_root(alpha, [(0.0, 0.0), (0.0, 0.0), (500.0, 5.0)]), abs=1e-6
+    )
+
+
+def test_shares_of_no_single_factor_are_told() -> None:
+    assert (
+        "a = 0.25, weights beta = (0.4375, 0.9375, 0.8125)"
+        in describe_law_conditions(three_sites(0.25, 0))[0]
+    )
+    others = {"u1": {"u2": 0.5, "s": 0.5}, "u2": {"u1": 0.2, "s": 0.8}, "s": {"u1": 0.5, "u2": 0.5}}
+    scenario = unit_scenario({name: {} for name in others}, {"law": "six_channel"}, dominance=others)
+    assert "does not hold: the shares are not those of one factor" in describe_law_conditions(scenario)[0]
+
+
+def test_two_sites_cannot_share_by_one_factor() -> None:
+    with pytest.raises(ScenarioError, match="is for 3 sites"):
+        trajectories(unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01))

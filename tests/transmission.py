@@ -1,0 +1,58 @@
+"""Loops of unit masses under laws of positions and forces, in the frequency domain: one matrix, solved.
+
+For each site i, with x_des, f_des the shares of the peers' x and torque, T late, and F_i the torque ON arm i:
+
+    s^2 x_i = (K + B s)(x_des - x_i) + c_a s^2 x_des + c_p f_des + c_o F_i + F_i - Z_own x_i ...
+
+Nothing here is of the package: it is what the runs in time are compared with.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Complex = NDArray[np.complex128]
+
+WALL = (500.0, 5.0)
+"""K and B of the environment at the slave, the last site."""
+
+
+def balance(
+    s: complex,
+    alpha: NDArray[np.float64],
+    *,
+    K: float = 100.0,
+    B: float = 20.0,
+    acceleration: float = 0.0,
+    force_peer: Sequence[float] | float = 1.0,
+    force_own: Sequence[float] | float = 0.0,
+    delay_s: float = 0.0,
+    loads: Sequence[tuple[float, float]] = (),
+) -> tuple[Complex, Complex]:
+    """Returns A and b of A x = b F, F free torques: `loads` are K and B of what holds the arms, in order."""
+    n = len(alpha)
+    late = alpha * np.exp(-s * delay_s)
+    peer, own = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
+    impedance = np.diag([K_h + B_h * s for K_h, B_h in [*loads, *[(0.0, 0.0)] * n][:n]])
+    torque = np.eye(n) + own + peer @ late  # of the torques on all arms, on each
+    motion = s**2 * np.eye(n) + (K + B * s) * (np.eye(n) - late) - acceleration * s**2 * late
+    return motion + torque @ impedance, torque
+
+
+def transmitted(frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object) -> float:
+    """|torque / velocity| that a torque on arm `at` meets, over |Z_e| of the wall at the last arm."""
+    s = 2j * np.pi * frequency_hz
+    free = [(0.0, 0.0)] * (len(alpha) - 1)
+    A, b = balance(s, alpha, loads=[*free, WALL], **law)  # type: ignore[arg-type]
+    x = np.linalg.solve(A, b[:, at])
+    return float(abs(1.0 / (s * x[at])) / abs(WALL[0] / s + WALL[1]))
+
+
+def rightmost_root(alpha: NDArray[np.float64], loads: Sequence[tuple[float, float]], **law: object) -> float:
+    """The largest real part of the roots without delay, from det A(s), a polynomial of degree 2 n."""
+    degree = 2 * len(alpha)
+    points = 10.0 * np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))
+    values = [np.linalg.det(balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
+    scaled = np.fft.fft(values) / (degree + 1)  # coefficients of (s / 10)^k
+    return float(10.0 * np.roots(scaled[::-1]).real.max())

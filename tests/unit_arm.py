@@ -1,0 +1,80 @@
+"""The unit arm: a mass of exactly 1 kg m^2 in one direction, without gravity and Coriolis torques.
+
+M = [[5/6, 1/3], [1/3, 1/3]], so along (1, 1/2) it answers a torque along (1, 1/2) as 1 kg m^2 would. A law
+with one gain for both joints keeps that line: x is q1, and q2 = q1 / 2.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tests.virtual_runs import Run, trajectories
+from trilat_net.scenario import Scenario, parse_scenario
+
+ARM = {
+    "l1_m": 1.0,
+    "m1_kg": 1.0,
+    "lc1_m": 1e-12,
+    "I1_kg_m2": 0.25,
+    "l2_m": 1.0,
+    "m2_kg": 0.25,
+    "lc2_m": 1e-12,
+    "I2_kg_m2": 0.3333333333333333,
+    "g_m_s2": 0.0,
+}
+CLAMP = {"kind": "spring", "stiffness_nm_rad": 1000.0, "damping_nm_s_rad": 0.0, "to_rad": [0.0, 0.0]}
+"""What holds a clamped slave; without it the slave is free."""
+
+
+def hand(to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0) -> dict[str, Any]:
+    """A spring hand that goes to x = `to` in two seconds."""
+    gains = {"stiffness_nm_rad": stiffness, "damping_nm_s_rad": damping}
+    return {
+        "kind": "spring",
+        "to_rad": [to, 0.5 * to],
+        "move_start_s": start_s,
+        "move_end_s": start_s + 2.0,
+        **gains,
+    }
+
+
+H50 = hand(0.3)
+"""The hand of most tests."""
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f'"{key}" = {_toml(one)}' for key, one in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def unit_scenario(
+    sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
+) -> Scenario:
+    """Sites with unit arms, the last one a slave; two follow each other, more share as `dominance` says.
+
+    `more` are keys of the scenario; links have 200 ms unless `link` says otherwise.
+    """
+    names = [*sites]
+    roles = {name: "slave" if name == names[-1] else "master" for name in names}
+    pair = dict(zip(names, ({name: 1.0} for name in reversed(names)), strict=True))
+    table = {
+        "name": "unit",
+        "rate_hz": 1000,
+        "scheme": "digital",
+        "arm": ARM,
+        "limits": {"tau_limit_nm": 1e6, "qd_limit_rad_s": 1e3},
+        "link": {"model": "constant", "delay_ms": 200.0},
+        "sites": {name: {"role": roles[name], "q0_rad": [0.0, 0.0], **site} for name, site in sites.items()},
+        "control": control,
+        "dominance": pair,
+        **more,
+    }
+    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in table.items()), "unit")
+
+
+def pair_run(control: Mapping[str, Any], *, clamped: bool, **more: Any) -> Run:
+    """A master with the hand H50 and a slave, held by CLAMP or free, in virtual time."""
+    sites = {"m": {"hands": [H50]}, "s": {"hands": [CLAMP] if clamped else []}}
+    return trajectories(unit_scenario(sites, control, **more))
