@@ -18,6 +18,7 @@ from . import deprecated
 
 if TYPE_CHECKING:
     from .api import simulate
+    from .core.compiled_law import compiled
     from .execution.rerun import rerun
     from .execution.verify import verify
     from .log.log_reader import open_log
@@ -26,11 +27,12 @@ if TYPE_CHECKING:
     from .studies.trials.trial_runner import check
     from .theory.end_pose import certify_with_roots as certify
 
-__all__ = ["certify", "check", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
+__all__ = ["certify", "check", "compiled", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
 
 _MODULES = {
     "certify": "theory.end_pose:certify_with_roots",
     "check": "studies.trials.trial_runner",
+    "compiled": "core.compiled_law",
     "figure": "reporting.figures.registry",
     "open_log": "log.log_reader",
     "rerun": "execution.rerun",

@@ -13,7 +13,7 @@ from tests.core.compiled import printed
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.metric_catalogue import QUANTITIES
 from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
-from trilat_net.errors import ScenarioError
+from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, list_shipped, load_scenario
@@ -187,7 +187,31 @@ def test_without_the_compiler_it_has_the_same_bits() -> None:
 def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"sites\.m1\.plant: is external: .* runs live only"):
         FusedRun(load_scenario("free", {"sites.m1.plant": "external"}))
-    with pytest.raises(ScenarioError, match=r"sites\.m1\.control\.law: tests\.laws:\w+ is a law in Python"):
-        FusedRun(load_scenario("free", {"control.law": "tests.laws:Adaptive"}))
     with pytest.raises(ScenarioError, match="makes 10000 ticks within one of the slowest"):
         FusedRun(load_scenario("free", {"rate_hz": 10_000, "sites.s.rate_hz": 1}))
+
+
+@pytest.mark.parametrize("law", ["Line", "CompiledLine"])
+def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
+    """One law among those of the kernel, which send nothing; and all sites, at two rates."""
+    plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
+    line = f"tests.plugged_laws:{law}"
+    for changes in ({"sites.s.control.law": line}, {"control.law": line, "sites.s.rate_hz": 500}):
+        scenario = load_scenario("asymmetric", {**plugged, **changes})
+        fused = FusedRun(scenario)
+        fused.advance(0.05)
+        fused.advance(scenario.duration_s)
+        last = {tick.site.name: tick.output for tick in virtual.execute_virtual(scenario)}
+        for name, row in zip(scenario.names, fused.records, strict=True):
+            names = scenario.layout(name).columns()
+            numbers = [number for field in names for number in getattr(last[name], field)]
+            assert row[: len(numbers)].tolist() == numbers
+
+
+@pytest.mark.parametrize("law", ["Line", "CompiledLine"])
+def test_a_law_that_fails_in_a_fused_run_is_named_with_its_tick(law: str) -> None:
+    control = {"law": f"tests.plugged_laws:{law}", "fail_at": 42}
+    run = FusedRun(load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control}))
+    problem = f"{law} of m2 failed at tick 41: ZeroDivisionError"
+    with pytest.raises(LawFailed, match=problem):
+        run.advance(0.2)

@@ -5,14 +5,15 @@ then the scenario's order of sites), and its numbers are that driver's, bit for 
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from . import chain_stages, two_link_stages
+from .compiled_law import law_stage
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
-from .kernel import act_stages, reference_stages, torque_stage
+from .kernel import act_stages, channel_of, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
 from .site_arrays import SiteArrays
 from .task_space import PLACE
@@ -60,6 +61,13 @@ def largest_of_joints(buckets: Array) -> Array:
 
 
 @leaf
+def _first_sent(s: Row) -> int:
+    """Returns where in a site's row of floats the numbers begin that its law sends."""
+    first: int = 4 * s.joints + (5 if s.task else 2) * s.shared + s.parameters
+    return first
+
+
+@leaf
 def _receive(
     k: int,
     t_ns: int,
@@ -72,11 +80,9 @@ def _receive(
 ) -> int:
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
     n, m = peer.joints, peer.shared
-    q, qd, tau_x = 0, n, 3 * n + 2 * m
-    sent_at = 4 * n + 2 * m + peer.parameters
+    q, qd, tau_x, sent_at = 0, n, 3 * n + 2 * m, _first_sent(peer)
     if peer.task:
-        q = sent_at
-        qd, tau_x, sent_at = q + m, q + 2 * m, q + 3 * m
+        q, qd, tau_x = sent_at - 3 * m, sent_at - 2 * m, sent_at - m
     while next_sample < made:
         record: Row = sent[next_sample & (sent.shape[0] - 1)]
         if record.t_ns >= t_ns:
@@ -178,19 +184,55 @@ def _update_sums(
         sums.q[i], sums.now_before[i], sums.held_before[i] = row[i], sums.now[i], sums.held[i]
 
 
+class LawArrays(NamedTuple):
+    """The plugged laws of all sites.
+
+    Attributes:
+        addresses: of the machine code of each site's law, shape (N,); 0: it has none, see `CompiledLaw`.
+        rows: the numbers of each law, shape (N, most).
+        sent: what each law sends, shape (N, most).
+    """
+
+    addresses: IntArray
+    rows: Array
+    sent: Array
+
+
 @leaf
-def _step_site(
+def _find_torque(
+    i: int, own: Row, arrays: SiteArrays, chain: RowArray | None, laws: LawArrays | None
+) -> None:
+    """Stage 6 of a site; a law in plain Python was asked already."""
+    if laws is None:
+        torque_stage(arrays.site[i], chain)
+        return
+    channel = channel_of(arrays.channel, i)
+    if laws.addresses[i] == 0 or channel is None:
+        torque_stage(arrays.site[i], chain)
+        return
+    site, links = arrays.site[i], arrays.links[i]
+    row, sent, address = laws.rows[i], laws.sent[i], laws.addresses[i]
+    law_stage(own.tick, own.t_ns, address, row, site, links, chain, channel, sent)
+
+
+@leaf
+def _record_sent(s: Row, i: int, row: Array, laws: LawArrays | None) -> None:
+    if laws is not None:
+        first = _first_sent(s)
+        for c in range(s.sent):
+            row[first + c] = laws.sent[i, c]
+
+
+@leaf
+def sense_site(
     i: int,
-    apart_rad: float,
     progress: RowArray,
     taken: IntArray,
     sent: RowArray,
-    peaks: Array,
-    sums: RowArray,
     arrays: SiteArrays,
     chain: RowArray | None,
-) -> int:
-    """Makes a site's next tick; returns its mode."""
+) -> None:
+    """Stages 1 to 5 of a site's next tick."""
     own: Row = progress[i]
     k, t_ns, rate_hz = own.tick, own.t_ns, own.rate_hz
     site, links = arrays.site[i], arrays.links[i]
@@ -203,16 +245,34 @@ def _step_site(
             arrays.samples[i, p],
             arrays.calendars[i, p],
             arrays.points,
-            None,
+            channel_of(channel_of(arrays.channel, i), p),
         )
         sender: Row = arrays.site[j, 0]
         taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], sent[j], link)
         recall_sample(k, rate_hz, link)
     reference_stages(k, t_ns, site, links, arrays.ramps[i], arrays.actors[i], arrays.table, chain)
-    torque_stage(site, chain)
+
+
+@leaf
+def finish_site(
+    i: int,
+    apart_rad: float,
+    progress: RowArray,
+    sent: RowArray,
+    peaks: Array,
+    sums: RowArray,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+    laws: LawArrays | None,
+) -> int:
+    """Stages 6 to 8 of a site's next tick, and what is kept of it; returns its mode."""
+    own: Row = progress[i]
+    k, t_ns, rate_hz, site = own.tick, own.t_ns, own.rate_hz, arrays.site[i]
+    _find_torque(i, own, arrays, chain, laws)
     record: Row = sent[i, k & (sent.shape[1] - 1)]
     record.t_ns = t_ns
     act_stages(k, t_ns, site, arrays.actors[i], arrays.table, chain, record.row)
+    _record_sent(site[0], i, record.row, laws)
     total: Row = sums[i]
     _update_peaks(record.row, t_ns, apart_rad, site[0], own, peaks[i], total)
     _update_sums(k, t_ns, site[0], chain, arrays.actors[i], arrays.table, record.row, total)
@@ -233,6 +293,7 @@ def run_until(
     sums: RowArray,
     arrays: SiteArrays,
     chains: RowArray | None,
+    laws: LawArrays | None,
 ) -> None:
     """Steps every site up to a time, or to the instant at which one diverges.
 
@@ -247,6 +308,7 @@ def run_until(
         sums: of each site, shape (N,), see `sums_dtype`.
         arrays: of all sites, see `stack_site_arrays`.
         chains: its `chain` once more: an argument that is None keeps the leaves of chains uncompiled.
+        laws: compiled laws that are plugged in; None: there are none.
     """
     count = progress.shape[0]
     while True:
@@ -261,10 +323,12 @@ def run_until(
             if own.t_ns != t_ns:
                 continue
             if chains is None:
-                mode = _step_site(i, apart_rad, progress, taken, sent, peaks, sums, arrays, None)
+                sense_site(i, progress, taken, sent, arrays, None)
+                mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, None, laws)
             else:
                 chain = chains[i, : arrays.site[i, 0].joints]
-                mode = _step_site(i, apart_rad, progress, taken, sent, peaks, sums, arrays, chain)
+                sense_site(i, progress, taken, sent, arrays, chain)
+                mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, chain, laws)
             if mode == _DIVERGED:
                 own.diverged_ns = t_ns
                 last_ns = t_ns

@@ -64,9 +64,13 @@ class LawChannel(NamedTuple):
     vectors: tuple[SentVector, ...] = ()
     peers: int = 0
 
+    def of(self, *, per_peer: bool) -> tuple[SentVector, ...]:
+        """Returns the vectors that go to each peer alone, or to all."""
+        return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
+
     def numbers(self, *, per_peer: bool) -> int:
         """Returns how many numbers go to each peer alone, or to all."""
-        return sum(vector.length for vector in self.vectors if vector.per_peer is per_peer)
+        return sum(vector.length for vector in self.of(per_peer=per_peer))
 
     @property
     def received(self) -> int:

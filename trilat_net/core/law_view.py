@@ -11,11 +11,11 @@ import numpy as np
 
 from . import chain_stages, two_link_stages
 from .jit import leaf
-from .law_channel import SentVector, join_received
+from .law_channel import SentVector
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import tick_ns
-from .user_law import LawInput, PeerView
+from .user_law import LawInput, PeerView, UserLaw, call_law, restore_law
 from .vectors import Array, Row, RowArray
 
 
@@ -43,10 +43,8 @@ def update_law_view(k: int, t_ns: int, site: RowArray, links: RowArray, chain: R
         link.age_s = (t_ns - tick_ns(max(link.used, 0), link.rate_hz)) * 1e-9
 
 
-_OF_SITE = (
-    *("q", "qd", "q_des", "qd_des", "felt", "tau_x", "tau_before", "q_before", "tau", "theta_hat"),
-    *("gravity", "inertia", "bias"),
-)
+_PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
+_PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G", "inertia": "M"}
 """Where names of a law's input differ from those of the site's row."""
 
@@ -60,55 +58,76 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
     return named
 
 
-class PlainView:
-    """The input of a law in plain Python, made of lists, and what it sends.
+class PlainLaw:
+    """A law in plain Python at its site: it gets lists, and its results are written into the site's row.
 
     Args:
+        law: the law.
         setup: of its site.
-        arrays: of its site.
-        sent: the numbers that its record names as sent, see `LawChannel`.
+        arrays: of its site; its vectors may be longer than the site's.
+        sent: what its record names as sent, see `LawChannel`.
     """
 
-    def __init__(self, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
-        site, links = arrays.site[0], arrays.links
-        self._rate_hz = setup.rate_hz
-        self._of_site = [site[_IN_ROW.get(name, name)] for name in _OF_SITE]
-        self._of_peers = [links[name] for name in PeerView._fields]
-        self._counts = (setup.layout.joints, setup.layout.shared)
-        self._received = None if arrays.channel is None else arrays.channel.received
-        self._receives = join_received([link.channel for link in setup.links])
-        self._sends = {
-            per_peer: [vector for vector in setup.channel.vectors if vector.per_peer is per_peer]
-            for per_peer in (False, True)
+    def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
+        self._law, self._setup, self._arrays, self._sent = law, setup, arrays, sent
+        site, layout = arrays.site[0], setup.layout
+        n, m = layout.joints, layout.shared
+        views = {name: site[_IN_ROW.get(name, name)][:n] for name in _PER_JOINT}
+        views |= {name: site[name][:m] for name in _PER_COORDINATE}
+        self._views = {
+            **views,
+            "theta_hat": site["theta_hat"][: layout.parameters],
+            "inertia": site["M"][:n, :n],
         }
-        self._sent = sent
+        self._limit = site["tau_limit"][:n]
+        columns = [arrays.links[name] for name in PeerView._fields]
+        self._of_peers = [column if column.ndim == 1 else column[:, :m] for column in columns]
+        self._received = None if arrays.channel is None else arrays.channel.received
+        self._receives = setup.received_vectors
+        self._sends = {per_peer: setup.channel.of(per_peer=per_peer) for per_peer in (False, True)}
         self._common = setup.channel.numbers(per_peer=False)
         self._own = setup.channel.numbers(per_peer=True)
 
-    def read(self, k: int) -> LawInput:
+    def compute(self, k: int, t_ns: int) -> list[float]:
+        """Stage 6 of tick k: takes torque, estimate and what is sent in; returns the law's memory.
+
+        Raises:
+            LawFailed: it failed.
+        """
+        a, setup = self._arrays, self._setup
+        update_law_view(k, t_ns, a.site, a.links, a.chain)
+        results = call_law(self._law, setup.name, self._read(k), self._collect_sent)
+        self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
+        self._views["theta_hat"][:], self._sent[:] = results.theta_hat, results.sent
+        return results.memory
+
+    def recall(self, memory: Sequence[float]) -> None:
+        """Restores the law from its memory."""
+        restore_law(self._law, self._setup.name, memory)
+
+    def _read(self, k: int) -> LawInput:
         """Returns the input of tick k, after `update_law_view`."""
-        vectors = dict(zip(_OF_SITE, [vector.tolist() for vector in self._of_site], strict=True))
+        setup = self._setup
         columns = [column.tolist() for column in self._of_peers]
-        peers = tuple(map(PeerView, *columns))
         received = () if self._received is None else self._received.tolist()
-        sent, common = self._sent.tolist(), self._common
+        sent, common, own = self._sent.tolist(), self._common, self._own
         return LawInput(
             k=k,
-            t_s=k / self._rate_hz,
-            h_s=1.0 / self._rate_hz,
-            joints=self._counts[0],
-            coordinates=self._counts[1],
-            peers=peers,
+            t_s=k / setup.rate_hz,
+            h_s=1.0 / setup.rate_hz,
+            joints=setup.layout.joints,
+            coordinates=setup.layout.shared,
+            peers=tuple(map(PeerView, *columns)),
             received=tuple(_name_vectors(self._receives, numbers) for numbers in received),
             sent=tuple(
-                _name_vectors(self._sends[True], sent[common + j * self._own :]) for j in range(len(peers))
+                _name_vectors(self._sends[True], sent[common + j * own :]) for j in range(len(columns[0]))
             ),
             to_all=_name_vectors(self._sends[False], sent),
-            **vectors,
+            **{name: view.tolist() for name, view in self._views.items()},
         )
 
-    def take_sent(self, now: LawInput) -> None:
-        """Takes in what the law sends.
+    def _collect_sent(self, now: LawInput) -> list[float]:
+        """Returns all that the law sends.
 
         Raises:
             ValueError: a vector has another length than the law declares.
@@ -122,5 +141,5 @@ class PlainView:
                         where = f"sent[{place}]" if per_peer else "to_all"
                         problem = f"has {len(values)} numbers, not {vector.length}"
                         raise ValueError(f"{where}.{vector.name} {problem}")
-                    sent += values
-        self._sent[:] = sent
+                    sent += map(float, values)
+        return sent

@@ -16,7 +16,6 @@ from .chain import build_chain
 from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
-from .law_channel import join_received
 from .link import ChannelArrays, calendar_pages, link_dtype, sample_dtype
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, DominanceRamp, Mode, first_tick_at
@@ -25,9 +24,9 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 
 _SETTINGS = (
     *("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
-    *("theta_known", "needs_model"),
+    *("theta_known", "needs_model", "remembered", "asked"),
 )
-_COUNTS = ("joints", "shared", "parameters", "task")
+_COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = (
@@ -144,7 +143,7 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
 
 
 def build_site_arrays(
-    setup: SiteSetup, spare: int = 0, pages: int = 0, layout: Layout | None = None
+    setup: SiteSetup, spare: int = 0, pages: int = 0, layout: Layout | None = None, *, plugged: bool = False
 ) -> SiteArrays:
     """Returns the arrays of a site at its first tick.
 
@@ -153,6 +152,7 @@ def build_site_arrays(
         spare: room for so many more changes of a link, and of the dominance factors.
         pages: pages of a link; 0: as many as any delay may ever need.
         layout: of the arrays, if they are to be larger than the site needs.
+        plugged: with the arrays of a plugged law, also if the site's is none.
     """
     links, layout = setup.links, layout or setup.layout
     peers = len(links)
@@ -166,7 +166,7 @@ def build_site_arrays(
     calendars = np.full((peers, pages), -1, dtype=np.int64)
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
     site = _build_site(setup, layout)
-    channel = None if setup.own is None else _build_channel(links, pages)
+    channel = _build_channel(setup, pages) if plugged or setup.own is not None else None
     arrays = SiteArrays(site, rows, models, samples, calendars, points, ramps, actors, table, chain, channel)
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
@@ -211,7 +211,8 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     pages = 1 << (first_tick_at(longest * 1000, fastest_hz) + _SLACK).bit_length()
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
-    sites = [build_site_arrays(setup, pages=pages, layout=largest) for setup in setups]
+    plugged = any(setup.own is not None for setup in setups)
+    sites = [build_site_arrays(setup, pages=pages, layout=largest, plugged=plugged) for setup in setups]
     first_point = first_torque = 0
     for site in sites:  # one table of points, and one of torques, for all
         site.models["trace_first"] += first_point
@@ -224,12 +225,41 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     }
     if not largest.chain:
         del columns["chain"]
-    del columns["channel"]
+    channels = [site.channel for site in sites if site.channel is not None]
+    if not channels:
+        del columns["channel"]
     joined: dict[str, Any] = {name: np.concatenate(columns.pop(name)) for name in ("points", "table")}
+    if channels:
+        joined["channel"] = _stack_channels(setups, columns.pop("channel"))
     stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
     for row, site in zip(stacked["actors"], sites, strict=True):
         row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
     return SiteArrays(**{"chain": None, "channel": None, **stacked, **joined})
+
+
+def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
+    """Returns the arrays of one site of a stack; its rows may be longer than its layout."""
+    channel = stacked.channel
+    parts = {name: getattr(stacked, name)[i] for name in SiteArrays._fields[:5]}
+    return stacked._replace(
+        **parts,
+        ramps=stacked.ramps[i],
+        actors=stacked.actors[i],
+        chain=None if stacked.chain is None else stacked.chain[i, : layout.joints],
+        channel=None if channel is None else ChannelArrays(*(array[i] for array in channel)),
+    )
+
+
+def _stack_channels(setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]) -> ChannelArrays:
+    """Returns the channels of several sites stacked; places are those in the numbers of the peer's record."""
+    for setup, channel in zip(setups, channels, strict=True):
+        for link, places in zip(setup.links, channel.places, strict=True):
+            common, own = (link.channel.numbers(per_peer=per_peer) for per_peer in (False, True))
+            places[places >= common] += link.place * own
+    waiting, received, places = map(_stack_padded, zip(*channels, strict=True))
+    for channel, whole in zip(channels, places, strict=True):
+        whole[:, channel.places.shape[1] :] = -1
+    return ChannelArrays(waiting, received, places)
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -249,6 +279,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     gains, rule, own = setup.gains, setup.on_stale, setup.layout
     s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
     s.joints, s.shared, s.parameters, s.task = own.joints, own.shared, own.parameters, own.task
+    s.sent = own.sent
     s.external, s.ramps = int(setup.external), 1
     s.theta_known = setup.theta_known
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
@@ -278,8 +309,8 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     return site
 
 
-def _build_channel(links: Sequence[LinkSetup], pages: int) -> ChannelArrays:
-    vectors = join_received([link.channel for link in links])
+def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
+    vectors, links = setup.received_vectors, setup.links
     numbers = sum(vector.length for vector in vectors)
     places = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
 from .exogenous import TorqueSource
-from .law_channel import LawChannel
+from .law_channel import LawChannel, SentVector, join_received
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
 from .user_law import LawContext, UserLawFactory
@@ -267,6 +267,11 @@ class SiteSetup(NamedTuple):
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
         return Layout.of_arm(self.chain, self.channel.floats)
+
+    @property
+    def received_vectors(self) -> tuple[SentVector, ...]:
+        """The vectors that its law finds of each peer; one that a peer does not send is zero."""
+        return join_received([*(link.channel for link in self.links), self.channel])
 
     def law_context(self) -> LawContext:
         """Returns what a plugged law may know before it begins."""

@@ -14,14 +14,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .channel import LOST
+from .compiled_law import plug_law
 from .delay import DelayKind
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
-from .law_view import PlainView, update_law_view
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
-from .user_law import UserLaw, call_law, restore_law
 from .vectors import Row
 
 _MODES = {int(mode): mode for mode in Mode}
@@ -67,8 +66,9 @@ class Site:
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._sends = bool(self._sent.size)
         self._user_law = None if setup.own is None else setup.own(setup.law_context())
-        self._site["needs_model"] = getattr(self._user_law, "needs_model", False)
-        self._view = PlainView(setup, self._arrays, self._sent)
+        self._law = None
+        if self._user_law is not None:
+            self._law = plug_law(self._user_law, setup, self._arrays, self._sent)
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
@@ -107,15 +107,14 @@ class Site:
             s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
         t_ns = tick.k * NS_PER_S // self.rate_hz
         memory: list[float] = []
-        if self._user_law is None:
+        if self._law is None:
             if self._tick is None:
                 self._tick = bind_leaf(site_tick, tick.k, t_ns, count, *self._tick_arrays)
             self._tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
             sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
             a = self._arrays
-            update_law_view(tick.k, t_ns, a.site, a.links, a.chain)
-            memory = self._call_user_law(self._user_law, tick.k)
+            memory = self._law.compute(tick.k, t_ns)
             act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
         q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
@@ -138,14 +137,6 @@ class Site:
             *(row[column] for column in task),
         )
         return record._replace(ch=self._sent.tolist()) if self._sends else record
-
-    def _call_user_law(self, law: UserLaw, k: int) -> list[float]:
-        """Stage 6 of a user's law: takes its torque and estimate in, and returns its memory."""
-        s: Row = self._site[0]
-        torque, estimate, memory = call_law(law, self.name, self._view.read(k), self._view.take_sent)
-        s.tau = np.clip(torque, -s.tau_limit, s.tau_limit)
-        s.theta_hat = estimate
-        return memory
 
     def _crc(self, packed: int, arrivals: int) -> int:
         """Returns `TickRecord.rx_crc`."""
@@ -200,8 +191,8 @@ class Site:
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
         self._sent[:] = last.ch or 0.0
-        if self._user_law is not None:
-            restore_law(self._user_law, self.name, last.mem[held + 1 :])
+        if self._law is not None:
+            self._law.recall(last.mem[held + 1 :])
         resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:

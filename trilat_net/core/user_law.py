@@ -6,6 +6,7 @@ record of every tick, so a log resumes in the middle of a run.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -136,9 +137,9 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 
 
 def call_law(
-    law: UserLaw, site: str, now: LawInput, take_sent: Callable[[LawInput], None]
-) -> tuple[list[float], list[float], list[float]]:
-    """Returns torque, estimate and memory of a law at a tick; `take_sent` takes in what it sends.
+    law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
+) -> "LawResults":
+    """Returns the results of a law at a tick; `collect_sent` returns what it sends.
 
     Raises:
         LawFailed: it raised, or its results are not finite numbers of the right count.
@@ -149,28 +150,50 @@ def call_law(
             raise TypeError("torque returned None and did not write now.tau")
         torque = [float(value) for value in (now.tau if returned is None else returned)]
         estimate = [float(value) for value in getattr(law, "theta_hat", now.theta_hat)]
-        memory = read_memory(law)
-        take_sent(now)
+        results = LawResults(torque, estimate, read_memory(law), collect_sent(now))
     except LawFailed:  # its watchdog has stopped it
         raise
     except (Exception, SystemExit) as error:
-        raise _law_error(law, site, now.k, _one_line(error)) from error
+        raise describe_failure(law, site, now.k, error) from error
     parameters = len(now.theta_hat)
     for name, values, length in (("torque", torque, now.joints), ("theta_hat", estimate, parameters)):
         if len(values) != length:
             raise _law_error(law, site, now.k, f"{name} has {len(values)} numbers, not {length}")
-    if len(memory) > MAX_LAW_MEMORY:
-        problem = f"memory has {len(memory)} numbers, at most {MAX_LAW_MEMORY} are kept"
-        raise _law_error(law, site, now.k, problem)
-    for name, values in (("torque", torque), ("theta_hat", estimate), ("memory", memory)):
+    check_results(law, site, now.k, results)
+    return results
+
+
+class LawResults(NamedTuple):
+    """What a law gives at a tick: its torque, estimate and memory, and all that it sends."""
+
+    torque: list[float]
+    theta_hat: list[float]
+    memory: list[float]
+    sent: list[float]
+
+
+def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
+    """Refuses numbers that are not finite, and a memory that is too large.
+
+    Raises:
+        LawFailed: with the first of them.
+    """
+    if (count := len(results.memory)) > MAX_LAW_MEMORY:
+        problem = f"memory has {count} numbers, at most {MAX_LAW_MEMORY} are kept"
+        raise _law_error(law, site, tick, problem)
+    for name, values in zip(results._fields, results, strict=True):
         if not all(map(math.isfinite, values)):
             first = next(n for n, value in enumerate(values) if not math.isfinite(value))
-            raise _law_error(law, site, now.k, f"{name}[{first}] is {values[first]}, no finite number")
-    return torque, estimate, memory
+            raise _law_error(law, site, tick, f"{name}[{first}] is {values[first]}, no finite number")
+
+
+def describe_failure(law: UserLaw, site: str, tick: int | None, error: BaseException) -> LawFailed:
+    """Returns the failure of a law that raised."""
+    return _law_error(law, site, tick, _one_line(error))
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    if isinstance(value, float | int):
+    if isinstance(value, Real):
         yield float(value)
         return
     for one in value:
@@ -181,7 +204,7 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
     """Returns a value of the same form as another, of the next numbers."""
     if isinstance(value, bool):
         return bool(next(numbers))
-    if isinstance(value, float | int):
+    if isinstance(value, Real):
         number = next(numbers)
         return int(number) if isinstance(value, int) and number.is_integer() else number
     if isinstance(value, np.ndarray):
@@ -215,7 +238,7 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     try:
         write_memory(law, memory)
     except (Exception, SystemExit) as error:
-        raise _law_error(law, site, None, _one_line(error)) from error
+        raise describe_failure(law, site, None, error) from error
 
 
 def law_name(law: UserLaw) -> str:

@@ -7,17 +7,30 @@ compiled loop cannot run are refused.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ..core.fused_run import PROGRESS_DTYPE, largest_of_joints, run_until, sent_dtype, sums_dtype
-from ..core.site_arrays import stack_site_arrays
-from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, tick_ns
+from ..core.compiled_law import CompiledLaw, plug_law
+from ..core.fused_run import (
+    NEVER_NS,
+    PROGRESS_DTYPE,
+    LawArrays,
+    finish_site,
+    largest_of_joints,
+    run_until,
+    sense_site,
+    sent_dtype,
+    sums_dtype,
+)
+from ..core.law_view import PlainLaw
+from ..core.site_arrays import select_site, stack_site_arrays
+from ..core.site_setup import SiteSetup
+from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, Mode, tick_ns
 from ..core.vectors import Array, Row, RowArray
-from ..errors import ScenarioError
+from ..errors import LawFailed, ScenarioError
 from ..scenario import Scenario
-from ..scenario.imported_law import ImportedLaw
 from ..scenario.operators import Wall
 from ..scenario.validate import refuse_external_arms
 
@@ -26,17 +39,10 @@ def check_fusable(scenario: Scenario) -> None:
     """Refuses a scenario that the compiled loop cannot run.
 
     Raises:
-        ScenarioError: an arm is external, a law is written in Python, or a site is so much slower than
-            another that too many samples would arrive in one of its ticks.
+        ScenarioError: an arm is external, or a site is so much slower than another that too many samples
+            would arrive in one of its ticks.
     """
     refuse_external_arms(scenario)
-    for name, spec in scenario.sites.items():
-        if isinstance(spec.control, ImportedLaw):
-            raise ScenarioError(
-                f"{spec.control.code} is a law in Python, which the compiled loop cannot call",
-                path=f"sites.{name}.control.law",
-                source=scenario.name,
-            )
     if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
         raise ScenarioError(
             f"the fastest site makes {ratio} ticks within one of the slowest, at most {MAX_ARRIVALS} "
@@ -70,8 +76,10 @@ class RunTotals(NamedTuple):
 class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
+    Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
+
     Raises:
-        ScenarioError: see `check_fusable`.
+        ScenarioError: see `check_fusable`; or a law cannot be made.
     """
 
     def __init__(self, scenario: Scenario, apart_rad: float = 0.01) -> None:
@@ -81,6 +89,7 @@ class FusedRun:
         setups = [scenario.setup(name) for name in scenario.names]
         self._tables = stack_site_arrays(setups)
         self._layouts = [setup.layout for setup in setups]
+        self._plug_laws(setups)
         joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         count = len(scenario.names)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
@@ -98,6 +107,61 @@ class FusedRun:
         ]
         self.ran_s = 0.0
 
+    def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
+        """Makes the laws that are plugged in, each on the rows of its site."""
+        tables, count = self._tables, len(setups)
+        self._laws: dict[int, PlainLaw | CompiledLaw] = {}
+        self._law_arrays: LawArrays | None = None
+        if tables.channel is None:
+            return
+        sent = np.zeros((count, max(setup.channel.floats for setup in setups)))
+        for i, setup in enumerate(setups):
+            if setup.own is not None:
+                own = select_site(tables, i, setup.layout)
+                law = setup.own(setup.law_context())
+                self._laws[i] = plug_law(law, setup, own, sent[i, : setup.channel.floats])
+        compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
+        addresses = np.zeros(count, dtype=np.int64)
+        rows = np.zeros((count, max((len(one.row) for one in compiled.values()), default=0)))
+        for i, one in compiled.items():
+            rows[i, : len(one.row)] = one.row
+            one.row, addresses[i] = rows[i], one.address
+        self._law_arrays = LawArrays(addresses, rows, sent)
+
+    def _run_until(self, last_ns: int) -> None:
+        """Steps every site up to a time, see `run_until`.
+
+        Raises:
+            LawFailed: a plugged law failed.
+        """
+        rows = (self._progress, self._taken, self._sent, self._peaks, self._sums)
+        compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
+        try:
+            if len(compiled) < len(self._laws):
+                self._run_plain_until(last_ns)
+            else:
+                run_until(last_ns, self._apart_rad, *rows, self._tables, self._tables.chain, self._law_arrays)
+        except LawFailed:
+            raise
+        except Exception as error:  # whatever a compiled law raises
+            found = [law.find_failure(error) for law in compiled]
+            raise next(filter(None, found), error) from None
+
+    def _run_plain_until(self, last_ns: int) -> None:
+        """Does as `run_until`, and asks laws in plain Python between the stages."""
+        kept, tables, laws = (self._peaks, self._sums), self._tables, self._law_arrays
+        asked = (self._progress, self._taken, self._sent)
+        progress = self._progress
+        while (t_ns := int(progress["t_ns"].min())) <= last_ns and t_ns != NEVER_NS:
+            for i in np.flatnonzero(progress["t_ns"] == t_ns).tolist():
+                own = select_site(tables, i, self._layouts[i])
+                sense_site(i, *asked, tables, own.chain)
+                if isinstance(law := self._laws.get(i), PlainLaw):
+                    law.compute(int(progress[i]["tick"]), t_ns)
+                finishing = (progress, self._sent, *kept, tables, own.chain, laws)
+                if finish_site(i, self._apart_rad, *finishing) == Mode.DIVERGED:
+                    progress[i]["diverged_ns"] = last_ns = t_ns
+
     def advance(self, until_s: float) -> None:
         """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays as it is."""
         if until_s <= self.ran_s or self.diverged_s is not None:
@@ -112,8 +176,7 @@ class FusedRun:
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         last_ns = round(until_s * NS_PER_S)
-        rows = (self._progress, self._taken, self._sent, self._peaks, self._sums)
-        run_until(last_ns, self._apart_rad, *rows, self._tables, self._tables.chain)
+        self._run_until(last_ns)
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def advance_watching(self, until_s: float, states: int = 100) -> tuple[Array, Array]:

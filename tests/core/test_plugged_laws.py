@@ -1,0 +1,143 @@
+"""Laws plugged into a tick: what they see and send; the compiled form gives the bits of the plain one."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net import compiled
+from trilat_net.core.law_channel import LawChannel, SentVector, join_received
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickInput, TickRecord
+from trilat_net.errors import LawFailed, ScenarioError
+from trilat_net.scenario import Scenario, load_scenario
+
+TICKS = 60
+
+
+def linked(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
+    return load_scenario(name, {"link.delay_ms": 5.0, "control.law": law, **more})
+
+
+def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRecord]]:
+    """Every sample arrives at the next tick, with the part of `ch` that is the receiver's."""
+    setups = {name: scenario.setup(name) for name in scenario.names}
+    sites = {name: Site(setup) for name, setup in setups.items()}
+    records: dict[str, list[TickRecord]] = {name: [] for name in sites}
+    for k in range(ticks):
+        for name, site in sites.items():
+            arrivals = []
+            for j, link in enumerate(setups[name].links if k else ()):
+                r = records[link.peer][k - 1]
+                part = link.channel.part(r.ch, link.place)
+                arrivals.append(Arrival(j, k - 1, r.q, r.qd, 0, r.tau_x, part))
+            records[name].append(site.step(TickInput(k, arrivals)))
+    return records
+
+
+def test_a_compiled_law_gives_the_bits_of_the_plain_one() -> None:
+    a, b = (run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine"))
+    assert a == b
+    last = a["s"][-1]
+    assert last.ch[0] != 0.0  # the energy, then what each of the two masters gets
+    assert len(last.ch) == 1 + 2 * 2
+    assert last.mem[-1] == TICKS
+
+
+class Watching:
+    """Keeps what it saw; follows nobody."""
+
+    remembers = ()
+    needs_model = True
+
+    def __init__(self, _facts: Any) -> None:
+        self.seen: list[Any] = []
+
+    def torque(self, now: Any) -> None:
+        self.seen.append(now)
+        for i in range(now.joints):
+            now.tau[i] = 3.0 * (i + 1) + now.k
+
+
+def test_a_law_sees_its_peers_its_external_torque_and_its_own_past() -> None:
+    pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
+    scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
+    made: list[Watching] = []
+    setup = scenario.setup("m1")._replace(own=lambda facts: made.append(Watching(facts)) or made[-1])
+    site, records = Site(setup), []
+    for k in range(20):
+        arrived = [Arrival(1, k - 1, (0.1 * k, 0.2), (0.3, 0.4), 0, (0.5, -0.6))] if k % 4 == 3 else []
+        records.append(site.step(TickInput(k, arrived)))
+    for k, now in enumerate(made[0].seen):
+        peer = now.peers[1]
+        released = [m for m in range(2, 20, 4) if m + 5 <= k]  # 5 ms are 5 ticks
+        assert peer.tick == (released[-1] if released else -1)
+        assert peer.new == (k - 5 in released)
+        assert peer.age_s == pytest.approx(1e-3 * (k - max(peer.tick, 0)), abs=1e-15)
+        assert peer.tau_x == ([0.5, -0.6] if released else [0.0, 0.0])
+        assert now.tau_x == records[k].tau_x
+        before = records[k - 1] if k else None
+        assert now.tau_before == (before.tau if before else [0.0, 0.0])
+        assert now.q_before == (before.q if before else list(setup.q0))
+        assert now.peers[0].tick == -1
+    assert any(now.tau_x != [0.0, 0.0] for now in made[0].seen)
+    now = made[0].seen[7]
+    th1, th2, th3, th4, th5 = setup.theta
+    c2, s2 = math.cos(now.q[1]), math.sin(now.q[1])
+    outer = setup.g_m_s2 * th5 * math.cos(now.q[0] + now.q[1])
+    gravity = [setup.g_m_s2 * th4 * math.cos(now.q[0]) + outer, outer]
+    h, (v, w) = th2 * s2, now.qd
+    np.testing.assert_allclose(now.gravity, gravity, rtol=1e-12)
+    np.testing.assert_allclose(now.inertia, [[th1 + 2 * th2 * c2, th3 + th2 * c2], [th3 + th2 * c2, th3]])
+    coriolis = [-h * (2 * v * w + w * w), h * v * v]
+    np.testing.assert_allclose(now.bias, np.add(gravity, coriolis), rtol=1e-12)
+
+
+def test_names_of_several_senders_are_joined() -> None:
+    a = LawChannel((SentVector("E", "J", 1), SentVector("u", "", 2, True)), 2)
+    b = LawChannel((SentVector("F", "N m", 2), SentVector("E", "J", 1)), 2)
+    vectors = join_received([a, b])
+    assert [one.name for one in vectors] == ["E", "u", "F"]
+    assert a.find_places(vectors) == [0, 1, 2, -1, -1]
+    assert b.find_places(vectors) == [2, -1, -1, 0, 1]
+    with pytest.raises(ValueError, match="E of 1 and of 3 numbers"):
+        join_received([a, LawChannel((SentVector("E", "J", 3),), 2)])
+
+
+REFUSED = {
+    "CallsPlain": r"it uses plain \(line \d+\), which is neither a number nor a function with @tri",
+    "CallsMethod": "it calls its method double: use a function with @trilat_net.compiled",
+    "ReadsText": "self.name is a str: a number, or a list of numbers of fixed length, is taken",
+    "ReadsNothing": "self.gain is no attribute of it",
+    "MakesList": r"it makes an array or a list \(line \d+\): make it in __init__, and write into it here",
+    "Returns": "torque returns something: compiled, it writes now.tau instead",
+    "RemembersText": "name, which it remembers, is neither a number nor a list of numbers",
+}
+
+
+@pytest.mark.parametrize("law", REFUSED)
+def test_what_numba_does_not_take_is_refused_with_its_reason(law: str) -> None:
+    with pytest.raises(ScenarioError, match=REFUSED[law]) as caught:
+        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+    assert caught.value.path == "sites.s.control.law"
+
+
+def test_a_compiled_class_says_what_it_remembers() -> None:
+    with pytest.raises(TypeError, match="Law lacks remembers"):
+        compiled(type("Law", (), {}))
+
+
+FAILING = {
+    "Forgets": (3, r"torque\[0\] is nan, no finite number"),
+    "BeyondEnd": (2, "IndexError: index is out of bounds"),
+}
+
+
+@pytest.mark.parametrize("law", FAILING)
+def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
+    site, (tick, problem) = Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")), FAILING[law]
+    for k in range(tick):
+        site.step(TickInput(k))
+    with pytest.raises(LawFailed, match=f"{law} of s failed at tick {tick}: {problem}"):
+        site.step(TickInput(tick))

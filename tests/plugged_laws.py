@@ -1,0 +1,134 @@
+"""Laws that look at peers and send to all and to each, plain and compiled; some that Numba does not take."""
+
+from typing import Any, ClassVar
+
+from trilat_net import compiled
+from trilat_net.core.user_law import LawContext, LawInput
+
+
+class Line:
+    """Springs to each peer, an energy that all get, an integral, a count; it uses every input."""
+
+    sends: ClassVar[Any] = {
+        "E": {"unit": "J", "length": 1},
+        "u": {"unit": "N m", "length": "joints", "per_peer": True},
+    }
+    remembers = ("integral", "count")
+    needs_model = True
+
+    def __init__(self, facts: LawContext, K: float = 20.0, fail_at: int = -1) -> None:
+        self.K, self.fail_at = K, fail_at
+        self.integral = [[0.0] * facts.joints for _ in facts.peers]
+        self.count = 0
+        self.signs = (-1, 1)
+        self.note = facts.site
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            total = now.gravity[i] + 0.01 * now.bias[i] + 0.05 * now.tau_x[i] - 0.1 * now.tau_before[i]
+            for j in range(len(now.peers)):
+                peer = now.peers[j]
+                apart = now.q[i] - peer.q[i]
+                self.integral[j][i] += now.h_s * apart
+                pull = peer.alpha * (self.K * apart + half(self.integral[j][i]))
+                if peer.new:
+                    pull += 1e-3 * peer.tick + 0.1 * peer.age_s + 0.01 * peer.tau_x[i]
+                now.sent[j].u[i] = pull
+                total -= pull + 0.1 * now.received[j].u[i] - self.signs[i] * 0.01 * now.received[j].E[0]
+            now.to_all.E[0] += total * (now.q[i] - now.q_before[i])
+            now.tau[i] = total - 5.0 * now.inertia[i][i] * now.qd[i]
+            now.theta_hat[i] = self.integral[0][i]
+        self.count += 1
+        if self.count == self.fail_at:
+            now.tau[0] /= self.count - self.fail_at
+
+
+@compiled
+def half(x: float) -> float:
+    return 0.5 * x
+
+
+@compiled
+class CompiledLine(Line):
+    sends: ClassVar[Any] = {
+        "E": {"unit": "J", "length": 1},
+        "u": {"unit": "N m", "length": "joints", "per_peer": True},
+    }
+
+
+def plain(x: float) -> float:
+    return x
+
+
+@compiled
+class Refused:
+    """What Numba does not take, by name."""
+
+    remembers = ()
+
+    def __init__(self, _facts: LawContext) -> None:
+        self.name, self.work, self.limits = "x", [0.0, 0.0], {"low": 0.0}
+
+    def double(self, x: float) -> float:
+        return 2.0 * x
+
+
+@compiled
+class CallsPlain(Refused):
+    def torque(self, now: LawInput) -> None:
+        now.tau[0] = plain(now.q[0])
+
+
+@compiled
+class CallsMethod(Refused):
+    def torque(self, now: LawInput) -> None:
+        now.tau[0] = self.double(now.q[0])
+
+
+@compiled
+class ReadsText(Refused):
+    def torque(self, now: LawInput) -> None:
+        now.tau[0] = len(self.name)
+
+
+@compiled
+class ReadsNothing(Refused):
+    def torque(self, now: LawInput) -> None:
+        now.tau[0] = self.gain  # type: ignore[attr-defined]
+
+
+@compiled
+class MakesList(Refused):
+    def torque(self, now: LawInput) -> None:
+        self.work = [now.q[0]] * 2
+
+
+@compiled
+class Returns(Refused):
+    def torque(self, now: LawInput) -> Any:
+        return now.q[0], now.q[1]
+
+
+@compiled
+class RemembersText(Refused):
+    remembers = ("name",)
+
+    def torque(self, now: LawInput) -> None:
+        now.tau[0] = 0.0
+
+
+@compiled
+class Forgets(Refused):
+    """Writes no torque at tick 3."""
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            if now.k < 3:
+                now.tau[i] = 0.0
+
+
+@compiled
+class BeyondEnd(Refused):
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            now.tau[i] = self.work[now.k]
