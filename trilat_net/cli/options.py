@@ -112,6 +112,10 @@ AcceptOption = Annotated[
     list[Accepted] | None,
     typer.Option("--accept", help="Exit 0 for a bounded oscillation, or an open judgement, too; repeatable."),
 ]
+OwnLawsOption = Annotated[
+    bool,
+    typer.Option("--own-laws", help="Run code of laws from outside for the energies that they declare."),
+]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
+from ..analysis.certificate.observed_energy import ObservedFinding
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.run_end import Stability
 
@@ -44,6 +45,8 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     if found.balance is not None:
         mark = _BALANCE.get(finding, "ok")
         lines.append((mark, f"energy balance: {describe_balance(found.balance)}"))
+    if found.observed is not None:
+        lines.append((_OBSERVED[found.observed.finding], found.observed.text))
     if found.roots is not None:
         decides = found.roots.exact and found.roots.verdict
         lines.append((_ROOTS.get(decides or "", "note"), found.roots.text))
@@ -63,6 +66,12 @@ def describe_judgement(found: Certificate) -> str:
 
 _JUDGEMENT = {Stability.STABLE: "ok", Stability.NOT_STABLE: "FAIL", Stability.OPEN: "open"}
 _BALANCE = {StabilityFinding.BROKEN: "FAIL", StabilityFinding.NOT_JUDGED: "open"}
+_OBSERVED = {
+    ObservedFinding.PASSIVE: "ok",
+    ObservedFinding.NEGATIVE: "open",
+    ObservedFinding.BROKEN: "FAIL",
+    ObservedFinding.NOT_JUDGED: "open",
+}
 _ROOTS = {"stable": "ok", "unstable": "open"}
 
 

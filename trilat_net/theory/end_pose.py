@@ -27,15 +27,16 @@ _ROOTS = 2
 """Roots that are looked for: the rightmost ones."""
 
 
-def certify_with_roots(log: Log, *, min_coverage: float = MIN_COVERAGE) -> Certificate:
-    """Returns the certificate of a log, with the roots of the loop where the run ended.
-
-    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end is open.
+def certify_with_roots(
+    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False
+) -> Certificate:
+    """Returns the certificate of a log, with the roots of the loop where the run ended; see `certify`.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    return certify(log, min_coverage=min_coverage)._replace(roots=find_end_pose_roots(log))
+    found = certify(log, min_coverage=min_coverage, own_laws=own_laws)
+    return found._replace(roots=find_end_pose_roots(log))
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:

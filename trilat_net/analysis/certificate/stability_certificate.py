@@ -30,6 +30,7 @@ from .energy_balance import (
     find_dominance_matrices,
 )
 from .evidence import Evidence, collect_evidence
+from .observed_energy import ObservedEnergy, observe_energies
 from .premises import (
     Premise,
     check_run_premises,
@@ -125,6 +126,7 @@ class Certificate(NamedTuple):
         groups: closed groups of sites, if there are several: then beta is not unique.
         energies: of every site; {} without a functional.
         roots: of the loop where the run ended; None if nobody looked.
+        observed: of the energies that laws declare; None if none does.
     """
 
     premises: list[Premise]
@@ -136,6 +138,7 @@ class Certificate(NamedTuple):
     groups: tuple[tuple[str, ...], ...] = ()
     energies: Mapping[str, SiteEnergy] = MappingProxyType({})
     roots: EndPoseRoots | None = None
+    observed: ObservedEnergy | None = None
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
@@ -165,6 +168,8 @@ class Certificate(NamedTuple):
             found += find_growth(self.balance, self.verdict.tolerance)
         if self.roots is not None and self.roots.exact and self.roots.verdict == "unstable":
             found.append(self.roots.text)
+        if self.observed is not None and self.observed.refuted:
+            found.append(self.observed.text)
         return (*self.end.reasons, *found, *self.evidence.reasons)
 
     @property
@@ -190,20 +195,22 @@ class Certificate(NamedTuple):
         return bounded or opened or self.stability is Stability.STABLE
 
 
-def certify(log: Log, *, min_coverage: float = MIN_COVERAGE) -> Certificate:
+def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False) -> Certificate:
     """Returns the certificate of a log; torn, short and empty ones too.
 
     Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end is open.
+    With `own_laws` the code of laws from outside runs, as far as they declare energies.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
     premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
     premises += check_sampled_walls(log)
+    observed = observe_energies(log, own_laws=own_laws)
 
     def conclude(verdict: StabilityVerdict, balance: EnergyBalance | None = None, **more: Any) -> Certificate:
         evidence = collect_evidence(log, balance, min_coverage)
-        return Certificate(premises, verdict, end, evidence, balance, **more)
+        return Certificate(premises, verdict, end, evidence, balance, observed=observed, **more)
 
     if not premises[0].holds:
         return conclude(_undecided(premises[0].text))
@@ -388,6 +395,7 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
         },
         "evidence": certificate.evidence.to_json(),
         "roots": None if certificate.roots is None else certificate.roots._asdict(),
+        "observed": None if certificate.observed is None else certificate.observed.to_json(),
         "functional": None if balance is None else _functional_to_json(certificate, balance),
     }
 

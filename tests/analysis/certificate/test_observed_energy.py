@@ -1,0 +1,111 @@
+"""Energies that laws declare: lines, stores and what is taken for good, judged from the records."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies
+from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
+from trilat_net.analysis.run_end import Stability
+from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.log.log_reader import Log
+from trilat_net.reporting.certificate_text import describe_certificate
+from trilat_net.scenario import load_scenario, parse_scenario
+
+B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
+PAIR = f"""
+name = "line"
+scheme = "digital"
+duration_s = 8.0
+[control]
+law = "tests.line_law:Line"
+[link]
+delay_ms = {1000 * DELAY_S}
+[dominance.m]
+s = 1.0
+[dominance.s]
+m = 1.0
+[[sites.m.hands]]
+kind = "spring"
+to_rad = [{TO}, {TO}]
+move_start_s = 0.5
+move_end_s = 2.0
+stiffness_nm_rad = {HAND}
+damping_nm_s_rad = 10.0
+[sites.s]
+role = "slave"
+[[sites.s.hands]]
+kind = "spring"
+stiffness_nm_rad = {WALL}
+damping_nm_s_rad = 10.0
+"""
+
+
+@cache
+def clamped(**changes: Any) -> Log:
+    """A master that a hand moves, a line, and a slave that is held."""
+    overrides = {key.replace("__", "."): value for key, value in changes.items()}
+    return simulate_scenario(load_scenario(parse_scenario(PAIR, "line"), overrides))
+
+
+def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
+    """b / T between the hand and what holds the slave: its energy is half its force squared times T / b."""
+    log = clamped()
+    found = observe_energies(log, own_laws=True)
+    assert found.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in found.premises)
+    assert {one.name for one in found.least} >= {"line m->s", "line s->m"}
+    assert min(one.amount_j for one in found.least) >= -1e-12
+    assert found.residual_j <= 1e-12 * found.largest_j
+    force = TO / (1 / HAND + DELAY_S / B + 1 / WALL)  # of each of two joints
+    assert log["m"].tau_x[-1] == pytest.approx([-force, -force], rel=2e-3)
+    waves = [log[site].sent[f"u[{peer}]"][-1] for site, peer in (("m", "s"), ("s", "m"))]
+    stored = sum(0.5 * DELAY_S * (wave**2).sum() for wave in waves)
+    assert stored == pytest.approx(force**2 * DELAY_S / B, rel=5e-3)
+
+
+def test_a_wave_that_is_held_over_an_outage_is_energy_from_nowhere() -> None:
+    """What is missing must be zero (Niemeyer and Slotine 2004); this law uses the last wave again and again.
+
+    The hand lets go in the outage, so that the master sends less than what the slave goes on using.
+    """
+    outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
+    log = clamped.__wrapped__(**outage, duration_s=3.2)
+    found = certify(log, own_laws=True)
+    assert found.observed.finding is ObservedFinding.NEGATIVE
+    lowest = min(found.observed.least, key=lambda one: one.amount_j)
+    assert lowest.name == "line m->s"
+    last = round(1000 * lowest.at_s) + 1
+    used = log["s"].used["m"][:last]
+    times = np.bincount(used[used >= 0], minlength=last)  # how often each wave was used
+    energy = 0.5 * 1e-3 * (log["m"].sent["u[s]"][:last] ** 2).sum(axis=1)
+    assert times.max() > 1000
+    assert lowest.amount_j == pytest.approx(((1 - times) * energy).sum(), rel=1e-9)
+    assert found.observed.text in found.reasons
+    assert found.stability is not Stability.STABLE
+
+
+def test_a_law_that_sends_more_than_it_got_is_found_by_its_books() -> None:
+    found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
+    assert found.finding is ObservedFinding.BROKEN
+    assert found.residual_j > 1e-4
+
+
+def test_code_from_outside_runs_only_on_request_and_other_laws_declare_nothing() -> None:
+    log = clamped()
+    assert observe_energies(log) is None
+    silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
+    mixed = simulate_scenario(load_scenario(log.scenario, silent))
+    assert observe_energies(mixed, own_laws=True).text.endswith("the law of s declares none")
+
+
+def test_the_certificate_says_it_in_words_and_in_json() -> None:
+    found = certify(clamped(), own_laws=True)
+    lines = {line.text: line.mark for line in describe_certificate(found)}
+    assert lines[found.observed.text] == "ok"
+    told = certificate_to_json(found)["observed"]
+    assert told["finding"] == "passive"
+    assert {one["name"] for one in told["premises"]} == {"books", "torque", "sampling"}
+    assert np.isfinite([one["amount_j"] for one in told["least"]]).all()

@@ -1,0 +1,232 @@
+"""ObservedEnergy of laws that declare what proves it: energy of lines, observers and tanks, from the records.
+
+Invariant: a law that declares energies is believed in nothing else. A line is what a site gave less what its
+peer took; the arm's port is the torque that was held times the step of the joints. Lines and stores are
+never below zero, and what a law has taken for good never falls, or the certificate says where.
+"""
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.law_energy import LawEnergies, LawRecords, PeerRecords
+from ...core.site_setup import Scheme
+from ...core.vectors import Array
+from ...log.log_reader import Log
+from ...scenario.imported_law import ImportedLaw
+from ..arm_rows import build_arm_rows
+from ..json_values import JsonObject
+from .premises import Premise
+
+LEAST_ENERGY_J = -1e-9
+"""What rounding may leave of an energy that is not below zero, J."""
+ROUNDING_SHARE = 1e-12
+"""And as a share of the largest energy."""
+SAMPLING_SHARE = 1e-2
+"""The arms may get so much more than the laws book, as a share of the largest energy."""
+
+
+class ObservedFinding(StrEnum):
+    """Class of a verdict; the text is the word for people."""
+
+    PASSIVE = "observed energy never below zero"
+    NEGATIVE = "observed energy below zero"
+    BROKEN = "the energies that a law declares do not add up"
+    NOT_JUDGED = "observed energy cannot be judged"
+
+
+class LeastEnergy(NamedTuple):
+    """An energy that must not be below zero, where it is least: "line m->s", "store of s", "taken by s"."""
+
+    name: str
+    amount_j: float
+    at_s: float
+
+
+class ObservedEnergy(NamedTuple):
+    """Verdict on the energies that laws declare.
+
+    Attributes:
+        finding: its class.
+        text: the sentence.
+        premises: what it rests on, one by one.
+        least: every energy where it is least.
+        largest_j: the largest of them.
+        residual_j: by how much the books of a law do not add up at most.
+        sampling_j: the most that the arms got beyond what the laws book.
+    """
+
+    finding: ObservedFinding
+    text: str
+    premises: Sequence[Premise] = ()
+    least: Sequence[LeastEnergy] = ()
+    largest_j: float = 0.0
+    residual_j: float = 0.0
+    sampling_j: float = 0.0
+
+    @property
+    def refuted(self) -> bool:
+        """True if an energy is below zero, or the books of a law do not add up."""
+        return self.finding in (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
+
+    def to_json(self) -> JsonObject:
+        """Returns it ready for JSON."""
+        premises, least = ([one._asdict() for one in rows] for rows in (self.premises, self.least))
+        return {**self._asdict(), "finding": self.finding.name.lower(), "premises": premises, "least": least}
+
+
+class _SiteBooks(NamedTuple):
+    """The energies of a site's law at its ticks, from the first one, J.
+
+    Attributes:
+        t_s: the ticks' times, s.
+        booked: what its law declares.
+        port: what the arm gave to the law by its books.
+        taken: what the law has taken for good.
+        residual: by how much the books do not add up.
+        leak: what the arm got beyond the books.
+    """
+
+    t_s: Array
+    booked: LawEnergies
+    port: Array
+    taken: Array
+    residual: Array
+    leak: Array
+
+
+def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
+    """Returns the verdict on the energies that the laws of a log declare; None if none declares any.
+
+    A law from outside is asked with `own_laws` alone, since that runs its code.
+
+    Raises:
+        LogError: a record cannot be read.
+        ScenarioError: the file of a law from outside is missing.
+    """
+    laws: dict[str, Any] = {}
+    for name, spec in log.scenario.sites.items():
+        setup = log.scenario.setup(name)
+        if setup.own is not None and (own_laws or not isinstance(spec.control, ImportedLaw)):
+            law = setup.own(setup.law_context())
+            laws |= {name: law} if callable(getattr(law, "energies", None)) else {}
+    if not laws:
+        return None
+    if problem := _find_obstacle(log, laws):
+        return ObservedEnergy(ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {problem}")
+    return _judge(log, {name: _read_books(log, name, law) for name, law in laws.items()})
+
+
+def _find_obstacle(log: Log, laws: Mapping[str, object]) -> str:
+    """Returns what keeps the energies from being added up; "" for nothing."""
+    silent = [name for name in log.sites if name not in laws]
+    if silent:
+        return f"the law of {', '.join(silent)} declares none"
+    gaps = [name for name in log.sites if not len(log[name]) or log[name].missing or log[name].tick[0]]
+    return f"records of {', '.join(gaps)} are missing" if gaps else ""
+
+
+def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
+    part, setup = log[name], log.scenario.setup(name)
+    count = len(part) - int(part.mode[-1] == "diverged")
+    records = _read_law_records(log, name, law, count)
+    booked: LawEnergies = law.energies(records)
+    digital = setup.scheme is Scheme.DIGITAL
+    held = records.tau.copy()
+    if not digital:
+        limit = np.array(setup.tau_limit_nm)
+        held[1:] = np.clip(1.5 * held[1:] - 0.5 * held[:-1], -limit, limit)
+    potential = np.zeros(count)
+    if setup.theta_known:  # holding the arm is no work of the law
+        potential = build_arm_rows(log.scenario, name).potential_energy(records.q)
+    step = np.einsum("kj,kj->k", held[:-1], np.diff(records.q, axis=0))
+    given = potential - potential[0] - np.concatenate([[0.0], np.cumsum(step)])
+    port = given if booked.port is None else booked.port
+    store = np.zeros(count) if booked.store is None else booked.store
+    left = port + np.sum(booked.took, axis=0) - np.sum(booked.gave, axis=0) - (store - store[0])
+    taken = left if booked.taken is None else booked.taken
+    t_s = part.t_s[:count]
+    return _SiteBooks(t_s, booked, port, taken, left - taken, port - given)
+
+
+def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
+    part = log[name]
+    mem = np.array([row[part.layout.shared + 1 :] for row in part.mem[:count]]).reshape(count, -1)
+    memory, first = {}, 0
+    for attribute in getattr(law, "remembers", ()):
+        length = np.size(getattr(law, attribute))
+        memory[attribute] = mem[:, first : first + length]
+        first += length
+    own = {key: values[:count] for key, values in part.sent.items()}
+    peers = []
+    for peer in part.peers:
+        tick = part.used[peer][:count]
+        there = log[peer].sent
+        heard = {key.removesuffix(f"[{name}]"): values for key, values in there.items()}
+        received = {
+            key: np.where(tick[:, None] >= 0, values[np.maximum(tick, 0)], 0.0)
+            for key, values in heard.items()
+            if "[" not in key
+        }
+        alone = {key.partition("[")[0]: values for key, values in own.items() if key.endswith(f"[{peer}]")}
+        peers.append(PeerRecords(tick, received, alone))
+    to_all = {key: values for key, values in own.items() if "[" not in key}
+    motion = (part.q[:count], part.qd[:count], part.tau[:count], part.tau_x[:count])
+    return LawRecords(1.0 / part.rate_hz, *motion, to_all, memory, peers)
+
+
+def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
+    """Returns the verdict on the books of all sites."""
+    least, largest = [], 0.0
+    for site, own in books.items():
+        energies = {f"taken by {site}": own.taken - np.maximum.accumulate(own.taken)}
+        if own.booked.store is not None:
+            energies[f"store of {site}"] = own.booked.store
+        for j, peer in enumerate(log[site].peers):  # what the peer had given by each tick of this site
+            other = books[peer]
+            gave = other.booked.gave[log[peer].peers.index(site)]
+            row = np.searchsorted(other.t_s, own.t_s + 1e-9, side="right") - 1
+            energies[f"line {peer}->{site}"] = gave[row] - own.booked.took[j]
+        for name, energy in energies.items():
+            low = int(energy.argmin())
+            least.append(LeastEnergy(name, float(energy[low]), float(own.t_s[low])))
+            largest = max(largest, float(energy.max()))
+    scale = max(largest, *(float(np.abs(own.port).max()) for own in books.values()))
+    residual = max(float(np.abs(own.residual).max()) for own in books.values())
+    sampling = max(float(own.leak.max()) for own in books.values())
+    premises = _check_premises(log, books, scale)
+    lowest = min(least, key=lambda one: one.amount_j)
+    failed = [premise.name for premise in premises if not premise.holds]
+    if not premises[0].holds:
+        finding, text = ObservedFinding.BROKEN, premises[0].text
+    elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale:
+        finding = ObservedFinding.NEGATIVE
+        text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
+    else:
+        finding, text = ObservedFinding.PASSIVE, f"{len(least)} energies, the largest {largest:.4g} J"
+        text += f"; but a premise fails: {', '.join(failed)}" * bool(failed)
+    return ObservedEnergy(finding, f"{finding}: {text}", premises, least, largest, residual, sampling)
+
+
+def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> list[Premise]:
+    """Returns what the verdict rests on: the books add up, torques are not cut off, sampling leaks little."""
+    residual = {site: float(np.abs(own.residual).max()) for site, own in books.items()}
+    site = max(residual, key=residual.__getitem__)
+    text = f"the law of {site} adds up to {residual[site]:.1e} J of {scale:.4g} J, the others closer"
+    premises = [Premise("books", residual[site] <= -LEAST_ENERGY_J + 1e-9 * scale, text)]
+    cut = [
+        name
+        for name in books
+        if (np.abs(log[name].tau) >= np.array(log.scenario.setup(name).tau_limit_nm)).any()
+    ]
+    text = (
+        f"cut off at {', '.join(cut)}: the arm got another one than the law books" if cut else "never cut off"
+    )
+    premises.append(Premise("torque", not cut, text))
+    leak = {name: float(own.leak.max()) for name, own in books.items()}
+    site = max(leak, key=leak.__getitem__)
+    text = f"the arm of {site} got up to {leak[site]:.3g} J more than its law books, between ticks"
+    premises.append(Premise("sampling", leak[site] <= SAMPLING_SHARE * scale + 1e-9, text))
+    return premises
