@@ -10,6 +10,7 @@ from . import (
     endurance,
     fused,
     links,
+    live,
     machine,
     presets,
     reading,
@@ -37,6 +38,7 @@ LONG = {
     "replay": replay.run,
     "stalls": stalls.run,
     "endurance": endurance.run,
+    "live": live.run,
 }
 """Only when they are named."""
 

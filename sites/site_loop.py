@@ -108,13 +108,10 @@ class StateBlock:
         self._turn = 3 * turn % self._ticks
         self._records: list[tuple[Any, ...]] = []
 
-    def add(self, output: TickRecord, *stamps: Any) -> None:
-        """Adds a record, with the further arguments of `encode_state`."""
+    def add(self, output: TickRecord, *stamps: Any) -> bool:
+        """Adds a record, with the further arguments of `encode_state`; true if a block is sent after it."""
         self._records.append((output, *stamps))
-
-    def due(self, k: int) -> bool:
-        """True at the ticks after which a block is sent."""
-        return (k + 1) % self._ticks == self._turn
+        return (output.tick + 1) % self._ticks == self._turn
 
     def flush(self) -> None:
         """Sends the records so far."""
@@ -145,8 +142,8 @@ class LoopIO(Protocol):
     def report(self, output: TickRecord) -> None:
         """Runs after a tick that took a command in, or at which the mode changed."""
 
-    def use_slack(self) -> object:
-        """Runs after a tick that left a quarter of its period."""
+    def use_slack(self) -> bool:
+        """Runs after a block, and again after the next tick if it returns true, in a quarter of a period."""
 
 
 def run_loop(
@@ -162,7 +159,8 @@ def run_loop(
 ) -> TickRecord | None:
     """Runs a site in real time, from tick 0, and returns its last record; None without a tick."""
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
-    busy_us, mode, last, deadline_ns = 0, Mode.RUN, None, timing.schedule.deadline(0)
+    busy_us, mode, last, asked = 0, Mode.RUN, None, False
+    deadline_ns = timing.schedule.deadline(0)
     for k in range(ticks):
         clock.sleep_until(deadline_ns)
         if io.should_stop():
@@ -176,10 +174,10 @@ def run_loop(
         last = output
         sent_ns, echo = timing.sent(k, clock.monotonic_ns()), timing.echo()
         io.publish_sample(encode_sample(site.name, boot, output, sent_ns, echo))
-        states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
+        block_due = states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
         stats.tick(late_us, busy_us)
         stats_due = stats.due(k)
-        if stats_due or states.due(k):  # statistics say that these records exist
+        if block_due or stats_due:  # statistics say that these records exist
             states.flush()
         if stats_due:
             io.publish_link(encode(stats.take(output, timing.measured(woke_ns))))
@@ -190,8 +188,8 @@ def run_loop(
             mode = output.mode
             io.report(output)
         deadline_ns = timing.schedule.deadline(k + 1)
-        if deadline_ns - clock.monotonic_ns() > quarter_ns:
-            io.use_slack()
+        if (block_due or asked) and deadline_ns - clock.monotonic_ns() > quarter_ns:
+            asked = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000
     states.flush()
     return last

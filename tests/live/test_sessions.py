@@ -4,6 +4,7 @@ import signal
 
 import pytest
 
+from sites.site_parts import warm_up
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import find_absent_samples
@@ -12,6 +13,7 @@ from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.scenario import load_scenario
 
 from .processes import (
     BEGUN,
@@ -42,9 +44,21 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, 
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20)])
+def test_arms_of_many_joints_live_are_virtual_time_bit_for_bit(
+    scenario: str, duration_s: int, stage: Stage
+) -> None:
+    warm_up(load_scenario(scenario), "m1")  # compiled once for all sites
+    session = Session(stage, scenario, PAPER, "--duration", str(duration_s))
+    session.all()
+    log = session.is_reproduced()
+    assert sum(len(log[name]) for name in PAPER) == 3000 * duration_s
+
+
+@pytest.mark.long
 def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> None:
     """With the `digital` scheme and a leader that comes last; and a second m1 is refused meanwhile."""
-    session = Session(stage, "paper", PAPER, "--duration", "8", "--set", 'scheme="digital"')
+    session = Session(stage, "paper", PAPER, "--duration", "16", "--set", 'scheme="digital"')
     session.all("recorder", "s", "m2", "m1")
     session.begun()
     (elsewhere,) = find_free_endpoints(1)

@@ -55,6 +55,18 @@ def is_core_cached() -> bool:
     return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
 
 
+def _mangle_record(record: numba.types.Record) -> tuple[str, tuple[str]]:
+    """Names a record in the symbols of machine code by its fields.
+
+    Numba numbers records in the order in which a process meets them. Leaves that two processes compiled for
+    two layouts then have the same symbols, and a third process that loads both from the cache mixes them up.
+    """
+    return "Record", (f"r{hashlib.sha256(record.name.encode()).hexdigest()[:16]}",)
+
+
+_record: Any = numba.types.Record
+_record.mangling_args = property(_mangle_record)
+
 _OPTIONS: Any = {"_nrt": False}
 """No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
 

@@ -1,0 +1,100 @@
+"""A live session of `paper`, five times: how long its ticks are busy, and how late, beside cyclictest.
+
+cyclictest (Debian: rt-tests) wakes once a millisecond at the sites' priority while they run. Where it is not
+installed, a thread of this process does, which takes what Python takes to wake up.
+
+A tick is busy from its waking until the loop sleeps again, all of it. That the sites keep one grid is read
+from their stamps: how long after the nominal time of its tick each sample was sent.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import threading
+import time
+
+import numpy as np
+
+from sites.realtime import FIFO_PRIORITY
+from trilat_net.log.log_reader import Log, open_log
+
+from .sessions import SITES, paper
+
+RUNS = 5
+DURATION_S = 20
+PERIOD_NS = 1_000_000
+BUSY_BAR_US, LATENESS_BAR, GRID_BAR_US = 45.0, 4.5, 200.0
+
+
+def run() -> list[str]:
+    waker = "cyclictest" if shutil.which("cyclictest") else "a sleeping thread of Python's"
+    print(f"{RUNS} sessions of {DURATION_S} s, {waker} beside them")
+    rows = []
+    for _ in range(RUNS):
+        log, beside_us = _run(waker)
+        busy_us = np.concatenate([log[name].busy_us for name in SITES])
+        late_us = np.concatenate([log[name].late_us for name in SITES])
+        sent_us = [np.median(_sent_after_us(log, name)) for name in SITES]
+        p50, (late_p50, late) = np.percentile(busy_us, 50), np.percentile(late_us, (50, 99))
+        rows.append((p50, late_p50, late, beside_us, late / beside_us, np.ptp(sent_us)))
+        by_site = ", ".join(f"{name} {at_us:.0f}" for name, at_us in zip(SITES, sent_us, strict=True))
+        print(
+            f"  busy p50 {p50:.0f} us; late p50 {late_p50:.0f}, p99 {late:.0f}, beside {beside_us:.0f} us: "
+            f"ratio {late / beside_us:.1f}; sent after the grid's tick, p50: {by_site} us",
+            flush=True,
+        )
+    busy, late_p50, late, beside_us, ratio, apart = np.median(rows, axis=0)
+    return [
+        f"  medians: busy p50 {busy:.0f} us (bar: <= {BUSY_BAR_US:g}); late p50 {late_p50:.0f}, "
+        f"p99 {late:.0f} us, beside {beside_us:.0f}, ratio {ratio:.1f} (bar: <= {LATENESS_BAR:g}); "
+        f"sites {apart:.0f} us apart on one grid (bar: <= {GRID_BAR_US:g})"
+    ]
+
+
+def _run(waker: str) -> tuple[Log, float]:
+    """Runs one session; returns its log, which is whole, and the p99 lateness of what woke beside it, us."""
+    with paper(DURATION_S) as session:
+        session.all()
+        session.begun()
+        priority = FIFO_PRIORITY * all("SCHED_FIFO" in session.processes[name].text() for name in SITES)
+        measure = _cyclictest_us if waker == "cyclictest" else _thread_us
+        beside_us = measure(priority, DURATION_S - 2)
+        session.codes()
+        log = open_log(session.log)
+        assert sum(len(log[name]) for name in SITES) == DURATION_S * 1000 * len(SITES)
+    return log, beside_us
+
+
+def _sent_after_us(log: Log, site: str) -> np.ndarray:
+    """Returns how long after the nominal times of its ticks a site sent its samples, by its clock, us."""
+    return np.array([(state.sent_ns - state.t_ns) / 1000 for state in log[site].states])
+
+
+def _cyclictest_us(priority: int, duration_s: int) -> float:
+    """Returns the 99th percentile of cyclictest's latencies, us."""
+    every_ms = ["cyclictest", "-q", "-m", "-i", "1000", "-h", "10000", "-D", str(duration_s)]
+    policy = ["-p", str(priority)] if priority else ["--policy=other"]
+    text = subprocess.run([*every_ms, *policy], capture_output=True, text=True, check=True).stdout
+    rows = np.array([line.split()[:2] for line in text.splitlines() if re.match(r"\d{6} \d{6}", line)], int)
+    counts = np.cumsum(rows[:, 1])
+    return float(rows[np.searchsorted(counts, 0.99 * counts[-1]), 0])
+
+
+def _thread_us(priority: int, duration_s: int) -> float:
+    """Returns the same of a thread that sleeps until each millisecond."""
+    late_ns: list[int] = []
+
+    def wake() -> None:
+        if priority:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        due_ns = time.monotonic_ns()
+        for _ in range(duration_s * 1000):
+            due_ns += PERIOD_NS
+            time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+            late_ns.append(time.monotonic_ns() - due_ns)
+
+    thread = threading.Thread(target=wake)
+    thread.start()
+    thread.join()
+    return float(np.percentile(late_ns, 99)) / 1000
