@@ -29,7 +29,17 @@ from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, Vector
 from ..errors import ScenarioError
-from .fields import Frozen, Joints, NotNegative, NotNegativeJoints, Positive, Real, VectorCounts, field_names
+from .fields import (
+    Frozen,
+    Joints,
+    KeyProblem,
+    NotNegative,
+    NotNegativeJoints,
+    Positive,
+    Real,
+    VectorCounts,
+    field_names,
+)
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
 Three = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
@@ -107,6 +117,8 @@ class Arm(Frozen, frozen=True):
         return theta_from_links(self.links)
 
 
+BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
+"""The keys of an arm that place it in space."""
 CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 """The keys of an arm that only a chain has."""
 
@@ -135,6 +147,21 @@ class Task(Frozen, frozen=True, omit_defaults=True):
     def shared(self) -> int:
         """How many coordinates the sites share; 0: as many as there are joints."""
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
+
+    def find_idle_key(self, written: Mapping[str, object]) -> KeyProblem | None:
+        """Returns a key of the written table that has no effect, or None."""
+        if not self.shared:
+            key = next((key for key in written if key != "space"), None)
+            problem = "has no effect while sites share joint angles: set task.space to 'position' or 'pose'"
+            return None if key is None else KeyProblem(key, problem)
+        foreign = [axis for axis in self.axes if axis not in TASK_AXES[: self.shared]]
+        if foreign:
+            return KeyProblem(
+                "axes", f"has {foreign[0]}, which belongs to a pose, and task.space is 'position'"
+            )
+        if self.posture_rad and not self.posture_rate_1_s:
+            return KeyProblem("posture_rad", "has no effect while posture_rate_1_s is 0")
+        return None
 
     @property
     def setup(self) -> TaskSetup | None:
@@ -213,6 +240,17 @@ class ArmModel(NamedTuple):
             return tuple(place.tolist())
         turned = turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
         return (*place.tolist(), *turned)
+
+    def task_jacobian(self, q: Vector) -> Array:
+        """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n), per joint."""
+        assert self.chain is not None
+        assert self.chain.task is not None
+        rows = build_chain(self.chain.joints)
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        place_end_effector(rows, np.array(self.chain.tip_m))
+        J = np.hstack([self.chain.task.scale * rows["J_lin"], rows["J_ang"]]).T
+        found: Array = J[: self.counts.shared]
+        return found
 
     def inertia(self, q: Array) -> Array:
         """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
-from .arms import read_arm
+from .arms import TASK_AXES, read_arm
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition, find_link_delays
 from .laws import Adaptive, AdaptiveBox, ControlLaw, ProportionalDamped, ProportionalDerivativeDamped
@@ -81,6 +81,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
         *describe_law_conditions(scenario),
         *_describe_arms(scenario),
+        *_describe_tasks(scenario),
         *(f"assumed: {text}" for text in scenario.assumed),
         *(
             f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
@@ -113,6 +114,23 @@ def _describe_arms(scenario: Scenario) -> list[str]:
             moved = f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"
             lines.append("; ".join([moved, *filter(None, facts)]))
         lines += [f"  note: {note}" for note in chain.notes]
+    return lines
+
+
+def _describe_tasks(scenario: Scenario) -> list[str]:
+    """Returns how far every site in task space starts from a singular pose."""
+    lines = []
+    for name, model in scenario.arms.items():
+        if model.shares_pose:
+            spec, followed = scenario.sites[name], np.array(model.axes) > 0.0
+            least = np.linalg.svd(model.task_jacobian(spec.q0_rad)[followed], compute_uv=False)[-1]
+            bound = spec.task.singular_value
+            near = ", so that its inverse is damped there" if least < bound else ""
+            axes = ", ".join(axis for axis, on in zip(TASK_AXES, followed, strict=False) if on)
+            lines.append(
+                f"{name} follows along {axes}: least singular value of its start pose {least:.3g}, damped "
+                f"below {bound:g}{near}"
+            )
     return lines
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
-from .arms import CHAIN_KEYS, Arm, ArmModel, Task, build_arm
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
@@ -33,6 +33,7 @@ from .fields import (
     expand_vectors,
     field_names,
     find_count_problem,
+    is_distribution,
     is_number,
     reword_problem,
     suggest_nearest,
@@ -285,7 +286,7 @@ def _model_arm(
     try:
         arm = msgspec.convert(table, Arm)
     except msgspec.ValidationError as error:
-        if not table.get("urdf"):
+        if not (table.get("urdf") or chains):
             return None
         problem, _, place = str(error).partition(" - at ")
         raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('`$.')}") from None
@@ -293,12 +294,24 @@ def _model_arm(
     if foreign:
         owner = f"belongs to the planar arm, and this one is {arm.urdf}" if arm.urdf else _OF_A_CHAIN
         raise ScenarioError(owner, path=f"{path}.{foreign[0]}")
+    if placed := [key for key in BASE_KEYS if key in table and not chains]:
+        problem = (
+            "has no effect where all arms are planar and share joint angles: set task.space, or leave it out"
+        )
+        raise ScenarioError(problem, path=f"{path}.{placed[0]}")
     if sum(abs(x) for x in arm.down) < 1e-6:
         raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
     try:
         task = msgspec.convert(task_table, Task)
-    except msgspec.ValidationError:
-        return None
+    except msgspec.ValidationError as error:
+        if any(map(is_distribution, task_table.values())):
+            return None
+        problem, _, place = str(error).partition(" - at ")
+        raise ScenarioError(
+            reword_problem(problem), path=f"{path.removesuffix('arm')}task.{place.strip('`$.')}"
+        ) from None
+    if idle := task.find_idle_key(task_table):
+        raise ScenarioError(idle.problem, path=f"{path.removesuffix('arm')}task.{idle.key}")
     try:
         return build_arm(arm, task, urdf, chains)
     except ScenarioError as error:

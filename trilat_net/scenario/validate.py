@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from ..errors import ScenarioError
+from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
@@ -33,6 +34,8 @@ from .operators import (
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 from .sent_vectors import check_sends
 
+RANK_TOLERANCE = 1e-6
+"""A singular value below this share of the largest is of a direction without motion."""
 FORCE_REFLECTION_SITES = 2
 """Sites of direct force reflection: one master, one slave."""
 
@@ -138,6 +141,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
     _check_joint_space(scenario)
     _check_start_poses(scenario)
+    _check_task_poses(scenario)
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
@@ -229,6 +233,39 @@ def _check_start_poses(scenario: Scenario) -> None:
                     f"from {joint.lower:g} to {joint.upper:g} {unit}: start within, or set stops = false",
                     path=path,
                 )
+
+
+def _check_task_poses(scenario: Scenario) -> None:
+    """Refuses an axis along which an end effector cannot move, and a start in a singular pose."""
+    for name, model in scenario.arms.items():
+        if not model.shares_pose:
+            continue
+        followed = [axis for axis, on in zip(TASK_AXES, model.axes, strict=False) if on]
+        J = model.task_jacobian(scenario.sites[name].q0_rad)[np.array(model.axes) > 0.0]
+        joints, path = model.counts.joints, f"sites.{name}.task.axes"
+        for axis, row in zip(followed, J, strict=True):
+            if np.abs(row).max() < RANK_TOLERANCE:
+                raise ScenarioError(
+                    f"has {axis}, along which no joint moves the end effector from its start pose: name the "
+                    "axes that the site shall follow, or start elsewhere (q0_rad)",
+                    path=path,
+                )
+        if len(followed) > joints:
+            raise ScenarioError(
+                f"follows {', '.join(followed)} with {joints} joints: name at most {joints} axes", path=path
+            )
+        directions, sizes, _ = np.linalg.svd(J)
+        if sizes[-1] < RANK_TOLERANCE * sizes[0]:
+            lost = " + ".join(
+                f"{part:.2g} {axis}"
+                for part, axis in zip(directions[:, -1], followed, strict=True)
+                if abs(part) > RANK_TOLERANCE
+            )
+            raise ScenarioError(
+                f"is a singular pose: its end effector cannot move along {lost}; bend a joint, or follow "
+                "fewer axes (task.axes)",
+                path=f"sites.{name}.q0_rad",
+            )
 
 
 def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:

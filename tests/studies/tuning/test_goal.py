@@ -105,7 +105,7 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
 )
 def test_what_only_runs_live_or_has_no_common_angles_is_refused(setting: str, word: str) -> None:
     with pytest.raises(ScenarioError) as refused:
-        check_comparable(load_scenario("free", [setting]))
+        check_comparable(load_scenario("free", [setting, 'task.axes=["x", "y"]'][: 1 + ("task" in setting)]))
     assert word in str(refused.value)
 
 

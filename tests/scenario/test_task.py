@@ -1,0 +1,78 @@
+"""Mistakes of sites in task space, and keys without effect: each is refused at its own key."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.task_arms import planar_task
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.scenario.describe import describe_scenario
+
+TEXT = planar_task()
+
+
+@pytest.mark.parametrize(
+    ("changes", "path", "words"),
+    [
+        (
+            {"sites.s.q0_rad": [0.1, 0.0]},
+            "sites.s.q0_rad",
+            "singular pose: its end effector cannot move along",
+        ),
+        ({"task.axes": ["x", "y", "z"]}, "sites.m.task.axes", "has z, along which no joint moves"),
+        ({"task.axes": []}, "sites.m.task.axes", "has z, along which no joint moves"),
+        ({"task.axes": ["x", "rx"]}, "sites.m.task.axes", "rx, which belongs to a pose"),
+        ({"task.axes": ["q"]}, "sites.m.task.axes[0]", "Invalid enum value 'q'"),
+        ({"task.space": "place"}, "sites.m.task.space", "Invalid enum value 'place'"),
+        ({"task.scale": 0}, "sites.m.task.scale", "> 0"),
+        ({"task.posture_rad": [0, 0]}, "sites.m.task.posture_rad", "while posture_rate_1_s is 0"),
+        (
+            {"task.posture_rad": [0, 0, 0], "task.posture_rate_1_s": 1},
+            "sites.m.task.posture_rad",
+            "has 3 numbers, and the arm has 2 joints",
+        ),
+        ({"task.space": "joints"}, "sites.m.task.axes", "has no effect while sites share joint angles"),
+        ({"sites.m.arm.base_xyz_m": [0, 0]}, "sites.m.arm.base_xyz_m", "length"),
+    ],
+)
+def test_a_mistake_of_a_task_is_refused_at_its_key(changes: dict[str, Any], path: str, words: str) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        parse_scenario(TEXT, overrides=changes)
+    assert (refused.value.path, words in refused.value.problem) == (path, True), refused.value
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "words"),
+    [
+        ("free", "arm.base_xyz_m", [1, 0, 0], "all arms are planar"),
+        ("free", "arm.base_rpy_rad", [1, 0, 0], "all arms are planar"),
+        ("free", "task.scale", 0.3, "sites share joint angles"),
+        ("free", "task.singular_value", 0.3, "sites share joint angles"),
+    ],
+)
+def test_a_key_without_effect_is_refused(name: str, key: str, value: Any, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words) as refused:
+        load_scenario(name, {key: value})
+    assert refused.value.path == f"sites.m1.{key}"
+
+
+def test_an_arm_that_gravity_does_not_turn_is_accepted() -> None:
+    """Its first axis is along gravity: it is weightless there, and learns nothing of it."""
+    scenario = load_scenario("unlike_arms", {"sites.s.arm.down": [0.0, 0.0, 5.0]})
+    chain = scenario.arms["s"].chain
+    assert chain is not None
+    assert np.linalg.norm(chain.gravity_m_s2) == pytest.approx(9.81)
+
+
+@pytest.mark.parametrize(("elbow_rad", "damped"), [(0.01, True), (1.7, False)])
+def test_a_start_near_a_singular_pose_is_told(elbow_rad: float, damped: bool) -> None:
+    """The least singular value of a two-link arm of equal lengths, from its determinant sin q2."""
+    lines = describe_scenario(parse_scenario(planar_task(elbow_rad=elbow_rad)))
+    (line,) = [line for line in lines if line.startswith("s follows along x, y")]
+    c, s = np.cos(elbow_rad), np.sin(elbow_rad)
+    squares = 3.0 + 2.0 * c  # of all entries of J
+    least = np.sqrt(0.5 * (squares - np.sqrt(squares**2 - 4.0 * s * s)))
+    assert f"start pose {least:.3g}," in line
+    assert ("its inverse is damped" in line) == damped
