@@ -13,7 +13,7 @@ from tests.theory.delay_equations import equations
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.process import count_cores, worker_pool
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import classify_cell
 
 from .stopwatch import best_s
@@ -26,28 +26,7 @@ ASKED = 10_000
 def run() -> list[str]:
     scenario = load_scenario("free", {"duration_s": 20.0})
     real_s = scenario.duration_s
-
-    def fused() -> FusedRun:
-        whole = FusedRun(scenario)
-        whole.advance(real_s)
-        return whole
-
-    def per_tick() -> np.ndarray:
-        last = {s.site.name: s.output.q for s in virtual.execute_virtual(scenario)}
-        return np.array([last[name] for name in scenario.names])
-
-    fused_s = best_s(fused, 40)
-    per_tick_s = best_s(per_tick, 3)
-    whole = fused()
-    same = np.array_equal(whole.records[:, :2], per_tick())
-    lines = [
-        f"free, {real_s:g} s, three sites at 1 kHz, on one core; best of some runs:",
-        f"  fused kernel: {real_s / fused_s:.0f} x real time, "
-        f"{1e9 * fused_s / (3e3 * real_s):.0f} ns a site tick",
-        f"  per-tick driver, no log: {real_s / per_tick_s:.1f} x real time; "
-        f"fused is {per_tick_s / fused_s:.0f} times as fast; "
-        f"last poses equal bit for bit: {'yes' if same else 'NO'}",
-    ]
+    lines, whole, fused_s = _both_drivers(scenario, 40)
     for tolerance in (1e-5, 1e-11):
         problem = dataclasses.replace(equations(scenario), tolerance=tolerance, starts=[], pieces=[])
         begun = time.perf_counter()
@@ -58,7 +37,37 @@ def run() -> list[str]:
             f"  SciPy DOP853, rtol {tolerance:g}: {real_s / scipy_s:.1f} x real time; fused is "
             f"{scipy_s / fused_s:.0f} times as fast; last poses {apart:.1e} rad apart"
         )
+    for name in ("six_joints", "seven_joints"):
+        lines += _both_drivers(load_scenario(name, {"duration_s": 2.0}), 5)[0]
     return [*lines, *_on_all_cores(real_s)]
+
+
+def _both_drivers(scenario: Scenario, runs: int) -> tuple[list[str], FusedRun, float]:
+    """What both drivers take for a scenario; its fused run, and the time of the best of so many."""
+    real_s = scenario.duration_s
+
+    def fused() -> FusedRun:
+        whole = FusedRun(scenario)
+        whole.advance(real_s)
+        return whole
+
+    def per_tick() -> np.ndarray:
+        last = {s.site.name: s.output.q for s in virtual.execute_virtual(scenario)}
+        return np.array([last[name] for name in scenario.names])
+
+    fused_s = best_s(fused, runs)
+    per_tick_s = best_s(per_tick, 3)
+    whole, poses = fused(), per_tick()
+    same = np.array_equal(whole.records[:, : poses.shape[1]], poses)
+    lines = [
+        f"{scenario.name}, {real_s:g} s, three sites at 1 kHz, on one core; best of some runs:",
+        f"  fused kernel: {real_s / fused_s:.0f} x real time, "
+        f"{1e9 * fused_s / (3e3 * real_s):.0f} ns a site tick",
+        f"  per-tick driver, no log: {real_s / per_tick_s:.1f} x real time; "
+        f"fused is {per_tick_s / fused_s:.0f} times as fast; "
+        f"last poses equal bit for bit: {'yes' if same else 'NO'}",
+    ]
+    return lines, whole, fused_s
 
 
 def _on_all_cores(real_s: float) -> list[str]:

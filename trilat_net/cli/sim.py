@@ -35,7 +35,9 @@ def sim_command(
         raise typer.Exit(interrupt.exit_code)
     terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
     if not within:
+        chains = any(spec.arm.urdf for spec in chosen.sites.values())
         terminal.print_error(
             f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there"
+            + ("; a urdf states such limits, and limits.qd_limit_rad_s others" if chains else "")
         )
         raise typer.Exit(1)
