@@ -8,8 +8,19 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
+from trilat_net.analysis.run_end import (
+    NO_BUCKETS,
+    EndBehaviour,
+    RunTrace,
+    Stability,
+    classify_log_end,
+    classify_run_end,
+    reduce_to_buckets,
+)
+from trilat_net.core.ticks import BUCKETS_PER_S
+from trilat_net.core.vectors import Array
 from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
 
 
 @cache
@@ -153,17 +164,18 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
 
 
 @pytest.mark.parametrize(
-    ("angle", "tau_x", "stability", "says"),
+    ("angle", "e", "tau_x", "stability", "says"),
     [
-        (0.05, 0.0, Stability.OPEN, "m and s stand 0.05 rad apart"),
-        (0.05, 1.0, Stability.STABLE, ""),
-        (0.01, 0.0, Stability.STABLE, ""),
+        (0.05, 0.0, 0.0, Stability.OPEN, "m and s stand 0.05 rad apart"),
+        (0.05, 0.0, 1.0, Stability.OPEN, "m and s stand 0.05 rad apart"),  # what pulls at s has no effect
+        (0.05, 0.05, 1.0, Stability.STABLE, ""),
+        (0.01, 0.0, 0.0, Stability.STABLE, ""),
     ],
 )
-def test_sites_at_rest_must_agree_where_no_force_holds_them_apart(angle, tau_x, stability, says) -> None:
+def test_sites_at_rest_must_agree_where_no_force_holds_them_apart(angle, e, tau_x, stability, says) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
-        return logs.replaced(state, q=q, q_des=q, qd=[0.0, 0.0], tau_x=[tau_x, 0.0])
+        return logs.replaced(state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0])
 
     found = classify_log_end(logs.rewritten(still(), change=changed))
     assert found.stability is stability
@@ -193,3 +205,53 @@ def test_a_joint_is_no_oscillation_while_a_faster_one_that_may_feed_it_falls(
         return logs.replaced(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
 
     assert classify_log_end(logs.rewritten(still(), change=changed)).behaviour is motion
+
+
+RATE_HZ, SPAN_S = 50, 40.0
+T_S = np.arange(round(RATE_HZ * SPAN_S)) / RATE_HZ
+
+
+def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
+    """A run of three sites whose joints swing at 1 Hz, or go one way, at a speed, without errors."""
+    qd = np.tile((speed * (1.0 if one_way else np.cos(2.0 * np.pi * T_S)))[:, None], 2)
+    q = np.cumsum(qd, axis=0) / RATE_HZ
+    bucket = np.arange(len(T_S)) * BUCKETS_PER_S // RATE_HZ
+    buckets = reduce_to_buckets(bucket, np.zeros_like(q), qd, q, NO_BUCKETS)
+    return RunTrace([buckets] * 3, [np.zeros(2)] * 3)
+
+
+@pytest.mark.parametrize(
+    ("speed", "behaviour"),
+    [
+        (lambda t: 5e-3 * np.exp(-0.01 * t), EndBehaviour.CONVERGED),
+        (lambda t: 5e-3 * np.exp(0.001 * t), EndBehaviour.UNDECIDED),
+        (lambda t: 5e-3 + 0.0 * t, EndBehaviour.UNDECIDED),
+        (lambda t: 1e-7 + 0.0 * t, EndBehaviour.CONVERGED),
+    ],
+    ids=["falls", "grows slowly", "goes on", "too slow to see"],
+)
+def test_a_small_speed_is_rest_only_if_it_falls(speed, behaviour: EndBehaviour) -> None:
+    scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
+    assert classify_run_end(scenario, trace(speed(T_S))).behaviour is behaviour
+
+
+@pytest.mark.parametrize(
+    ("speed_rad_s", "behaviour"),
+    [(3e-4, EndBehaviour.CONVERGED), (1e-3, EndBehaviour.UNDECIDED), (4e-3, EndBehaviour.DRIFTS)],
+)
+def test_what_sinks_slowly_has_not_converged(speed_rad_s: float, behaviour: EndBehaviour) -> None:
+    """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
+    scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
+    sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
+    assert classify_run_end(scenario, sinking).behaviour is behaviour
+
+
+@pytest.mark.parametrize(
+    ("at_s", "stability"), [(15.0, Stability.STABLE), (35.0, Stability.STABLE), (39.0, Stability.OPEN)]
+)
+def test_a_loop_that_changes_last_must_be_seen_after_that(at_s: float, stability: Stability) -> None:
+    later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
+    scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
+    found = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
+    assert found.stability is stability
+    assert ("the loop changes until 39 s" in found.text) is (stability is Stability.OPEN)

@@ -46,7 +46,7 @@ from trilat_net.studies.sweep.cell_result import classify_cell
 from trilat_net.theory.end_pose import find_end_pose_roots
 from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
-from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions, is_constant_link
 
 LONGER = 8.0
 """The run that knows the truth is so many times as long."""
@@ -183,6 +183,24 @@ PARAMETRIC = {
 HANGS = {"control.Gamma": [1.0, 1.0, 1.0, 0.01, 0.01], "control.theta_hat0": [3.0, 1.0, 1.0, 1.6, 0.8]}
 NUDGE = [{"kind": "pulse", "start_s": 20.0, "end_s": 39.9, "peak_nm": [8.0, 8.0]}]
 
+LOSSY = {"link.loss": 1e-6}
+CLOSE = {"sites.m1.q0_rad": [0.1, 0.2], "sites.m2.q0_rad": [0.102, 0.199], "sites.s.q0_rad": [0.099, 0.203]}
+STIFF = {"control.K": 100.0, "control.d": 200.0, "rate_hz": 1000, "duration_s": 20.0}
+
+
+def _slower_from(at_s: float, d: float) -> Callable[[], Scenario]:
+    """P+d whose delay becomes longer, on links that lose a sample now and then."""
+    to = {"delay_ms": 900.0, "loss": 1e-6}
+    later = [{"at_s": at_s, "link": link, "to": to} for link in load_scenario("p_d_margin").links]
+    return _margin(LOSSY | {"timeline": later}, d=d)
+
+
+def _touched(across: float) -> Callable[[], Scenario]:
+    """Two pairs of arms, of which a hand touches one, weakly."""
+    hand = {"kind": "spring", "to_rad": [0.9, 0.9], "stiffness_nm_rad": 0.01}
+    return lambda: load_scenario(two_pairs(LEARNT, APART, across), {"sites.a.hands": [hand]})
+
+
 ROWS = (
     Row(
         "F1", "the wide group decays, the small one grows", _pairs(p_d(2.4), p_d(1.7)), NEVER_STABLE, "joint"
@@ -199,8 +217,19 @@ ROWS = (
     Row("F5", "P+d, 1.6 s, d 2.7", _margin(d=2.7, T_ms=1600.0, duration_s=60.0), NEVER_STABLE, "unstable"),
     Row("F5", "P+d, 0.8 s, d 2", _margin(d=2.0, T_ms=800.0, duration_s=60.0), NEVER_STABLE, "unstable"),
     Row("F5=", "P+d, 1.6 s, d 16", _margin(d=16.0, T_ms=1600.0, duration_s=120.0), STABLE),
+    Row("F5", "at its edge, if a sample is lost", _margin(CLOSE | LOSSY, d=0.96), NEVER_STABLE),
+    Row("F5=", "beyond its edge, the same", _margin(CLOSE | LOSSY, d=1.2), STABLE),
+    Row(
+        "F5",
+        "1.56 s, d 2.6, if a sample is lost",
+        _margin(LOSSY, d=2.6, T_ms=1560.0, duration_s=120.0),
+        NEVER_STABLE,
+        "of the mean ages",
+    ),
+    Row("F5=", "1.56 s, d 16, the same", _margin(LOSSY, d=16.0, T_ms=1560.0, duration_s=120.0), STABLE),
     Row("F6", "two pairs that hardly hear of each other", _pairs(*LEARNT, 1e-6), NEVER_STABLE, "apart"),
     Row("F6=", "two pairs that do", _pairs(*LEARNT, 0.3), STABLE),
+    Row("F6", "a hand that cannot hold them apart", _touched(1e-6), NEVER_STABLE, "apart"),
     Row("F7", "20 ms of free motion", _free({"sites.m1.hands": WIDER}), NEVER_STABLE, "operator acts"),
     Row("F7", "100 ms of it, after a push", _free({"sites.m1.hands": NUDGE}), NEVER_STABLE, "operator acts"),
     Row("F7=", "30 s of it", _free({"sites.m1.hands": EARLY}), STABLE),
@@ -222,10 +251,16 @@ ROWS = (
     Row("F9", "a torque limit of 15 N m", _free(limits__tau_limit_nm=15.0), NEVER_STABLE, "v ends"),
     Row("F9=", "a torque limit of 100 N m", _free(limits__tau_limit_nm=100.0), STABLE),
     Row("F9=", "gravity known", _margin(duration_s=60.0), STABLE),
+    Row("F9", "arms that sink slowly", _margin(STIFF | {"control.gravity": 0.99}), NEVER_STABLE),
+    Row("F9=", "arms that do not", _margin(STIFF), STABLE),
     Row("W", "a hand swings ever wider", _margin({"sites.m1.hands": WIDER}), ("open",), "operator acts"),
     Row(
         "W", "a hand swings on at the slave", _margin({"sites.s.hands": LASTING}), ("open",), "operator acts"
     ),
+    Row(
+        "W", "a delay that is too long in the end", _slower_from(39.9, 2.0), NEVER_STABLE, "the loop changes"
+    ),
+    Row("W=", "a longer delay since long", _slower_from(15.0, 5.0), STABLE),
     Row("W=", "the hand lets go", _margin({"sites.m1.hands": EARLY}), STABLE),
 )
 
@@ -505,13 +540,14 @@ def say_of_run(scenario: Scenario) -> str:
     """The word of `trilat certify` on a scenario's run, and no log is made where none is needed.
 
     A run whose end is not stable keeps that word. Else the roots at the end pose have a say, and V, if
-    the law has one: that takes all records.
+    the law has one: that takes all records, and so do ages that vary.
     """
     run = RunInMemory(scenario)
     end = run.find_end()
     if end.stability is not Stability.STABLE:
         return str(end.stability)
-    if not any(map(explain_missing_functional, scenario.sites.values())):
+    varies = not all(map(is_constant_link, scenario.links.values()))
+    if varies or not any(map(explain_missing_functional, scenario.sites.values())):
         return say_of(trilat_net.simulate(scenario))
     no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")
     ticks = {site: scenario.ticks(site) for site in scenario.names}

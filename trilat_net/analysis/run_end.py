@@ -4,11 +4,11 @@ Invariant: every command takes its word from here (docs/definitions.md, "Stable"
 judged by itself, and the worst decides; a word states what the record shows and predicts nothing. What else
 is known of a whole log (V, the roots at its end pose) may make a stable run open, never the reverse.
 
-The judged part is the second half of the run, or what follows the last act of an operator if that is less and
-long enough. It is called the half below. It is divided into n equal windows, n = 16 and, if those do not
-decide, n = 8. A window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the
-logarithms of these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of
-freedom).
+The judged part is the second half of the run, or what follows the last act of an operator and the last change
+of the loop if that is less and long enough. It is called the half below. It is divided into n equal windows,
+n = 16 and, if those do not decide, n = 8. A window counts with its largest value, at least `FLOOR_RAD`. A
+straight line is fitted to the logarithms of these maxima, with the one-sided 99.5 % bounds of its slope
+(Student's t, n - 2 degrees of freedom).
 
 GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or more each;
 and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first,
@@ -28,7 +28,7 @@ excludes growth that begins later, or a beat longer than the run, whose rising f
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -65,15 +65,19 @@ THROWN_RAD = 0.5 * math.pi
 """Arms that nobody pushed and that end further from every start pose were thrown there, rad."""
 
 DRIFT_RAD = 0.05
-"""A joint that goes by more in one direction over the judged half may drift, rad."""
+"""A joint that goes by more in one direction over the judged half may drift, rad; for one that is as slow as
+at rest, `SETTLED_ERROR_RAD` leaves that undecided."""
 
 FORCE_NM = 1e-3
-"""A larger torque of an operator or environment at the end may hold sites apart, N m."""
+"""A larger torque of an operator or environment at the end may hold sites apart, N m, and"""
+HELD_SHARE = 0.02
+"""an error of so much of their distance says that it does: what is pulled at has one."""
 
 LEAST_JUDGED_S = 2.0
-"""What follows the last act of an operator is judged by itself if it lasts so long, s, and"""
+"""What follows the last act of an operator or change of the loop is judged by itself if it lasts so long, s,
+and"""
 LEAST_JUDGED_SHARE = 0.1
-"""this share of the run; else the second half is, and the operator acts in it."""
+"""this share of the run; else the second half is, with the act or the change in it."""
 
 MIN_SIGN_CHANGES = 6
 """Fewer changes of sign in the second half of a run show no period."""
@@ -126,6 +130,9 @@ class EndBehaviour(StrEnum):
             return Stability.STABLE
         undecided = self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
         return Stability.OPEN if undecided else Stability.NOT_STABLE
+
+
+_MOVES_ON = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
 
 class EnvelopeFit(NamedTuple):
@@ -226,12 +233,14 @@ class RunTrace(NamedTuple):
         tau_x: the torque of operator and environment at its last record, shape (n,), N m.
         diverged_at_s: when the first site left its limits, or None.
         pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for never.
+        changed_until_s: when a command last changed the loop, s; 0 for never.
     """
 
     buckets: Sequence[Array]
     tau_x: Sequence[Array]
     diverged_at_s: float | None = None
     pushed_until_s: float = 0.0
+    changed_until_s: float = 0.0
 
 
 NO_BUCKETS = np.zeros((0, 3))
@@ -273,6 +282,7 @@ def trace_log(log: Log) -> RunTrace:
         [part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
         first_divergence_s(log),
         max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
+        max((tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)), default=0.0),
     )
 
 
@@ -288,16 +298,20 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     sites = _split_buckets(scenario, trace.buckets)
     count = max(min(map(len, sites)) - 1, 0)
     kept = np.flatnonzero(np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0))
-    acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, count / BUCKETS_PER_S))
-    first, acts = _choose_judged_part(kept / BUCKETS_PER_S, acted_s)
-    kept = kept[first:]
-    t_s, columns = np.asarray(kept / BUCKETS_PER_S), [site[kept] for site in sites]
+    span_s, t_s = count / BUCKETS_PER_S, kept / BUCKETS_PER_S
+    acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, span_s))
+    changed_s = max(trace.changed_until_s, find_last_change(scenario, span_s))
+    first, late = _choose_judged_part(t_s, max(acted_s, changed_s))
+    acts = late and _choose_judged_part(t_s, acted_s)[1]
+    t_s, columns = t_s[first:], [site[kept[first:]] for site in sites]
     missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
     end = _find_worst_joint(scenario, t_s, columns, sites)._replace(missing_sites=missing)
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
         reasons = (*_find_disagreement(scenario, trace, t_s, columns), *_find_odd_pose(scenario, sites))
+        if late and not acts:
+            reasons += (f"the loop changes until {changed_s:.4g} s, within the judged part",)
         return end._replace(reasons=reasons)
     why = f"an operator acts until {acted_s:.4g} s, within the judged part"
     return end._replace(operator_acts=True, reasons=(why,)) if acts else end
@@ -336,8 +350,11 @@ def _find_worst_joint(
         trends = [[next(fits) for _ in kind] for kind in ends]
         for joint, (end_error, end_speed) in enumerate(zip(*ends, strict=True)):
             error, speed = (kind[joint] for kind in trends)
-            behaviour = _classify_joint(error, speed, end_error, end_speed)
-            if behaviour in (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED):
+            still = speed.trend is EnvelopeTrend.DECAYS or end_speed <= FLOOR_RAD  # too slow for a trend
+            settles = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
+            rests = end_speed <= SETTLED_SPEED_RAD_S and (still or (speed.calm and settles))
+            behaviour = _classify_joint(error, speed, end_error, end_speed, still=still, rests=rests)
+            if behaviour in _MOVES_ON or (behaviour is EndBehaviour.CONVERGED and not still):
                 behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s)
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
             joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
@@ -365,29 +382,34 @@ def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int
 
 
 def _classify_joint(
-    error: EnvelopeFit, speed: EnvelopeFit, end_error_rad: float, end_speed_rad_s: float
+    error: EnvelopeFit,
+    speed: EnvelopeFit,
+    end_error_rad: float,
+    end_speed_rad_s: float,
+    *,
+    still: bool,
+    rests: bool,
 ) -> EndBehaviour:
     """Returns the class that the trends of a joint's |e| and |qd| have together.
 
     Errors that grow while the joint gets no faster may start a drift, or follow from what an operator has
-    just done: undecided. The reverse is growth: arms that swing in unison have no error.
+    just done: undecided. The reverse is growth: arms that swing in unison have no error. A joint is `still`
+    if its speed decays, and `rests` if it is slow and falls, however little; what goes on at a small speed
+    may go on for ever, or grow. That of arms outside of the program need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
-    falls = speed.trend is EnvelopeTrend.DECAYS or end_speed_rad_s <= FLOOR_RAD  # too slow for a trend
-    rests = end_speed_rad_s <= SETTLED_SPEED_RAD_S
-    slow = rests and (falls or speed.calm)
-    if not slow and not falls:
-        if rests:  # it hardly moves, and its trend says nothing
+    if not rests and not still:
+        if end_speed_rad_s <= SETTLED_SPEED_RAD_S:  # it hardly moves, and its trend says nothing
             return EndBehaviour.UNDECIDED
-        still = {EnvelopeTrend.HARDLY: EndBehaviour.HARDLY, EnvelopeTrend.STEADY: EndBehaviour.BOUNDED}
-        return still.get(speed.trend, EndBehaviour.UNDECIDED)
+        goes_on = {EnvelopeTrend.HARDLY: EndBehaviour.HARDLY, EnvelopeTrend.STEADY: EndBehaviour.BOUNDED}
+        return goes_on.get(speed.trend, EndBehaviour.UNDECIDED)
     if error.calm and (end_error_rad <= SETTLED_ERROR_RAD or error.trend is EnvelopeTrend.STEADY):
-        return EndBehaviour.CONVERGED if slow else EndBehaviour.DECAYS
+        return EndBehaviour.CONVERGED if rests else EndBehaviour.DECAYS
     if error.trend is EnvelopeTrend.DECAYS:
-        near = slow and end_error_rad <= SETTLED_ERROR_RAD
+        near = rests and end_error_rad <= SETTLED_ERROR_RAD
         return EndBehaviour.CONVERGED if near else EndBehaviour.DECAYS
     return EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
 
@@ -396,7 +418,8 @@ def _name_motion(behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array) 
     """Returns the class of a joint that moves on, by where it goes in the judged half.
 
     It drifts if every quarter takes half of its share or more in one way, and its mean speed is at least half
-    of the largest: what swings on its way is no drift. A bounded oscillation changes its sign.
+    of the largest: what swings on its way is no drift. A bounded oscillation changes its sign. What is as
+    slow as at rest, and goes one way, is undecided before that.
     """
     if len(t_s) < BUCKETS_PER_S:
         return behaviour
@@ -405,8 +428,11 @@ def _name_motion(behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array) 
     way = np.diff(q[marks])
     total = abs(float(way.sum()))
     steady = float((way * np.sign(way.sum())).min()) >= 0.125 * total
-    if total >= DRIFT_RAD and steady and total >= 0.5 * (t_s[-1] - t_s[first]) * fastest[first:].max():
-        return EndBehaviour.DRIFTS
+    if steady and total >= 0.5 * (t_s[-1] - t_s[first]) * fastest[first:].max():
+        if total >= DRIFT_RAD:
+            return EndBehaviour.DRIFTS
+        if total >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
+            return EndBehaviour.UNDECIDED
     swings = behaviour is not EndBehaviour.BOUNDED or _count_sign_changes(q[first:]) >= MIN_SIGN_CHANGES
     return behaviour if swings else EndBehaviour.UNDECIDED
 
@@ -434,15 +460,15 @@ def _find_disagreement(
 ) -> Iterable[str]:
     """Yields what is said of sites that do not agree, do not come closer, and are held apart by no force."""
     for group in find_coupled_sites(scenario):
-        if len(group) < 2 or max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM:
-            continue
-        if any(scenario.arms[scenario.names[n]].shares_pose for n in group):  # e says if they agree
-            continue
+        if len(group) < 2 or any(scenario.arms[scenario.names[n]].shares_pose for n in group):
+            continue  # e says if they agree
         q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)
         joint = int(apart[-1].argmax())
         nearer = fit_envelope(t_s, apart.max(axis=1)).trend is EnvelopeTrend.DECAYS
-        if apart[-1, joint] > AGREEMENT_RAD and not nearer:
+        pulled = max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM
+        held = pulled and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
+        if apart[-1, joint] > AGREEMENT_RAD and not (nearer or held):
             ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
             yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
 
@@ -451,17 +477,20 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
-    hanging = [
-        name
-        for name, start, end in zip(scenario.names, starts, ends, strict=True)
-        if (arm := build_arm_rows(scenario, name)).hangs(end) and not arm.hangs(start)
-    ]
+    hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))
     away = [_distance_rad(end, [q for q in starts if len(q) == len(end)]) for end in ends]
     n = int(np.argmax(away))
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
     elif away[n] > THROWN_RAD and not (scenario.external or any(s.hands for s in scenario.sites.values())):
         yield f"{scenario.names[n]} ends {away[n]:.3g} rad away from every start pose, and nobody pushed"
+
+
+def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
+    """Returns the sites, of those whose last angles are given, whose arms hang and did not at the start."""
+    arms = {name: build_arm_rows(scenario, name) for name in ends}
+    starts = {name: np.array(scenario.sites[name].q0_rad) for name in ends}
+    return [name for name, q in ends.items() if arms[name].hangs(q) and not arms[name].hangs(starts[name])]
 
 
 def _distance_rad(q: Array, starts: Sequence[Array]) -> float:
@@ -480,6 +509,15 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
             edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
             last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))
     return last_s
+
+
+def find_last_change(scenario: Scenario, span_s: float) -> float:
+    """Returns when the loop last changed before the end of a run, s: by its timeline or an environment."""
+    ends_s = [change.at_s + change.ramp_s for change in scenario.timeline if change.at_s < span_s]
+    for spec in scenario.sites.values():
+        edges = (at_s for one in spec.environment for at_s in (one.actor.start_s, one.actor.end_s))
+        ends_s += [at_s for at_s in edges if at_s < span_s]
+    return max([0.0, *ends_s])
 
 
 def _frequency_hz(parts: list[SiteLog]) -> float | None:

@@ -48,8 +48,8 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     if found.observed is not None:
         lines.append((_OBSERVED[found.observed.finding], found.observed.text))
     if found.roots is not None:
-        decides = found.roots.exact and found.roots.verdict
-        lines.append((_ROOTS.get(decides or "", "note"), found.roots.text))
+        doubtful = not found.roots.exact and found.roots.verdict == "stable"
+        lines.append(("note" if doubtful else _ROOTS.get(found.roots.verdict, "note"), found.roots.text))
     intact = "open" if found.evidence.reasons else "ok"
     mark = intact if found.evidence.integrity.passed else "FAIL"
     lines.append((mark, f"log: {found.evidence.text}"))

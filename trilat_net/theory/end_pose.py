@@ -1,7 +1,8 @@
 """The loop linearised where a recorded run ended, beside the certificate of its log.
 
 Invariant: the roots are those at the log's own end pose and estimates, under the conditions at its end; they
-speak of small motions there. Nothing is executed.
+speak of small motions there. Where a delay varies, or was measured, they are those of the mean age that the
+records have. Nothing is executed.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
+from ..scenario.delay_models import ConstantDelay
 from .equilibrium import follow_equilibrium
 from .linear_edge import find_deepest_contact
 from .operating_point import Equilibrium, derive_operating_conditions, is_constant_link
@@ -48,23 +50,42 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _no_roots("the run diverged")
     if any(log.changes(site) for site in log.sites):
         return _no_roots("commands changed the loop while it ran")
-    if not all(map(is_constant_link, log.scenario.links.values())):
-        return _no_roots("delays vary")
-    scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
+    scenario, mean_s = _fix_delays(log)
     try:
         conditions = derive_operating_conditions(scenario)
+        for at, age_s in mean_s.items():
+            conditions.age_s[at] = age_s
         q, theta_hat = _choose_state(scenario, parts)
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
     except ScenarioError as error:
         return _no_roots(error.problem)
     decisive = compute_decisive_spectrum(conditions, rest, _ROOTS, _ROOTS)
-    root, verdict = decisive.rightmost, decisive.verdict
+    root, verdict, exact = decisive.rightmost, decisive.verdict, not (conditions.varying or mean_s)
     if root is None:
-        return EndPoseRoots(verdict, None, not conditions.varying, f"this rest: {verdict}, without roots")
+        return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    mean = ", of the mean ages" if conditions.varying else ""
-    text = f"this rest: {verdict}, {root.s.real:+.3g} /s{omega}{mean}"
-    return EndPoseRoots(verdict, root.s.real, not conditions.varying, text)
+    mean = "" if exact else ", of the mean ages"
+    return EndPoseRoots(
+        verdict, root.s.real, exact, f"this rest: {verdict}, {root.s.real:+.3g} /s{omega}{mean}"
+    )
+
+
+def _fix_delays(log: Log) -> tuple[Scenario, dict[tuple[int, int], float]]:
+    """Returns the scenario that a log ran, with constant delays in place of those that vary or were measured.
+
+    And per (receiver, sender) of such a link the mean age of the sample in use over the last quarter, s.
+    """
+    names, mean_s, links = log.scenario.names, {}, dict(log.scenario.links)
+    for name, link in log.scenario.links.items():
+        peer, site = name.split("->")
+        used = log[site].used[peer]
+        rows = (used >= 0) & (log[site].t_s >= 0.75 * log[site].t_s[-1])
+        if not is_constant_link(link) and rows.any():
+            age_s = log[site].t_s[rows] - used[rows] / log[peer].rate_hz
+            at = names.index(site), names.index(peer)
+            mean_s[at] = float(age_s.mean())
+            links[name] = ConstantDelay(delay_ms=1e3 * mean_s[at])
+    return msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log), links=links), mean_s
 
 
 def _no_roots(why: str) -> EndPoseRoots:

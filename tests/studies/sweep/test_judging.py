@@ -119,9 +119,7 @@ def test_what_hardly_moves_beside_an_unstable_rest_is_undecided(d: float, verdic
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off] for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
     }
     found = judged(load_scenario("p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}))
-    assert found.motion is EndBehaviour.CONVERGED
     assert found.verdict is verdict
-    assert found.reasons.startswith("this rest: unstable") is (d < 0.94)
 
 
 def test_a_run_that_diverges_says_when() -> None:

@@ -10,9 +10,14 @@ import pytest
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.tuning import TuningResult, plan_tuning
-from trilat_net.studies.tuning.candidate import measure_candidate
+from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
 from trilat_net.studies.tuning.final_posture import CandidateClass
-from trilat_net.studies.tuning.pareto_search import dominates, find_pareto_front
+from trilat_net.studies.tuning.pareto_search import (
+    CandidateSearch,
+    Objective,
+    dominates,
+    find_pareto_front,
+)
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 from trilat_net.studies.tuning.tuning_report import (
     tabulate_front,
@@ -36,7 +41,8 @@ def test_the_same_request_makes_the_same_result_whatever_the_number_of_processes
     found: TuningResult, tmp_path: Path
 ) -> None:
     again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
-    assert again.found == found.found
+    assert [one.tried for one in again.found] == [one.tried for one in found.found]
+    assert [one.scores for one in again.found] == [one.scores for one in found.found]
     assert [one.score for one in again.printed] == [one.score for one in found.printed]
 
 
@@ -146,11 +152,20 @@ def test_the_time_is_told_before_and_is_of_the_right_order(tmp_path: Path) -> No
                  "stiffness_n_m = 1.0}]", laws=["p_d"], budget=8).runs == 20  # fmt: skip
 
 
+def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
+    """A search of which so many candidates, all of the same gains, are on the front, the others on none."""
+    search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
+    outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
+    scores = [
+        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0) for n, one in enumerate(outcomes, 1)
+    ]
+    search.tell([gains] * 6, scores)
+    return search
+
+
 def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
-    one = found.found[1]
     knob = SEARCH_SPACES["p_d"].knobs[0]
-    at_edge = one._replace(tried=[{"K": knob.high, "d": 10.0}] * 6, front=[0])
-    assert found.at_edge(at_edge) == ["K"]
+    assert found.at_edge(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
 
 
 @pytest.fixture(scope="module")
@@ -200,8 +215,8 @@ def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
 
 
 def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult) -> None:
-    one = found.found[0]._replace(front=[0, 1, 2, 3, 4])
+    one = with_front("adaptive", found.found[0].tried[0], 5)
     shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
     assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
     assert len(tabulate_front(found, one).rows) == 5
-    assert tabulate_front(found, one._replace(front=[]), 3).rows == []
+    assert tabulate_front(found, with_front("adaptive", found.found[0].tried[0], 0), 3).rows == []

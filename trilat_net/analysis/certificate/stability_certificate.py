@@ -105,7 +105,7 @@ class EndPoseRoots(NamedTuple):
     Attributes:
         verdict: stable, unstable or at the edge, of small motions there; "" if there is no such loop.
         rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None without one.
-        exact: False if ages vary, and the roots are those of their means: they decide nothing then.
+        exact: False if ages vary, and the roots are those of their means: no proof then, but a doubt.
         text: the rest and its roots, or why there are none.
     """
 
@@ -166,7 +166,7 @@ class Certificate(NamedTuple):
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
-        if self.roots is not None and self.roots.exact and self.roots.verdict == "unstable":
+        if self.roots is not None and self.roots.verdict == "unstable":
             found.append(self.roots.text)
         if self.observed is not None and self.observed.refuted:
             found.append(self.observed.text)

@@ -110,27 +110,22 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
     Raises:
         UsageError: polars is not installed.
     """
-    kinds: dict[str, type] = {
-        "cell": int,
-        **{one.key: float if one.numeric else str for one in plan.axes},
-        "law": str,
-        "seed": int,
-        "random": bool,
-        **dict.fromkeys(CellResult.__struct_fields__, float),
-        "verdict": str,
-        "motion": str,
-        "reasons": str,
-        "extended": int,
-        **dict.fromkeys(("scenario_sha256", "command", "scenario"), str),
-    }
-    columns = {name: ([row[name] for row in rows], kind) for name, kind in kinds.items()}
+    kinds = {**_kinds_of_axes(plan), "seed": int, "random": bool}
+    kinds |= dict.fromkeys(CellResult.__struct_fields__, float)
+    kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command", "scenario"), str)
     plan_text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
-    return _encode_parquet(columns, row_group_size=_ROWS_OF_A_GROUP, metadata={_PLAN_KEY: plan_text})
+    options = {"row_group_size": _ROWS_OF_A_GROUP, "metadata": {_PLAN_KEY: plan_text}}
+    return _encode_parquet(rows, kinds | {"extended": int}, **options)
 
 
-def _encode_parquet(columns: Mapping[str, tuple[Sequence[Any], type]], **options: Any) -> bytes:
+def _kinds_of_axes(plan: SweepPlan) -> dict[str, type]:
+    """Returns the types of the columns that say where a row lies."""
+    return {"cell": int, **{one.key: float if one.numeric else str for one in plan.axes}, "law": str}
+
+
+def _encode_parquet(rows: Sequence[ResultRow], kinds: Mapping[str, type], **options: Any) -> bytes:
     pl = require_polars()
-    series = {name: pl.Series(name, values, dtype=kind) for name, (values, kind) in columns.items()}
+    series = {name: pl.Series(name, [row[name] for row in rows], dtype=kinds[name]) for name in kinds}
     made = io.BytesIO()
     pl.DataFrame(series).write_parquet(made, compression="zstd", **options)
     return made.getvalue()
@@ -220,20 +215,14 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
     Raises:
         UsageError: polars is not installed.
     """
-    shares = [one.stable / one.decided if one.decided else None for one in found]
-    intervals = [one.interval for one in found]
-    columns: dict[str, tuple[list[Any], type]] = {"cell": ([one.cell for one in found], int)}
-    for n, axis in enumerate(plan.axes):
-        columns[axis.key] = [one.values[n] for one in found], float if axis.numeric else str
-    columns["law"] = [one.law for one in found], str
-    columns["runs"] = [sum(one.counts) for one in found], int
-    for n, verdict in enumerate(CellClass):
-        columns[verdict.value] = [one.counts[n] for one in found], int
-    columns["stable_share"] = shares, float
-    columns["stable_share_low"] = [low for low, _ in intervals], float
-    columns["stable_share_high"] = [high for _, high in intervals], float
-    for n, key in enumerate(RUN_TOTALS):
-        means = [one.means[n] for one in found]
-        columns[f"{key}_mean"] = [mean and mean.mean for mean in means], float
-        columns[f"{key}_half"] = [mean and mean.half for mean in means], float
-    return _encode_parquet(columns)
+    kinds = _kinds_of_axes(plan) | dict.fromkeys(("runs", *(one.value for one in CellClass)), int)
+    kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
+    kinds |= dict.fromkeys((f"{key}_{word}" for key in RUN_TOTALS for word in MeanInterval._fields), float)
+    rows = []
+    for one in found:
+        low, high = one.interval
+        numbers = [number for mean in one.means for number in mean or (None, None)]
+        share = one.stable / one.decided if one.decided else None
+        cells = (one.cell, *one.values, one.law, sum(one.counts), *one.counts, share, low, high, *numbers)
+        rows.append(dict(zip(kinds, cells, strict=True)))
+    return _encode_parquet(rows, kinds)

@@ -19,9 +19,8 @@ from enum import StrEnum
 import msgspec
 import numpy as np
 
-from ...analysis.arm_rows import build_arm_rows
 from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
-from ...analysis.run_end import EndBehaviour, RunEnd, Stability
+from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...log.log_reader import Log
@@ -198,8 +197,7 @@ def check_final_posture(log: Log) -> list[str]:
     wanted_s = log.scenario.duration_s
     if last_s <= wanted_s - _SHORT_S:
         warnings.append(f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run")
-    arms = {site: build_arm_rows(log.scenario, site) for site in parts}
-    hanging = [s for s, q in ends.items() if arms[s].hangs(q) and not arms[s].hangs(parts[s].q[0])]
+    hanging = find_hanging_sites(log.scenario, ends)
     if not hanging:
         return [*warnings, *_warn_fallen(log, ends)]
     verb = "hangs" if len(hanging) == 1 else "hang"

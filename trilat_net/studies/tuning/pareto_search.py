@@ -84,7 +84,7 @@ CandidateGains = dict[str, float]
 
 
 class CandidateSearch:
-    """One law's search.
+    """One law's search, and what it found.
 
     Attributes:
         tried: the gains that were tried, in order.
@@ -102,6 +102,21 @@ class CandidateSearch:
         first, count = (budget + 1) // 2, len(REFINEMENT_STEPS)
         share, more = divmod(budget - first, count)
         self.rounds = [first, *(share + (n < more) for n in range(count))]
+
+    @property
+    def points(self) -> list[ObjectivePoint | None]:
+        """(objective, effort) of every candidate; None of one that may stand on no front."""
+        return [self._objective.point(score) for score in self.scores]
+
+    @property
+    def front(self) -> list[int]:
+        """Places of the candidates that none of the same law dominates, by rising effort."""
+        return find_pareto_front(self.points)
+
+    @property
+    def outcomes(self) -> dict[CandidateClass, int]:
+        """How many candidates are of each class, all of them counted."""
+        return {outcome: sum(score.outcome is outcome for score in self.scores) for outcome in CandidateClass}
 
     def ask(self, number: int) -> list[CandidateGains]:
         """Returns the candidates of a round; `tell` has taken all earlier ones."""
@@ -126,8 +141,7 @@ class CandidateSearch:
 
         Where nothing settled yet, those that erred least without diverging; where all diverged, anything.
         """
-        points = [self._objective.point(score) for score in self.scores]
-        places = find_pareto_front(points)
+        points, places = self.points, self.front
         if places:
             lonely = compute_crowding([points[n] or (0.0, 0.0) for n in places])
             by_space = [n for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])]

@@ -22,7 +22,7 @@ from .candidate import (
     load_tuning_scenario,
     measure_candidate_task,
 )
-from .final_posture import CandidateClass, build_twin, check_comparable
+from .final_posture import build_twin, check_comparable
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
 from .search_space import (
     PAPER_GAINS,
@@ -48,26 +48,6 @@ class PaperGainsResult(NamedTuple):
     name: str
     candidate: TuningScenario
     score: CandidateScore
-
-
-class SearchResult(NamedTuple):
-    """What the search of one law found.
-
-    Attributes:
-        tried: every candidate's gains, in order.
-        scores: what came of them.
-        front: places of the candidates that none of the same law dominates, by rising effort.
-    """
-
-    space: SearchSpace
-    tried: list[dict[str, float]]
-    scores: list[CandidateScore]
-    front: list[int]
-
-    @property
-    def outcomes(self) -> dict[CandidateClass, int]:
-        """How many candidates are of each class, all of them counted."""
-        return {outcome: sum(score.outcome is outcome for score in self.scores) for outcome in CandidateClass}
 
 
 class TuningPlan(NamedTuple):
@@ -158,12 +138,8 @@ class TuningPlan(NamedTuple):
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores
-        found = []
-        for search in searches:
-            front = find_pareto_front([self.objective.point(score) for score in search.scores])
-            found.append(SearchResult(search.space, search.tried, search.scores, front))
         paper = [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)]
-        return TuningResult(self, found, paper)
+        return TuningResult(self, searches, paper)
 
 
 _EDGE = 1.02
@@ -177,14 +153,14 @@ class TuningResult(NamedTuple):
     """A comparison that was run; laws in the order in which they were asked for."""
 
     plan: TuningPlan
-    found: list[SearchResult]
+    found: list[CandidateSearch]
     printed: list[PaperGainsResult]
 
-    def candidate(self, found: SearchResult, place: int) -> TuningScenario:
+    def candidate(self, found: CandidateSearch, place: int) -> TuningScenario:
         """Returns one candidate as an experiment."""
         return self.plan.base.with_gains(found.space, self.plan.knowledge, found.tried[place])
 
-    def at_edge(self, found: SearchResult) -> list[str]:
+    def at_edge(self, found: CandidateSearch) -> list[str]:
         """Returns which gains of a law's best point stand at an edge of their range: it may lie beyond."""
         if not found.front:
             return []
@@ -195,12 +171,10 @@ class TuningResult(NamedTuple):
             if not knob.low * _EDGE < best[knob.name] < knob.high / _EDGE
         ]
 
-    def shared(self, found: SearchResult) -> list[int]:
+    def shared(self, found: CandidateSearch) -> list[int]:
         """Returns the places of a law's front that no candidate of any law dominates."""
         points = [
-            (other.space.law, place, self.plan.objective.point(other.scores[place]))
-            for other in self.found
-            for place in other.front
+            (other.space.law, place, other.points[place]) for other in self.found for place in other.front
         ]
         kept = [points[n] for n in find_pareto_front([point for _, _, point in points])]
         return [place for law, place, _ in kept if law == found.space.law]

@@ -26,9 +26,9 @@ from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
-from .pareto_search import REFINEMENT_STEPS, Objective, ObjectivePoint
+from .pareto_search import REFINEMENT_STEPS, CandidateSearch, Objective
 from .search_space import SEARCH_SPACES, weigh_joints
-from .tuning_plan import MAX_BUDGET, SearchResult, TuningPlan, TuningResult
+from .tuning_plan import MAX_BUDGET, TuningPlan, TuningResult
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
@@ -42,11 +42,11 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
     )
 
 
-def _law_row(tuned: TuningResult, found: SearchResult) -> tuple[str, ...]:
+def _law_row(tuned: TuningResult, found: CandidateSearch) -> tuple[str, ...]:
     counts = found.outcomes
-    ends = [tuned.plan.objective.point(found.scores[place]) for place in found.front[-1:] + found.front[:1]]
-    best, cheapest = ends or (None, None)
-    numbers = (*(best or (None, None)), *(cheapest or (None, None))[::-1])
+    ends = [found.points[place] or (None, None) for place in found.front[-1:] + found.front[:1]]
+    best, cheapest = ends or [(None, None)] * 2
+    numbers = (*best, *cheapest[::-1])
     return (
         found.space.law,
         str(len(found.tried)),
@@ -68,7 +68,7 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
     return TextTable(("law", "gain", "unit", "from", "to", "told"), rows, align="lllrrl")
 
 
-def tabulate_front(tuned: TuningResult, found: SearchResult, most: int = MAX_BUDGET) -> TextTable:
+def tabulate_front(tuned: TuningResult, found: CandidateSearch, most: int = MAX_BUDGET) -> TextTable:
     """Returns a law's front by rising effort; * marks what no law's candidate dominates."""
     count = len(found.front)
     kept = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
@@ -209,7 +209,7 @@ def tuning_to_json(tuned: TuningResult) -> JsonObject:
     }
 
 
-def _law(tuned: TuningResult, found: SearchResult) -> JsonObject:
+def _law(tuned: TuningResult, found: CandidateSearch) -> JsonObject:
     shared = tuned.shared(found)
     return {
         "told": found.space.told,
@@ -245,7 +245,7 @@ def draw_front(tuned: TuningResult) -> Figure:
     with style.figure_style():
         figure = style.new_figure(_HEIGHT_IN, FRONT_WIDTH_IN)
         axes = figure.add_subplot()
-        drawn = [_draw_law(axes, tuned, found) for found in tuned.found]
+        drawn = [_draw_law(axes, found) for found in tuned.found]
         stars = _draw_printed(axes, tuned)
         axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
         axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
@@ -265,23 +265,18 @@ def draw_front(tuned: TuningResult) -> Figure:
     return figure
 
 
-def _draw_law(axes: Axes, tuned: TuningResult, found: SearchResult) -> Line2D:
+def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
     place = list(SEARCH_SPACES).index(found.space.law)
     colour, mark = style.SITE_COLOURS[place % len(style.SITE_COLOURS)], _MARKS[place % len(_MARKS)]
-    settled = _points(tuned, found, range(len(found.scores)))
-    front = _points(tuned, found, found.front)
+    settled = [point for point in found.points if point is not None]
+    front = [point for place in found.front if (point := found.points[place]) is not None]
     faint: dict[str, Any] = {"linestyle": "", "markersize": 2.0, "alpha": 0.3, "markeredgewidth": 0.0}
     plain: dict[str, Any] = {"marker": mark, "markersize": 3.5, "linewidth": 1.1, "color": colour}
     axes.plot([x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint)
     axes.step([x for _, x in front], [y for y, _ in front], where="post", **plain)
     count = found.outcomes[CandidateClass.SETTLED]
     return Line2D([], [], label=f"{found.space.law} ({count}/{len(found.scores)})", **plain)
-
-
-def _points(tuned: TuningResult, found: SearchResult, places: Sequence[int]) -> list[ObjectivePoint]:
-    points = [tuned.plan.objective.point(found.scores[place]) for place in places]
-    return [point for point in points if point is not None]
 
 
 def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
