@@ -44,11 +44,14 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20)])
+@pytest.mark.parametrize(
+    ("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20), ("unlike_arms", 5)]
+)
 def test_arms_of_many_joints_live_are_virtual_time_bit_for_bit(
     scenario: str, duration_s: int, stage: Stage
 ) -> None:
-    warm_up(load_scenario(scenario), "m1")  # compiled once for all sites
+    for name in ("m1", "s"):  # compiled once for all sites of as many joints
+        warm_up(load_scenario(scenario), name)
     session = Session(stage, scenario, PAPER, "--duration", str(duration_s))
     session.all()
     log = session.is_reproduced()

@@ -340,7 +340,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the paths of the end effectors of chains, m, in three planes of the frame that all sites share.
 
-    A ring marks the start of a site, a disc its end.
+    Of sites in task space in the metres of the task. A ring marks the start of a site, a disc its end.
     """
     places = style.arrange_joints(len(_PLANES), form.narrow)
     height_in = 0.9 * form.width_in / len(places[0])
@@ -349,6 +349,7 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         for site in log.sites:
             part, line = log[site], style.site_line(log, site)
             path = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd).at
+            path = path * log.scenario.sites[site].task.scale
             for axes, plane in zip(panels.values() if len(part) else (), _PLANES, strict=False):
                 _draw_path(axes, path[:, plane], line)
         for axes, (across, up) in zip(panels.values(), _PLANES, strict=True):
