@@ -29,6 +29,7 @@ from trilat_net.analysis.certificate.energy_balance import EnergyBalance, comput
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
+from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
 from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
 from trilat_net.studies.tuning.search_space import build_model_information, select_search_spaces
 from trilat_net.theory import analyse_linear_loop, find_equilibrium, find_linear_edge
@@ -488,3 +489,43 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
 def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
     made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
     check("docs/fair-comparison.md", f"| as printed{told} | {{}} | {{}} |", [made.error_rad, made.effort_nm])
+
+
+P_D_PAGE = (ROOT / "docs/maps/p_d.md").read_text(encoding="utf-8")
+EDGES = re.findall(r"^\| (\d+) \| ([\d.]+) to ([\d.]+)", P_D_PAGE, re.MULTILINE)
+LIVE_CELLS = re.findall(
+    r"^\| (\d+) \| (\d+) \| ([\d.]+) \| ([a-z ]+) \| ([a-z ]+) \|$", P_D_PAGE, re.MULTILINE
+)
+
+
+def class_of(longest_s: float, **changes: Any) -> CellClass:
+    return classify_cell(load_scenario("p_d_margin", keys(changes)).text, longest_s).verdict
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("row", range(19))
+def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
+    """Of the two tables of docs/maps/p_d.md: unstable below, stable above."""
+    assert len(EDGES) == 19
+    delay_ms, low, high = map(float, EDGES[row])
+    soft, longest_s = (SOFT, 640.0) if row >= 11 else ({}, 320.0)
+    given = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
+    assert class_of(longest_s, **given, control__d=low).stable is False
+    assert class_of(longest_s, **given, control__d=high).stable is True
+
+
+@pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
+def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
+    number, delay_ms, d, virtual, live = LIVE_CELLS[row]
+    assert virtual == live
+    assert int(number) == 40 * (int(delay_ms) // 40) + round(10.0 * float(d)) - 1  # 40 values of d each
+    found = class_of(160.0, link__delay_ms=float(delay_ms), control__d=float(d), duration_s=20.0)
+    assert found.value == virtual
+
+
+@pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
+def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
+    """As docs/maps/p_d.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
+    assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
+    found = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
+    assert found is CellClass.UNDECIDED

@@ -76,11 +76,11 @@ def _fix_delays(log: Log) -> tuple[Scenario, dict[tuple[int, int], float]]:
     And per (receiver, sender) of such a link the mean age of the sample in use over the last quarter, s.
     """
     names, mean_s, links = log.scenario.names, {}, dict(log.scenario.links)
-    for name, link in log.scenario.links.items():
+    for name in (name for name, link in links.items() if not is_constant_link(link)):
         peer, site = name.split("->")
         used = log[site].used[peer]
         rows = (used >= 0) & (log[site].t_s >= 0.75 * log[site].t_s[-1])
-        if not is_constant_link(link) and rows.any():
+        if rows.any():
             age_s = log[site].t_s[rows] - used[rows] / log[peer].rate_hz
             at = names.index(site), names.index(peer)
             mean_s[at] = float(age_s.mean())
