@@ -10,10 +10,12 @@ import time
 import numpy as np
 
 from tests.theory.delay_equations import equations
+from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.process import count_cores, worker_pool
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.laws import LAWS
 from trilat_net.studies.sweep.cell_result import classify_cell
 
 from .stopwatch import best_s
@@ -39,7 +41,26 @@ def run() -> list[str]:
         )
     for name in ("six_joints", "seven_joints"):
         lines += _both_drivers(load_scenario(name, {"duration_s": 2.0}), 5)[0]
-    return [*lines, *_on_all_cores(real_s)]
+    return [*lines, *_with_plugged_laws(real_s, fused_s), *_on_all_cores(real_s)]
+
+
+def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
+    """Times laws that are plugged in: one that uses all that a law may see, an example, and the built-in."""
+    built_in = [name for name, kind in LAWS.items() if getattr(kind, "core_class", None) is not None]
+    lines = ["laws that are plugged in, by their names, in one run:"]
+    for law in ("tests.plugged_laws:CompiledLine", "examples.reaction_law:Reaction", *built_in):
+        scenario = load_scenario("free", {"duration_s": real_s, "scheme": "digital", "control.law": law})
+
+        def run_it(scenario: Scenario = scenario) -> None:
+            FusedRun(scenario).advance(real_s)
+
+        try:
+            run_it()
+        except ScenarioError as error:  # it is not for three sites, or not for joints
+            lines.append(f"  {law}: {error.problem}")
+            continue
+        lines.append(f"  {law}: {adaptive_s / best_s(run_it, 10):.2f} of the speed of adaptive (bar: >= 0.4)")
+    return lines
 
 
 def _both_drivers(scenario: Scenario, runs: int) -> tuple[list[str], FusedRun, float]:

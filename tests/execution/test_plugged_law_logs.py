@@ -1,0 +1,64 @@
+"""Logs of laws that look at each peer and send to it, executed again: whole, from any record, and changed."""
+
+from typing import Any
+
+import pytest
+
+from tests.execution.deliveries import TICKS
+from tests.execution.logs import OTHER_PLATFORM, without_records
+from tests.log_editing import opened, recorded
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import TickInput
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.resumption import RecordedInputs, read_output
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+
+LAWS = ("Line", "CompiledLine")
+SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
+
+
+def plugged(law: str) -> bytes:
+    return recorded("paper", {**SHORT, "control.law": f"tests.plugged_laws:{law}"})
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
+def test_a_plugged_law_is_verified_whole_tick_by_tick_and_behind_a_gap(
+    law: str, session: dict[str, str] | None
+) -> None:
+    data = plugged(law)
+    verdict = verify(opened(data))
+    assert verdict.whole_run
+    assert verdict.identical == verdict.records == 3 * TICKS
+    twins = compare_with_virtual(opened(data))
+    assert twins.fed.identical == twins.plain.identical == 3 * TICKS
+    cut = verify(without_records({"s": range(50, 61)}, data, session))
+    assert cut.agreed
+    assert cut.identical > 3 * TICKS - 60
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
+    log = opened(plugged(law))
+    samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
+    ends = dict.fromkeys(log.sites, TICKS - 1)
+    for name in log.sites:
+        part, setup = log[name], log.scenario.setup(name)
+        for first in range(2, TICKS, 9):
+            inputs: RecordedInputs[Any] = RecordedInputs(part, samples, ends, {}, setup.links)
+            site = Site(setup)
+            inputs.resume(site, first)
+            for state in part.states[first : first + 12]:
+                arrivals, missing = inputs.arrivals(state.rx)
+                assert not missing
+                record = site.step(TickInput(state.tick, arrivals))
+                assert record._replace(x=[], xd=[], wrench=[]) == read_output(state, part.peers)
+
+
+def test_a_rerun_changes_what_a_changed_gain_changes_and_nothing_else() -> None:
+    log = opened(plugged("CompiledLine"))
+    same = rerun(log, closed_loop=True)
+    assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())
+    changed = rerun(log, ["s"], {"sites.s.control.K": 25.0})
+    assert 0 < changed.sites["s"].identical < changed.sites["s"].executed
