@@ -20,7 +20,7 @@ class Line:
         self.K, self.fail_at = K, fail_at
         self.integral = [[0.0] * facts.joints for _ in facts.peers]
         self.count = 0
-        self.signs = (-1, 1)
+        self.signs = tuple(1 if i % 2 else -1 for i in range(facts.joints))
         self.note = facts.site
 
     def torque(self, now: LawInput) -> None:

@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 
 from ..errors import LawFailed, ScenarioError
 from .control import limit_torque
-from .jit import leaf
+from .jit import bind_leaf, leaf
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
@@ -261,8 +261,16 @@ class CompiledLaw:
             whole[0][name] = value
         self.row: Array = whole.view(np.float64)
         self._law, self._name, self._arrays, self._sent = law, setup.name, arrays, sent
+        self._stage = law_stage
         self._remembered = sum(numbers[name].size for name in law.remembers)
         arrays.site["remembered"] = self._remembered
+
+    def bind(self) -> None:
+        """Compiles what `compute` calls, and looks up its types once for all."""
+        a = self._arrays
+        assert a.channel is not None
+        rows = (self.row, a.site, a.links, a.chain, a.channel, self._sent)
+        self._stage = bind_leaf(law_stage, 0, 0, self.address, *rows)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
         """Stage 6 of tick k, see `law_stage`; returns the law's memory.
@@ -273,7 +281,7 @@ class CompiledLaw:
         a = self._arrays
         assert a.channel is not None
         try:
-            law_stage(k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent)
+            self._stage(k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent)
         except Exception as error:  # whatever the law raises
             raise self.find_failure(error) or error from None
         memory: list[float] = self.row[: self._remembered].tolist()

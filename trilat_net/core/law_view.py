@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from . import chain_stages, two_link_stages
-from .jit import leaf
+from .jit import bind_leaf, leaf
 from .law_channel import SentVector
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
@@ -70,6 +70,7 @@ class PlainLaw:
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
         self._law, self._setup, self._arrays, self._sent = law, setup, arrays, sent
+        self._update = update_law_view
         site, layout = arrays.site[0], setup.layout
         n, m = layout.joints, layout.shared
         views = {name: site[_IN_ROW.get(name, name)][:n] for name in _PER_JOINT}
@@ -88,6 +89,11 @@ class PlainLaw:
         self._common = setup.channel.numbers(per_peer=False)
         self._own = setup.channel.numbers(per_peer=True)
 
+    def bind(self) -> None:
+        """Compiles what `compute` calls, and looks up its types once for all."""
+        a = self._arrays
+        self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
+
     def compute(self, k: int, t_ns: int) -> list[float]:
         """Stage 6 of tick k: takes torque, estimate and what is sent in; returns the law's memory.
 
@@ -95,7 +101,7 @@ class PlainLaw:
             LawFailed: it failed.
         """
         a, setup = self._arrays, self._setup
-        update_law_view(k, t_ns, a.site, a.links, a.chain)
+        self._update(k, t_ns, a.site, a.links, a.chain)
         results = call_law(self._law, setup.name, self._read(k), self._collect_sent)
         self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
         self._views["theta_hat"][:], self._sent[:] = results.theta_hat, results.sent

@@ -68,7 +68,11 @@ class Site:
         self._user_law = None if setup.own is None else setup.own(setup.law_context())
         self._law = None
         if self._user_law is not None:
-            self._law = plug_law(self._user_law, setup, self._arrays, self._sent)
+            a, b = self._arrays, self._buffers
+            self._law = plug_law(self._user_law, setup, a, self._sent)
+            self._law.bind()  # compiled now, and not within the time that the law has for a tick
+            self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
+            self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
@@ -112,10 +116,10 @@ class Site:
                 self._tick = bind_leaf(site_tick, tick.k, t_ns, count, *self._tick_arrays)
             self._tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
-            sense_stages(tick.k, t_ns, count, self._arrays, self._buffers)
+            self._sense(tick.k, t_ns, count, self._arrays, self._buffers)
             a = self._arrays
             memory = self._law.compute(tick.k, t_ns)
-            act_stages(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
+            self._act(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
         q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
         mode = self._mode.item()
