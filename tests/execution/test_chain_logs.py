@@ -4,6 +4,7 @@ import io
 import math
 from functools import cache
 
+import numpy as np
 import pytest
 
 from tests.chains import six_joints
@@ -11,10 +12,10 @@ from tests.log_editing import Record, edited, opened
 from trilat_net.core.chain import LINK_PARAMETERS
 from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
-from trilat_net.execution.virtual import write_virtual_log
+from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
-from trilat_net.scenario.scenario_reader import parse_scenario
+from trilat_net.scenario.scenario_reader import load_scenario, parse_scenario
 
 N, TICKS = 6, 80
 
@@ -75,3 +76,46 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
     first = verify(opened(edited(made(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
+
+
+TWO_LINKS = """<robot name="two">
+  <link name="base"/>
+  <joint name="q1" type="continuous"><parent link="base"/><child link="link1"/><axis xyz="0 0 1"/></joint>
+  <link name="link1"><inertial><origin xyz="0.4 0 0"/><mass value="1.5"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.12"/></inertial></link>
+  <joint name="q2" type="continuous"><parent link="link1"/><child link="link2"/><origin xyz="1.1 0 0"/>
+    <axis xyz="0 0 1"/></joint>
+  <link name="link2"><inertial><origin xyz="0.3 0 0"/><mass value="0.8"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.07"/></inertial></link>
+  <joint name="end" type="fixed"><parent link="link2"/><child link="tip"/><origin xyz="0.9 0 0"/></joint>
+  <link name="tip"/>
+</robot>"""
+PLANAR = {"l1_m": 1.1, "m1_kg": 1.5, "lc1_m": 0.4, "I1_kg_m2": 0.12}
+PLANAR |= {"l2_m": 0.9, "m2_kg": 0.8, "lc2_m": 0.3, "I2_kg_m2": 0.07}
+
+
+@pytest.mark.long
+def test_the_planar_arm_written_as_a_chain_makes_the_same_run() -> None:
+    """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators that push."""
+    for law in ({"law": "adaptive", "Gamma": 0.0}, {"law": "p_d", "K": 30.0, "d": 4.0}):
+        logs = []
+        for arm in (PLANAR, {"urdf": "two.urdf", "down": [0.0, -1.0, 0.0]}):
+            given = {
+                "arm": arm,
+                "control": law,
+                "duration_s": 2.0,
+                "expect": {},
+                "limits.qd_limit_rad_s": 100.0,
+            }
+            given |= {"limits.tau_limit_nm": 200.0} | (
+                {"urdf": {"two.urdf": TWO_LINKS}} if "urdf" in arm else {}
+            )
+            plain = load_scenario("paper", given)
+            if law["law"] == "adaptive":
+                given["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
+            logs.append(simulate_scenario(load_scenario("paper", given)))
+        for site in logs[0].sites:
+            for name in ("q", "qd", "tau", "q_des"):
+                planar, chain = (getattr(log[site], name) for log in logs)
+                assert np.abs(planar - chain).max() <= 1e-12 * (1.0 + np.abs(planar).max()), (site, name)
+        assert np.ptp(logs[0]["m1"].q, axis=0).min() > 0.05

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.chains import six_joints
 from tests.core.chain_references import chain_references
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
@@ -19,40 +20,17 @@ from trilat_net.scenario import parse_scenario
 
 from .test_registry import misplaced
 
-SIX = """
-name = "six"
-rate_hz = 200
-duration_s = 1.0
-[arm]
-urdf = "arm6.urdf"
-armature_kg_m2 = 0.2
-[control]
-law = "adaptive"
-Lambda = 1.0
-Kp = 10.0
-Kd = 2.0
-Gamma = 1.0
-[link]
-delay_ms = 40.0
-[sites.m]
-q0_rad = [0.3, -1.0, 1.2, -0.6, 0.5, 0.2]
-[sites.s]
-role = "slave"
-q0_rad = [0.0, -1.1, 1.0, -0.4, 0.3, 0.1]
-[dominance]
-m = { s = 1.0 }
-s = { m = 1.0 }
-"""
+SIX = six_joints(1.0, delay_ms=40.0)
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 
 
 @cache
 def six() -> Log:
-    return simulate_scenario(parse_scenario(SIX, "six.toml"))
+    return simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200}))
 
 
 def test_the_end_of_a_chain_is_where_pinocchio_has_it_and_links_keep_their_lengths():
-    arm = six().scenario.arms["m"]
+    arm = six().scenario.arms["m1"]
     states = chain_references()["arm6"].states
     points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
     assert points[:, -1] == pytest.approx(np.array([state.tip_position for state in states]), abs=1e-12)
@@ -62,7 +40,7 @@ def test_the_end_of_a_chain_is_where_pinocchio_has_it_and_links_keep_their_lengt
 
 
 def test_pictures_of_a_chain_have_up_on_top_and_shadows_below():
-    arm = six().scenario.arms["m"]
+    arm = six().scenario.arms["m1"]
     origin, above, aside = arm_poses.project_arm_m(arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]]))
     assert not origin.any()
     assert above[0] == pytest.approx(0.0)
@@ -82,7 +60,7 @@ def test_panels_of_joints_fill_their_rows():
 @pytest.mark.parametrize(
     ("draw", "panels"),
     [
-        (joint_motion.draw_positions, 12),
+        (joint_motion.draw_positions, 18),
         (joint_motion.draw_tracking_errors, 7),
         (joint_motion.draw_control_torques, 6),
         (joint_motion.draw_parameter_estimates, 60),
@@ -105,7 +83,7 @@ def test_paths_are_those_of_the_end_effectors_in_three_planes():
     panels = joint_motion.draw_end_effector_paths(log, REPORT_SIZE).axes
     names = [(axes.get_xlabel()[0], axes.get_ylabel()[0]) for axes in panels]
     assert names == [("x", "y"), ("x", "z"), ("y", "z")]
-    for site, line in (("m", 0), ("s", 3)):  # a path, its ring and its disc
+    for site, line in (("m1", 0), ("s", 6)):  # a path, its ring and its disc
         part = log[site]
         points = arm_poses.joint_positions_m(log.scenario.arms[site], part.q[[0, -1]])[:, -1]
         for axes, plane in zip(panels, ([0, 1], [0, 2], [1, 2]), strict=True):
@@ -120,7 +98,7 @@ def test_the_force_of_a_wall_in_space_is_what_the_record_says_of_the_arm():
     normal = np.array([0.6, -0.3, 0.74])
     wall = {"kind": "wall", "point_m": (start + 0.01 * normal).tolist(), "normal": normal.tolist()}
     push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
-    log = simulate_scenario(parse_scenario(SIX, "six.toml", push))
+    log = simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
     part = log["s"]
     force_panel, depth_panel = contact_force.draw_contact(log).axes
     t_s, force = force_panel.lines[0].get_data()
@@ -138,13 +116,13 @@ def test_the_force_of_a_wall_in_space_is_what_the_record_says_of_the_arm():
 
 
 def test_columns_and_messages_name_joints_and_links():
-    table = six().table("m")
+    table = six().table("m1")
     assert table["q3_rad"].meaning.endswith("joint 3, elbow")
     inertia = table["theta_hat3_Izz_kg_m2"]
     assert (inertia.unit, inertia.source) == ("kg m^2", "theta_hat[29]")
-    assert (inertia.values == six()["m"].theta_hat[:, 29]).all()
+    assert (inertia.values == six()["m1"].theta_hat[:, 29]).all()
     assert table["theta_hat1_m_kg"].unit == "kg"
-    channels = Ros2SiteChannels(six().scenario, "m")
+    channels = Ros2SiteChannels(six().scenario, "m1")
     assert channels.joints == JOINTS
     names = channels.arrays["theta_hat"].channel.about["names"].split(" ")
     assert (len(names), names[0], names[29]) == (60, "shoulder.m", "forearm.Izz")
@@ -154,7 +132,7 @@ def test_the_page_draws_chains_from_their_joints():
     log = six()
     bounds = charts.workspace_box_m(log)
     data = charts.Charts(log, None, bounds).data()
-    assert [arm["points"] for arm in data["arms"]] == [7, 7]
+    assert [arm["points"] for arm in data["arms"]] == [7, 7, 7]
     table = data["tables"][data["arms"][0]["table"]]
     assert len(table["columns"]) == 3 * 7 * 2
     titles = [chart["title"] for chart in data["charts"] if chart["section"] == "estimates"]
