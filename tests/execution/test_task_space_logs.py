@@ -6,6 +6,7 @@ import pytest
 import trilat_net
 from tests.task_arms import planar_task
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
@@ -50,6 +51,10 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
     apart = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
     assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= apart
     assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))
+
+
+def test_the_end_of_a_run_is_told_in_metres(log: Log) -> None:
+    assert classify_log_end(log).error_unit == "m"
 
 
 def test_linear_analysis_says_why_it_has_none(log: Log) -> None:

@@ -174,6 +174,7 @@ class RunEnd(NamedTuple):
         diverged_at_s: when the first site left its limits, or None.
         frequency_hz: frequency of a bounded oscillation; None without one.
         missing_sites: sites without any record, which leave the run undecided.
+        error_unit: of |e|: that of angles, or of places in task space.
     """
 
     behaviour: EndBehaviour
@@ -187,6 +188,7 @@ class RunEnd(NamedTuple):
     diverged_at_s: float | None = None
     frequency_hz: float | None = None
     missing_sites: tuple[str, ...] = ()
+    error_unit: str = "rad"
 
     @property
     def stability(self) -> Stability:
@@ -205,7 +207,8 @@ class RunEnd(NamedTuple):
     @property
     def _behaviour_text(self) -> str:
         behaviour, error, speed = self.behaviour, self.error, self.speed
-        end = f"|e| {self.end_error_rad:.3g} rad and |qd| {self.end_speed_rad_s:.3g} rad/s in the last second"
+        error_text = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
+        end = f"{error_text} and |qd| {self.end_speed_rad_s:.3g} rad/s in the last second"
         if self.diverged_at_s is not None:
             return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
         if self.missing_sites:
@@ -306,6 +309,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     t_s, columns = t_s[first:], [site[kept[first:]] for site in sites]
     missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
     end = _find_worst_joint(scenario, t_s, columns, sites)._replace(missing_sites=missing)
+    if scenario.sites[scenario.names[0]].task.space == "position":
+        end = end._replace(error_unit="m")
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:

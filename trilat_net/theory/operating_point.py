@@ -136,7 +136,8 @@ def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
     for name, spec in scenario.sites.items():
         if spec.task.space != "joints":
             raise ScenarioError(
-                f"is {spec.task.space!r}: loops are linearised joint by joint, and not in task space",
+                f"is {spec.task.space!r}: loops are linearised joint by joint, and not in task space, where "
+                "sites are coupled through J(q) and its inverse",
                 path=f"sites.{name}.task.space",
                 source=scenario.name,
             )
