@@ -19,6 +19,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from ..errors import RunFailed, UsageError
 from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
+from ..scenario import Scenario
+from ..scenario.imported_law import ImportedLaw
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 
 T = TypeVar("T")
@@ -283,6 +285,12 @@ def open_worker_pool(
                 return stack.enter_context(opened)
 
             yield WorkerPool(start(), count, start, hint=hint) if count > 1 else WorkerPool(None, 1)
+
+
+def list_imported_laws(scenarios: Iterable[Scenario]) -> list[ImportedLaw]:
+    """Returns the laws of users' own that some scenarios need."""
+    controls = (site.control for scenario in scenarios for site in scenario.sites.values())
+    return [control for control in controls if isinstance(control, ImportedLaw)]
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:

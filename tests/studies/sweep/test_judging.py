@@ -72,6 +72,13 @@ def test_what_the_scenarios_are_known_to_do(name: str, changes: dict[str, Any], 
     assert judged(load_scenario(name, changes)).verdict is verdict
 
 
+def test_a_law_in_python_is_judged_as_the_same_law_of_the_kernel() -> None:
+    """`tests.laws:Adaptive` is Eq. (13) and (15) by other code, with the gains of the scenario."""
+    short = {"duration_s": 2.0, "link.delay_ms": 5.0}
+    theirs = load_scenario("free", {**short, "control.law": "tests.laws:Adaptive"})
+    assert judged(theirs) == judged(load_scenario("free", short))
+
+
 def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
     """Of a growth of 0.01/s nothing is to be seen in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}

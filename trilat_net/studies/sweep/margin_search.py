@@ -18,7 +18,7 @@ from ...errors import ScenarioError, UsageError
 from ...reporting.text_table import TextTable
 from ...scenario import Scenario
 from ...theory import find_root_crossings
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ..executor import Progress, Workers, ignore_progress, list_imported_laws, open_worker_pool
 from . import cell_result
 from .map_plane import StableInterval, label_axis
 from .stability_map import (
@@ -204,7 +204,8 @@ def search_margins(
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
         seeds = plan.seeds if plan.written.scenario(*end.overrides).random else plan.seeds[:1]
         searches += [MarginTask(plan.written, cell, seed, plan.longest_s, within) for seed in seeds]
-    with open_worker_pool(jobs, on, most=len(searches)) as pool:
+    laws = list_imported_laws([plan.base])
+    with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(search_margin_task, searches, progress)
 
 

@@ -19,7 +19,14 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.scenario_reader import read_source
 from ..commands import format_command
-from ..executor import Progress, WorkerPool, Workers, ignore_progress, open_worker_pool
+from ..executor import (
+    Progress,
+    WorkerPool,
+    Workers,
+    ignore_progress,
+    list_imported_laws,
+    open_worker_pool,
+)
 from . import cell_result
 from .cell_result import CellClass
 from .sweep_cell import CellRun, SweepSource, run_cell
@@ -153,7 +160,9 @@ def run_sweep(
             journal.add(entry)
         before, began_ns = set(journal.done), clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(before)
-        with open_worker_pool(jobs, on if left else None, most=left, hint=_RESUME_HINT) as pool:
+        laws = list_imported_laws([plan.base])
+        workers = on if left else None
+        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _run_cells(plan, journal, pool, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9

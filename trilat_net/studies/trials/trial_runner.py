@@ -13,8 +13,7 @@ from ...errors import TrilatError
 from ...execution import virtual
 from ...net.clock import SystemClock
 from ...scenario import Scenario
-from ...scenario.imported_law import ImportedLaw
-from ..executor import MAX_LOSSES, Workers, open_worker_pool
+from ..executor import MAX_LOSSES, Workers, list_imported_laws, open_worker_pool
 from .trial import Trial, TrialResult, trials
 from .trial_report import TrialReport
 
@@ -47,8 +46,7 @@ def run_trials(
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    controls = [site.control for trial in batch for site in trial.scenario.sites.values()]
-    laws = [control for control in controls if isinstance(control, ImportedLaw)]
+    laws = list_imported_laws(trial.scenario for trial in batch)
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
