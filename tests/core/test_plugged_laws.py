@@ -11,6 +11,7 @@ from trilat_net.core.law_channel import LawChannel, SentVector, join_received
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, TickInput, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
+from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
 TICKS = 60
@@ -141,3 +142,17 @@ def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
         site.step(TickInput(k))
     with pytest.raises(LawFailed, match=f"{law} of s failed at tick {tick}: {problem}"):
         site.step(TickInput(tick))
+
+
+@pytest.mark.long
+def test_on_a_chain_plain_compiled_and_fused_have_the_same_bits() -> None:
+    """Its inertia, bias and gravity are used."""
+    scenarios = [linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")]
+    a, b = (run_by_hand(scenario, 30) for scenario in scenarios)  # soon after that the arms diverge
+    assert a == b
+    for scenario in scenarios:
+        fused = FusedRun(scenario)
+        fused.advance(0.03)
+        for name, row in zip(scenario.names, fused.records, strict=True):
+            fields = scenario.layout(name).columns()
+            assert row.tolist() == [number for field in fields for number in getattr(a[name][-1], field)]
