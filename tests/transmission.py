@@ -2,7 +2,7 @@
 
 For each site i, with x_des, f_des the shares of the peers' x and torque, T late, and F_i the torque ON arm i:
 
-    s^2 x_i = (K + B s)(x_des - x_i) + c_a s^2 x_des + c_p f_des + c_o F_i + F_i - Z_own x_i ...
+    s^2 x_i = (K + B s)(x_des - x_i) + c_a s^2 x_des + c_p f_des + c_o F_i + F_i
 
 Nothing here is of the package: it is what the runs in time are compared with.
 """
@@ -28,16 +28,24 @@ def balance(
     force_peer: Sequence[float] | float = 1.0,
     force_own: Sequence[float] | float = 0.0,
     delay_s: float = 0.0,
+    held_s: float = 0.0,
     loads: Sequence[tuple[float, float]] = (),
 ) -> tuple[Complex, Complex]:
-    """Returns A and b of A x = b F, F free torques: `loads` are K and B of what holds the arms, in order."""
+    """Returns A and b of A x = b F, F free torques: `loads` are K and B of what holds the arms, in order.
+
+    `held_s`: for so long a torque of the law is held, which delays it by half of that.
+    """
     n = len(alpha)
-    late = alpha * np.exp(-s * delay_s)
+    one, late = np.eye(n), alpha * np.exp(-s * delay_s)
+    held = (1.0 - np.exp(-s * held_s)) / (s * held_s) if held_s else 1.0
     peer, own = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
     impedance = np.diag([K_h + B_h * s for K_h, B_h in [*loads, *[(0.0, 0.0)] * n][:n]])
-    torque = np.eye(n) + own + peer @ late  # of the torques on all arms, on each
-    motion = s**2 * np.eye(n) + (K + B * s) * (np.eye(n) - late) - acceleration * s**2 * late
-    return motion + torque @ impedance, torque
+    # s^2 x = held tau + f and (1 - c_a late) tau = -(K + B s)(1 - late) x + felt f, f: the torque on the arm,
+    # tau + f being what is sent as qdd
+    slow = (one - acceleration * late) / held
+    felt = own + (peer + acceleration * one) @ late
+    b = slow + felt
+    return slow * s**2 + (K + B * s) * (one - late) + b @ impedance, b
 
 
 def transmitted(frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object) -> float:

@@ -7,7 +7,7 @@ with one gain for both joints keeps that line: x is q1, and q2 = q1 / 2.
 from collections.abc import Mapping
 from typing import Any
 
-from tests.virtual_runs import Run, trajectories
+from tests.virtual_runs import Array, Run, sampled, trajectories
 from trilat_net.scenario import Scenario, parse_scenario
 
 ARM = {
@@ -78,3 +78,11 @@ def pair_run(control: Mapping[str, Any], *, clamped: bool, **more: Any) -> Run:
     """A master with the hand H50 and a slave, held by CLAMP or free, in virtual time."""
     sites = {"m": {"hands": [H50]}, "s": {"hands": [CLAMP] if clamped else []}}
     return trajectories(unit_scenario(sites, control, **more))
+
+
+def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
+    """Per time the records before it, of a compiled run: by field shape (N, 2)."""
+    rows = sampled(scenario, times_s)
+    columns = next(iter(scenario.names))
+    fields = scenario.layout(columns).columns()
+    return [{name: rows[:, k, fields[name]] for name in fields} for k in range(len(times_s))]

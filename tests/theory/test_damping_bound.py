@@ -9,7 +9,8 @@ import sympy as sp
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
 from trilat_net.core.dominance import find_balancing_weights
-from trilat_net.studies.sweep.stability_map import COMMON_MOTION_SHARE, evaluate_criterion
+from trilat_net.scenario.law_conditions import COMMON_MOTION_SHARE
+from trilat_net.studies.sweep.stability_map import evaluate_criterion
 from trilat_net.theory import analyse_linear_loop
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 

@@ -16,7 +16,14 @@ from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from .arms import TASK_AXES, read_arm
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition, find_link_delays
-from .laws import Adaptive, AdaptiveBox, ControlLaw, ProportionalDamped, ProportionalDerivativeDamped
+from .laws import (
+    Adaptive,
+    AdaptiveBox,
+    ControlLaw,
+    LeeSpong,
+    ProportionalDamped,
+    ProportionalDerivativeDamped,
+)
 from .scenario_types import Scenario
 
 COUPLED_OPERATORS = (
@@ -46,18 +53,19 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = find_link_delays(scenario.links, rates_hz)
     laws = tuple(site.control for site in scenario.sites.values())
-    owners: dict[StabilityCondition, list[str]] = {}
+    owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for n, (name, site) in enumerate(scenario.sites.items()):
-        if isinstance(law := site.control, PluggedLaw):
+        if isinstance(law := site.control, PluggedLaw | LeeSpong):
             limits = np.atleast_1d(site.limits.tau_limit_nm).tolist()
             situation = LawSituation(
                 n, scenario.names, laws, scenario.alpha, delay_s, tuple(limits), site.rate_hz
             )
             if found := law.condition(situation):
-                owners.setdefault(found, []).append(f"{law.__struct_config__.tag} at {name}")
+                owners.setdefault((str(law.__struct_config__.tag), found), []).append(name)
     words = {True: "holds", False: "does not hold", None: "is not decided here"}
     return [
-        f"condition of {', '.join(where)} {words[one.holds]}: {one.text}" for one, where in owners.items()
+        f"condition of {tag} at {', '.join(where)} {words[one.holds]}: {one.text}"
+        for (tag, one), where in owners.items()
     ]
 
 

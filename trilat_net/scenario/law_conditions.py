@@ -4,14 +4,18 @@ Invariant: a law states its condition once, as a method of its type; `trilat sce
 `trilat linear` print what it returns. It says if the condition is only sufficient, and who proved it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..core.delay import DelayKind
+from ..core.dominance import find_balancing_weights
 from ..core.vectors import Array
 from .delay_models import LinkBase
+
+COMMON_MOTION_SHARE = 0.21723362821
+"""-min sin x / x: the share of K T that the common motion of all sites asks for, at its worst mass."""
 
 
 class LawSituation(NamedTuple):
@@ -40,6 +44,17 @@ class LawSituation(NamedTuple):
         """The longest delay of links with a dominance factor, s; NaN if one of them varies."""
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
+    def restrict(self, sites: Sequence[int]) -> "LawSituation":
+        """Returns the situation of the same site among some of the sites alone."""
+        part = np.ix_(sites, sites)
+        return self._replace(
+            site=list(sites).index(self.site),
+            names=tuple(self.names[n] for n in sites),
+            laws=tuple(self.laws[n] for n in sites),
+            alpha=self.alpha[part],
+            delay_s=self.delay_s[part],
+        )
+
 
 class StabilityCondition(NamedTuple):
     """A law's condition at a site.
@@ -65,3 +80,30 @@ def find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int])
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
         delay_s[names.index(site), names.index(peer)] = ticks / rate_hz if constant else np.nan
     return delay_s
+
+
+def judge_position_exchange(situation: LawSituation, stiffness: str, damping: str) -> StabilityCondition:
+    """Returns the condition of P+d, whatever the arms weigh; the keys of a law's K and d are named.
+
+    Nuno, Basanez, Ortega and Spong, IJRR 28, 2009, for two sites; of more than two the shares must be
+    reversible, K and d one for all and the delays one T: docs/errata.md, 13.
+    """
+    T, laws = situation.longest_s, situation.laws
+    K, d = (np.array([getattr(law, key, [np.nan]) for law in laws]) for key in (stiffness, damping))
+    if np.isnan(T) or np.isnan(K).any():
+        return StabilityCondition(None, "known for constant delays, and with this law at all sites")
+    if len(laws) == 2:
+        both = float(situation.delay_s.sum())
+        pulls = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
+        excess = float((4.0 * d[0] * d[1] - both**2 * pulls).min())
+        text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {1e3 * both:.4g} ms (sufficient whatever the masses)"
+        return StabilityCondition(excess >= -1e-9 * float(d.max()) ** 2, text)
+    if np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any() or np.ptp(situation.delay_s[situation.alpha > 0.0]):
+        return StabilityCondition(None, "known of more than two sites for one K, one d and one delay")
+    if find_balancing_weights(situation.alpha) is None:
+        return StabilityCondition(
+            False, "shares that are not reversible: some heavy arms are unstable at any d"
+        )
+    share = max(-float(np.linalg.eigvals(situation.alpha).real.min()), COMMON_MOTION_SHARE)
+    text = f"d > {share:.4g} K T = {share * float(K.max()) * T:.4g} (sufficient whatever the masses)"
+    return StabilityCondition(bool((d[0] > share * K[0] * T).all()), text)

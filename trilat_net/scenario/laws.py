@@ -23,7 +23,16 @@ from .fields import (
     PositiveJoints,
 )
 from .imported_law import ImportedLaw
-from .plugged_laws import FourChannels, SixChannels
+from .law_conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .plugged_laws import (
+    Authority,
+    FourChannels,
+    Impedances,
+    SaturatedPositions,
+    SixChannels,
+    SmithPredicted,
+    Synchronised,
+)
 
 
 class AdaptiveGains(Frozen, frozen=True):
@@ -157,8 +166,46 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
     gravity: NotNegative = 1.0
 
 
-KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting
-PluggedLaws = FourChannels | SixChannels
+class LeeSpong(Frozen, frozen=True, tag_field="law", tag="lee_spong"):
+    """PD+d under its published bound: d = K T_max + P_e for delays up to T_max.
+
+    Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22, 2006.
+
+    Attributes:
+        K: stiffness per joint, N m/rad.
+        Kd: damping of the error's velocity, per joint, N m s/rad.
+        T_max_ms: half of the longest round trip, ms.
+        P_e: damping beyond what the delay needs, per joint, N m s/rad.
+        gravity: share of gravity that it knows, 1: exactly.
+    """
+
+    K: PositiveCoordinates = (10.0,)
+    Kd: NotNegativeCoordinates = (3.0,)
+    T_max_ms: NotNegative = 200.0
+    P_e: NotNegativeJoints = (0.0,)
+    gravity: NotNegative = 1.0
+
+    @property
+    def damping(self) -> tuple[float, ...]:
+        """The damping d per joint, N m s/rad."""
+        return tuple(
+            stiff * 1e-3 * self.T_max_ms + extra for stiff, extra in zip(self.K, self.P_e, strict=True)
+        )
+
+    def gains(self, theta: Array) -> Gains:
+        """Returns the gains for the core: those of PD+d."""
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the condition of P+d on K and d."""
+        return judge_position_exchange(situation, "K", "damping")
+
+
+KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting | LeeSpong
+PluggedLaws = (
+    FourChannels | SixChannels | SaturatedPositions | Authority | Synchronised | Impedances | SmithPredicted
+)
 ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | PluggedLaws | ImportedLaw
 LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

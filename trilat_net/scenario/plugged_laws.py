@@ -4,14 +4,29 @@ Invariant: as for the laws of `laws.py`. A law whose small motions are those of 
 so by `linear_gains`, so that `trilat linear` and `trilat ports` have it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..core.laws.four_channel import FourChannel, SixChannel
+from ..core.laws.impedance_control import ImpedanceControl
+from ..core.laws.saturated_pd import SaturatedPd
+from ..core.laws.shared_authority import SharedAuthority
+from ..core.laws.smith_predictor import SmithPredictor
+from ..core.laws.synchronisation import Synchronisation
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
-from .fields import Joints, NotNegative, NotNegativeJoints, PositiveJoints, Share
+from .fields import (
+    Joints,
+    NotNegative,
+    NotNegativeJoints,
+    NotNegativeParameters,
+    Parameters,
+    PositiveJoints,
+    Share,
+)
 from .imported_law import PluggedLaw
-from .law_conditions import LawSituation, StabilityCondition
+from .law_conditions import LawSituation, StabilityCondition, judge_position_exchange
 
 _LLEWELLYN = (
     "transparent without delay only; with delay no bound is known that holds for every operator and "
@@ -83,6 +98,192 @@ class SixChannels(FourChannels, frozen=True, tag_field="law", tag="six_channel")
         found = FourChannels.condition(self, situation)
         text = f"factor a = {a:g}, weights beta = ({beta}); {found.text if found else ''}"
         return StabilityCondition(found.holds if found else None, text)
+
+
+class SaturatedPositions(PluggedLaw, frozen=True, tag_field="law", tag="saturated_pd"):
+    """P+d whose pull towards each peer saturates: tau = G - sum alpha_ij P tanh(K (q - q_j) / P) - d qd.
+
+    Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected to varying time delay
+    and bounded inputs", ISA Transactions 68, 2017.
+
+    Attributes:
+        K: stiffness of small errors, per joint, N m/rad.
+        P: largest pull of all peers together, per joint, N m.
+        d: damping of the arm's velocity, per joint, N m s/rad.
+        gravity: share of gravity that it knows, 1: exactly.
+    """
+
+    core_class = SaturatedPd
+
+    K: PositiveJoints = (10.0,)
+    P: PositiveJoints = (5.0,)
+    d: NotNegativeJoints = (3.0,)
+    gravity: NotNegative = 1.0
+
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns P+d, with the stiffness of small errors."""
+        return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the condition of P+d: the slope of the pull is nowhere above K."""
+        return judge_position_exchange(situation, "K", "d")
+
+
+class Authority(PluggedLaw, frozen=True, tag_field="law", tag="authority"):
+    """Two users share the authority over a slave, and feel each other but not the environment.
+
+    After Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface design for minimally
+    invasive telesurgical training", IEEE T-CST, 2005.
+
+    Attributes:
+        K: stiffness per joint, N m/rad.
+        d: damping of the arm's velocity, per joint, N m s/rad.
+        leads: true of a user, false of the slave.
+        gravity: share of gravity that it knows, 1: exactly.
+    """
+
+    core_class = SharedAuthority
+
+    K: PositiveJoints = (10.0,)
+    d: NotNegativeJoints = (3.0,)
+    leads: bool = True
+    gravity: NotNegative = 1.0
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the condition of P+d among the users; the slave follows them and closes no loop."""
+        users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
+        if situation.site not in users:
+            return StabilityCondition(True, "it follows and closes no loop: stable for every delay and d > 0")
+        among = situation.restrict(users)
+        return judge_position_exchange(among, "K", "d")
+
+
+class Synchronised(PluggedLaw, frozen=True, tag_field="law", tag="sync"):
+    """Adaptive synchronisation of r = qd + Lambda q: under gravity all arms end at q = 0.
+
+    tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum alpha_ij r_j - r), theta_hat' = -Gamma Y' r. For
+    planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time delay",
+    Automatica 44, 2008; the defect: Nuno, Ortega and Basanez, Automatica 46, 2010.
+
+    Attributes:
+        Lambda: per joint, 1/s.
+        K: per joint, N m s/rad.
+        Gamma: adaptation gain per parameter.
+        theta_hat0: first estimate of theta, Eq. (24).
+    """
+
+    core_class = Synchronisation
+
+    Lambda: PositiveJoints = (1.0,)
+    K: PositiveJoints = (3.0,)
+    Gamma: NotNegativeParameters = (1.0,)
+    theta_hat0: Parameters = (0.0,)
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns that every constant delay is allowed, and what it then does."""
+        if np.isnan(situation.longest_s):
+            return StabilityCondition(None, "proved for constant delays, and a delay here varies")
+        text = "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 (sufficient)"
+        return StabilityCondition(
+            True, f"{text}; but under gravity the arms end at q = 0, wherever they are led"
+        )
+
+
+class Impedances(PluggedLaw, frozen=True, tag_field="law", tag="impedance"):
+    """Impedance control of several users and a slave, by inverse dynamics with known parameters.
+
+    M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + what the slave sends of its environment's force. After
+    Shahbazi, Atashzar, Talebi and Patel, IEEE/ASME T-Mech 20(4), 2015.
+
+    Attributes:
+        M: inertia of the impedance, per joint, kg m^2.
+        B: damping, per joint, N m s/rad.
+        K: stiffness, per joint, N m/rad.
+        follows: true of the slave; a master stays at its start pose.
+    """
+
+    core_class = ImpedanceControl
+
+    M: PositiveJoints = (1.0,)
+    B: NotNegativeJoints = (10.0,)
+    K: PositiveJoints = (50.0,)
+    follows: bool = False
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the stiffest spring at the slave's arm for which the small-gain theorem holds."""
+        followers = [n for n, law in enumerate(situation.laws) if getattr(law, "follows", False)]
+        if len(followers) != 1 or not all(isinstance(law, Impedances) for law in situation.laws):
+            return StabilityCondition(
+                False, "one site follows, and all the others have this law with follows = false"
+            )
+        K_e = find_stiffest_wall(situation.laws, situation.alpha[followers[0]], followers[0])
+        if K_e == 0.0:
+            return StabilityCondition(False, "the small-gain theorem asks for B > 0 at every site")
+        most = "of any stiffness" if K_e == np.inf else f"of up to {K_e:.4g} N m/rad"
+        text = f"for any delays, varying ones too, in free motion and at a spring {most} at the slave"
+        return StabilityCondition(True, f"{text} (small gain: sufficient)")
+
+
+def find_stiffest_wall(laws: Sequence[Impedances], shares: Array, slave: int) -> float:
+    """Returns the largest stiffness at the slave with loop gain below 1 at all frequencies, N m/rad.
+
+    The loop from the slave's force to itself is sum a_i^2 K_e (K_s + B_s s) / ((M_s s^2 + B_s s + K_s + K_e)
+    (M_i s^2 + B_i s + K_i)), whatever its delays. inf: there is no largest; 0: not even free motion decays.
+    """
+    s = 1j * np.geomspace(1e-2, 1e4, 4000)
+    gains = [np.array([law.M, law.B, law.K]) for law in laws]
+    if any((gain[1] <= 0.0).any() for gain in gains):
+        return 0.0
+    most = np.inf
+    for joint in range(len(laws[0].K)):
+        M, B, K = gains[slave][:, joint]
+        back = sum(
+            shares[n] ** 2 / (gain[0, joint] * s * s + gain[1, joint] * s + gain[2, joint])
+            for n, gain in enumerate(gains)
+            if n != slave
+        )
+        walls = np.geomspace(1e-2, 1e6, 400)
+        loop = np.abs(walls[:, None] * (K + B * s) / (M * s * s + B * s + K + walls[:, None]) * back)
+        wrong = np.flatnonzero(loop.max(axis=1) >= 1.0)
+        if len(wrong):
+            most = min(most, float(walls[max(0, wrong[0] - 1)]))
+    return most
+
+
+class SmithPredicted(PluggedLaw, frozen=True, tag_field="law", tag="smith"):
+    """P+d of a master and a slave with a Smith predictor of the slave at the master.
+
+    Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957 (from memory).
+
+    Attributes:
+        K: stiffness per joint, N m/rad.
+        d: damping of the arm's velocity, per joint, N m s/rad.
+        inertia: of the model of the slave, per joint, kg m^2; K, d and inertia are alike at both sites.
+        predicts: true of the master.
+        gravity: share of gravity that it knows, 1: exactly.
+    """
+
+    core_class = SmithPredictor
+
+    K: PositiveJoints = (10.0,)
+    d: NotNegativeJoints = (3.0,)
+    inertia: PositiveJoints = (1.0,)
+    predicts: bool = False
+    gravity: NotNegative = 1.0
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns that the model decides: with the true one the loop is that without delay."""
+        laws = situation.laws
+        if [getattr(law, "predicts", None) for law in laws].count(True) != 1:
+            return StabilityCondition(False, "one of the two sites has predicts = true")
+        if any(
+            getattr(law, key, None) != getattr(self, key) for law in laws for key in ("K", "d", "inertia")
+        ):
+            return StabilityCondition(False, "K, d and inertia must be alike at both sites")
+        text = "a slave in free motion whose inertia is the model's makes the loop one without delay (d > 0)"
+        return StabilityCondition(
+            None, f"{text}; contact, and an inertia that changes, the model does not have"
+        )
 
 
 def complementary_shares(a: float) -> Array:

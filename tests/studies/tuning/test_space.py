@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from tests.core.chain_references import ChainState, chain_references
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
+from trilat_net.scenario.imported_law import PluggedLaw
 from trilat_net.studies.commands import format_toml_value
 from trilat_net.studies.tuning.candidate import TuningScenario, load_tuning_scenario
 from trilat_net.studies.tuning.search_space import (
@@ -38,6 +39,9 @@ def test_a_candidate_is_its_law_at_every_site_and_nothing_else_changes(law: str,
         assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
         assert site.limits == experiment.scenario.sites[name].limits
         assert site.limits.tau_limit_nm == 60.0
+        if isinstance(site.control, PluggedLaw):
+            assert getattr(site.control, "gravity", 0.95) == 0.95
+            continue
         known = site.control.gains(site.arm.theta)
         first = known.known if np.any(known.known) else known.theta_hat0
         assert first[3:] == pytest.approx(0.95 * site.arm.theta[3:])
@@ -114,7 +118,7 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
     [
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
-        ("", ["no law ''", "tuned are adaptive, adaptive_box, p_d, pd_d, p_f, known"]),
+        ("", ["no law ''", "tuned are adaptive, adaptive_box, p_d, pd_d, saturated_pd"]),
         ("my.file:Law", ["a law of your own has no search ranges"]),
         ("own", ["a law of your own"]),
     ],

@@ -11,9 +11,11 @@ Invariant: the acceleration that is sent is that of the arm's model under the to
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+from ..compiled_law import compiled
 from ..user_law import LawContext, LawInput
 
 
+@compiled
 class FourChannel:
     """The law of a site, of any number of sites.
 

@@ -23,6 +23,7 @@ from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.fields import is_number
+from ...scenario.law_conditions import COMMON_MOTION_SHARE
 from ...scenario.laws import Adaptive, ProportionalDamped
 from ...theory import compute_growth_rates
 from ..commands import format_command, set_options
@@ -35,8 +36,6 @@ from .sweep_results import SweepResults
 _GRAVITY = slice(3, 5)
 """The parameters of Eq. (24) that gravity's torque consists of."""
 _ROUNDING = 1e-6
-COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the share of K T that the common motion of all sites asks for, at its worst mass."""
 
 
 class StabilityCriterion(NamedTuple):

@@ -16,7 +16,8 @@ import numpy as np
 from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
-from ...scenario.fields import MAX_QUANTITY, suggest_nearest
+from ...scenario.fields import MAX_QUANTITY, field_names, suggest_nearest
+from ...scenario.laws import LAWS
 
 MIN_BOX = 0.1
 """Least half width of a box of estimates, as a share of the given parameters."""
@@ -176,12 +177,35 @@ def _p_f(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> 
     }
 
 
+def _plugged(law: str, **masters: bool) -> Callable[[Scenario, ModelInformation, GainValues], SiteControls]:
+    """Returns the writer of a plugged law; `masters`: a key that is this at masters and not so at slaves."""
+    gravity = "gravity" in field_names(LAWS[law])
+
+    def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+        told = {"gravity": knowledge.gravity} if gravity else {}
+        return {
+            name: {
+                "law": law,
+                **gains,
+                **{key: value == (spec.role == "master") for key, value in masters.items()},
+                **told,
+            }
+            for name, spec in scenario.sites.items()
+        }
+
+    return controls
+
+
 _LAMBDA = GainRange("Lambda", "1/s", 0.2, 20.0)
 _KP = GainRange("Kp", "N m s/rad", 0.5, 200.0)
 _KD = GainRange("Kd", "N m s/rad", 0.1, 50.0)
 _GAMMA = GainRange("Gamma", "", 0.01, 10.0)
 _K = GainRange("K", "N m/rad", 1.0, 1000.0)
 _D = GainRange("d", "N m s/rad", 0.5, 200.0)
+_B = _D._replace(name="B")
+_CHANNELS = (_K, _B)
+_IMPEDANCE = (GainRange("M", "kg m^2", 0.1, 10.0), _B, _K)
+_PREDICTING = (_K, _D, GainRange("inertia", "kg m^2", 0.1, 10.0))
 _ADAPTING = (_LAMBDA, _KP, _KD, _GAMMA)
 _REFLECTING = (
     _K._replace(where="slave"),
@@ -198,6 +222,19 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("adaptive_box", _ADAPTING, f"{_AS_FIRST}; the box is around it", _adaptive_box),
         SearchSpace("p_d", (_K, _D), "gravity", _knowing_gravity("p_d")),
         SearchSpace("pd_d", (_K, _KD, _D), "gravity", _knowing_gravity("pd_d")),
+        SearchSpace(
+            "saturated_pd", (_K, GainRange("P", "N m", 0.5, 50.0), _D), "gravity", _plugged("saturated_pd")
+        ),
+        SearchSpace("four_channel", _CHANNELS, "gravity", _plugged("four_channel")),
+        SearchSpace("six_channel", _CHANNELS, "gravity", _plugged("six_channel")),
+        SearchSpace("authority", (_K, _D), "gravity", _plugged("authority", leads=True)),
+        SearchSpace(
+            "impedance",
+            _IMPEDANCE,
+            "gravity AND inertia exactly: more than the others",
+            _plugged("impedance", follows=False),
+        ),
+        SearchSpace("smith", _PREDICTING, "gravity", _plugged("smith", predicts=True)),
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
     )
@@ -225,6 +262,10 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
         if name not in SEARCH_SPACES:
             hint = suggest_nearest(name, list(SEARCH_SPACES))
             raise UsageError(f"--law: there is no law {name!r} to tune{hint}{tuned}")
+        wanted = getattr(getattr(LAWS.get(name), "core_class", None), "sites", None)
+        if wanted not in (None, len(scenario.names)):
+            problem = f"law {name} is for {wanted} sites, and this has {len(scenario.names)}: leave it out"
+            raise ScenarioError(problem, source=scenario.name)
     roles = sorted(spec.role for spec in scenario.sites.values())
     if "p_f" in names and roles != ["master", "slave"]:
         raise ScenarioError(

@@ -1,0 +1,152 @@
+"""Saturated P+d, Lee and Spong's law, shared authority, impedance control, the Smith predictor: at rest."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
+from trilat_net.core.hyperbolic import tanh
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.describe import describe_law_conditions
+from trilat_net.scenario.plugged_laws import complementary_shares
+
+SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}
+P_D = {"law": "p_d", "K": 100.0, "d": 20.0}
+SMITH = {"law": "smith", "K": 100.0, "d": 5.0}
+TRIO = ("m1", "m2", "s")
+
+
+def two(law: dict[str, Any], *, clamped: bool = False, **master: Any) -> Scenario:
+    sites = {"m": {"hands": [H50], **master}, "s": {"hands": [CLAMP] if clamped else []}}
+    return unit_scenario(sites, law, duration_s=30.0)
+
+
+def three(law: dict[str, Any], slave: tuple[float, float], sites: dict[str, Any], **more: Any) -> Scenario:
+    """Two masters that follow the others by halves, and a slave that follows them by two shares."""
+    halves = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}}
+    shares = {**halves, "s": {"m1": slave[0], "m2": slave[1]}}
+    return unit_scenario(
+        {name: sites.get(name, {}) for name in TRIO},
+        law,
+        duration_s=40.0,
+        **{"dominance": shares, **more},
+    )
+
+
+def test_the_tangent_is_that_of_the_mathematics_library() -> None:
+    values = np.concatenate([np.linspace(-25.0, 25.0, 4001), np.logspace(-300.0, 1.0, 500)])
+    found = np.array([tanh(value) for value in values])
+    assert np.abs(found - np.tanh(values)).max() <= 3e-16
+    assert (found == -np.array([tanh(-value) for value in values])).all()
+    assert (tanh(0.0), tanh(math.inf), tanh(-math.inf)) == (0.0, 1.0, -1.0)
+    assert math.isnan(tanh(math.nan))
+
+
+def test_a_saturated_pull_ends_at_its_limit() -> None:
+    free = last_rows(two(SATURATED), 30.0)[0]
+    assert free["q"][:, 0] == pytest.approx(0.3, abs=1e-6)
+    clamped = last_rows(two(SATURATED, clamped=True), 30.0)[0]
+    assert clamped["q"][:, 0] == pytest.approx([0.20008, 0.0050], abs=5e-6)
+    assert -clamped["tau_x"][0, 0] == pytest.approx(4.9959, abs=5e-5)
+    linear = last_rows(two(P_D, clamped=True), 30.0)[0]
+    assert -linear["tau_x"][0, 0] == pytest.approx(9.677, abs=5e-4)
+
+
+def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
+    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}}
+    vote = last_rows(three(SATURATED, (0.9, 0.1), sites), 40.0)[0]
+    assert vote["q"][:, 0] == pytest.approx([0.2444, -0.2, 0.2389], abs=5e-5)
+    mean = last_rows(three(P_D, (0.9, 0.1), sites), 40.0)[0]
+    assert mean["q"][:, 0] == pytest.approx([0.135, -0.015, 0.120], abs=5e-4)
+
+
+def test_lee_and_spong_feel_the_clamp_and_drag_a_common_motion() -> None:
+    """The drag of both arms at one speed is 2 d + 2 K T = 4 K T at the bound."""
+    law = {"law": "lee_spong", "K": 100.0, "Kd": 3.0, "T_max_ms": 200.0}
+    clamped = last_rows(two(law, clamped=True), 30.0)[0]
+    assert -clamped["tau_x"][0, 0] / clamped["q"][0, 0] == pytest.approx(90.909, abs=5e-4)
+    push = {"kind": "recorded", "points": [[0.0, 0.8, 0.4], [100.0, 0.8, 0.4]]}
+    pushed = unit_scenario({"m": {"hands": [push]}, "s": {}}, law, duration_s=40.0)
+    assert 0.8 / last_rows(pushed, 40.0)[0]["qd"][:, 0] == pytest.approx(80.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("late_ms", "holds"), [(200.0, True), (201.0, False)])
+def test_the_bound_of_lee_and_spong_is_met_at_the_edge(late_ms: float, holds: bool) -> None:
+    link = {"model": "constant", "delay_ms": late_ms}
+    law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0}
+    told = describe_law_conditions(unit_scenario({"m": {}, "s": {}}, law, link=link))
+    assert (
+        f"lee_spong at m, s {'holds' if holds else 'does not hold'}: 4 d1 d2 >= (T1 + T2)^2 K1 K2" in told[0]
+    )
+
+
+@pytest.mark.long
+def test_users_share_authority_and_feel_no_environment() -> None:
+    """Hands that end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
+    stiff: dict[str, Any] = {"kind": "spring", "stiffness_nm_rad": 1e5, "damping_nm_s_rad": 100.0}
+    ends = (0.3 + 15.0 / 1e5, -0.3 - 45.0 / 1e5)
+    sites = {
+        name: {"hands": [{**stiff, "to_rad": [x, 0.5 * x]}], "q0_rad": [x, 0.5 * x]}
+        for name, x in zip(TRIO, ends, strict=False)
+    }
+    shares = {
+        i: {j: x for j, x in zip(TRIO, row, strict=True) if i != j}
+        for i, row in zip(TRIO, complementary_shares(0.75).tolist(), strict=True)
+    }
+    law = {"law": "authority", "K": 100.0, "d": 20.0}
+    for wall, slave in (([], 0.15), ([CLAMP], 15.0 / 1100.0)):
+        sites["s"] = {"control": {"leads": False}, "hands": wall}
+        scenario = three(law, (0.75, 0.25), sites, dominance=shares)
+        rest = last_rows(scenario, 40.0)[0]
+        assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
+        assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
+    told = " ".join(describe_law_conditions(scenario))
+    assert "authority at m1, m2 holds: 4 d1 d2 >= (T1 + T2)^2 K1 K2" in told
+    assert "authority at s holds: it follows and closes no loop" in told
+
+
+@pytest.mark.long
+def test_impedances_give_way_as_they_are_set() -> None:
+    push = {"kind": "recorded", "points": [[0.0, 0.0, 0.0], [1.0, 3.0, 3.0], [100.0, 3.0, 3.0]]}
+    law = {"law": "impedance", "K": 50.0}
+    sites: dict[str, Any] = {"m1": {"hands": [push]}, "s": {"control": {"follows": True}}}
+    free = three(law, (0.75, 0.25), sites)
+    rest = last_rows(free, 40.0)[0]
+    assert rest["q"][:, 0] == pytest.approx([0.06, 0.0, 0.045], abs=1e-9)
+    assert "holds: for any delays, varying ones too" in describe_law_conditions(free)[0]
+    sites["s"]["hands"] = [CLAMP]
+    held = last_rows(three(law, (0.75, 0.25), sites), 40.0)[0]
+    f = held["tau_x"][2, 0]  # the force on the environment
+    assert 50.0 * held["q"][:2, 0] == pytest.approx([3.0 - 0.75 * f, -0.25 * f], abs=1e-9)
+
+
+@pytest.mark.long
+def test_a_prediction_removes_the_delay_from_the_loop() -> None:
+    """The damping is a quarter of what P+d needs: the master moves as if there were no delay."""
+    predicting = two(SMITH, control={"predicts": True})
+    ends = last_rows(predicting, 2.0, 3.5, 30.0)
+    assert ends[-1]["q"][:, 0] == pytest.approx(0.3, abs=1e-9)
+    near = unit_scenario(
+        {"m": {"hands": [H50]}, "s": {}},
+        {**P_D, "d": 5.0},
+        link={"model": "constant", "delay_ms": 0.0},
+        duration_s=30.0,
+    )
+    for late, prompt in zip(ends, last_rows(near, 2.0, 3.5, 30.0), strict=True):
+        assert late["q"][0, 0] == pytest.approx(prompt["q"][0, 0], abs=2e-3)
+    plain = last_rows(two({**P_D, "d": 5.0}), 30.0)[0]
+    assert abs(plain["qd"]).max() > 1.0  # without the prediction it swings ever more
+
+
+@pytest.mark.long
+def test_a_prediction_that_lacks_the_contact_is_unstable_there() -> None:
+    rows = last_rows(two(SMITH, clamped=True, control={"predicts": True}), 20.0)[0]
+    assert abs(rows["qd"]).max() > 1.0
+
+
+def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
+    with pytest.raises(ScenarioError, match="saturated_pd compares joint by joint"):
+        load_scenario("unlike_arms", {"control": SATURATED})

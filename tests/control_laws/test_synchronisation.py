@@ -1,0 +1,62 @@
+"""Adaptive synchronisation of qd + Lambda q: agreement without gravity, collapse to q = 0 with it."""
+
+from typing import Any
+
+import pytest
+
+from tests.unit_arm import last_rows, unit_scenario
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.describe import describe_law_conditions
+
+PENDULUM = {
+    "l1_m": 1.0,
+    "m1_kg": 1.0,
+    "lc1_m": 1.0,
+    "I1_kg_m2": 1e-9,
+    "l2_m": 1.0,
+    "m2_kg": 1e-12,
+    "lc2_m": 1e-9,
+    "I2_kg_m2": 1e-6,
+}
+"""Joint 1 is a pendulum of 1 kg m^2 and 1 kg m; joint 2 weighs nothing."""
+GAINS: dict[str, dict[str, Any]] = {
+    "sync": {"law": "sync", "K": [3.0, 3e-6]},
+    "adaptive": {"law": "adaptive", "Kp": [1.0, 1e-6], "Kd": [3.0, 3e-6]},
+}
+
+
+def pendulums(law: str, starts: tuple[float, ...], gravity: float) -> Scenario:
+    names = "abc"[: len(starts)]
+    share = 1.0 / (len(starts) - 1)
+    return unit_scenario(
+        {name: {"q0_rad": [start, 0.0]} for name, start in zip(names, starts, strict=True)},
+        {**GAINS[law], "Lambda": 1.0, "Gamma": [1.0, 0.0, 0.0, 1.0, 0.0]},
+        dominance={name: {peer: share for peer in names if peer != name} for name in names},
+        arm={**PENDULUM, "g_m_s2": gravity},
+        rate_hz=2000,
+        duration_s=200.0,
+    )
+
+
+def ends(law: str, starts: tuple[float, ...], gravity: float, *times_s: float) -> list[Any]:
+    return [row["q"][:, 0] for row in last_rows(pendulums(law, starts, gravity), *times_s)]
+
+
+@pytest.mark.parametrize("starts", [(0.6, -0.5), (1.0, 0.4), (0.6, -0.5, 0.1)])
+def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, ...]) -> None:
+    scenario = pendulums("sync", starts, 9.81)
+    first, last = (row["q"][:, 0] for row in last_rows(scenario, 20.0, 200.0))
+    assert abs(last).max() < 1e-13
+    if starts == (0.6, -0.5):  # a decaying rest, which the way of sampling moves by some per cent
+        assert first == pytest.approx([-6.4e-5, 5.9e-5], rel=0.035)
+    assert "under gravity the arms end at q = 0" in describe_law_conditions(scenario)[0]
+
+
+def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
+    assert ends("adaptive", (0.6, -0.5), 9.81, 200.0)[0] == pytest.approx(-0.047162, rel=1e-3)
+    assert ends("adaptive", (0.6, -0.5), 0.0, 200.0)[0] == pytest.approx(0.05, abs=1e-6)
+
+
+@pytest.mark.parametrize(("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)])
+def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> None:
+    assert ends("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)
