@@ -47,21 +47,3 @@ class Silent(Line):
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
     energies = None
-
-
-class Spring:
-    """A spring to zero with a damper, held over every period, that hears of nobody."""
-
-    remembers: ClassVar = ()
-    schemes: ClassVar = ("digital",)
-
-    def __init__(self, facts: LawContext, K: float, d: float) -> None:  # noqa: ARG002
-        self.K, self.d = K, d
-
-    def torque(self, now: LawInput) -> None:
-        for i in range(now.joints):
-            now.tau[i] = -self.K * now.q[i] - self.d * now.qd[i]
-
-    def energies(self, seen: LawRecords) -> LawEnergies:
-        none = [np.zeros(len(seen.q)) for _ in seen.peers]
-        return LawEnergies(none, none, store=0.5 * self.K * (seen.q**2).sum(axis=1))

@@ -28,6 +28,7 @@ class Trajectory:
     tau_x: Array
     theta_hat: Array
     used: NDArray[np.int64]
+    ch: Array
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def trajectories(scenario: Scenario) -> Run:
                 t_s=np.array([o.tick for o in outputs]) / scenario.sites[name].rate_hz,
                 **{
                     field: np.array([getattr(o, field) for o in outputs])
-                    for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat", "used")
+                    for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat", "used", "ch")
                 },
             )
             for name, outputs in records.items()

@@ -68,13 +68,3 @@ def test_two_closed_groups_are_named_for_people_and_programs(tmp_path: Path) -> 
     facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)
     assert facts["closed_groups"] == [["a", "b"], ["c", "d"]]
     assert facts["functional"] is None
-
-
-def test_laws_from_outside_are_asked_for_their_energies_on_request_alone(tmp_path: Path) -> None:
-    overrides = ("control.law=tests.line_law:Line", "scheme=digital", "rate_hz=500")
-    file = simulated(tmp_path, "two_sites", *overrides, seconds="0.5")
-    assert "observed energy" not in trilat("certify", file, cwd=tmp_path).out
-    asked = trilat("certify", file, "--own-laws", cwd=tmp_path)
-    assert "executing this log runs code from outside: tests.line_law:Line of m, s" in asked.err
-    assert "ok   observed energy never below zero: 4 energies" in asked.out
-    assert "line s->m" in asked.out

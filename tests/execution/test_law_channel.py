@@ -1,6 +1,5 @@
 """What laws send to their peers: it comes to whom it is for, stands in the records, and is executed again."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -59,20 +58,6 @@ def test_it_is_executed_again_and_equals_virtual_time() -> None:
     again = rerun(log, ["m1", "s"])
     assert again.identical
     assert [effect.identical for effect in again.sites.values()] == [TICKS, TICKS]
-
-
-@pytest.mark.parametrize(("before", "after"), [("adaptive", LAW), (LAW, "p_d")])
-@pytest.mark.parametrize("closed_loop", [False, True])
-def test_a_rerun_may_give_a_site_a_law_that_sends_or_take_it_away(
-    before: str, after: str, *, closed_loop: bool
-) -> None:
-    log = opened(recorded("paper", {**SHORT, "control.law": before}))
-    again = rerun(log, [] if closed_loop else ["s"], {"sites.s.control.law": after}, closed_loop=closed_loop)
-    assert bool(again.after["s"].sent) is (after == LAW)
-    stream = io.BytesIO()
-    again.write(stream)
-    verdict = verify(opened(stream.getvalue()))
-    assert verdict.identical == verdict.records == (3 if closed_loop else 1) * TICKS
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])

@@ -63,7 +63,7 @@ def _show(found: "Certificate") -> None:
     terminal.out.print()
     terminal.print_table(TextTable(("premise", "", "found"), rows), {"holds": "green", "fails": "yellow"})
     if observed is not None and observed.least:
-        least = [(one.name, f"{one.amount_j:.4g}", f"{one.at_s:.4g}") for one in observed.least]
+        least = [(name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least]
         terminal.out.print()
         terminal.print_table(TextTable(("energy of the laws", "least J", "at s"), least, align="lrr"))
     if found.balance is None:

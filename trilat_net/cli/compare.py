@@ -190,7 +190,8 @@ def compare_command(
         _option(
             "--law",
             metavar="LAW,LAW...",
-            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: p_f, known.",
+            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: p_f, known, "
+            "wave, tdpa, tanks.",
         ),
     ] = None,
     budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,

@@ -168,13 +168,14 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
 
 
 def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """Returns the attributes of a law that are numbers: what it remembers, then what `torque` names.
+    """Returns the attributes of a law that are numbers: what it remembers, then the others.
 
     A number that `torque` writes, and a list, is of floats; other integers stay integers.
     """
     code = list(dis.get_instructions(type(law).torque))
     written = {one.argval for one in code if one.opname == "STORE_ATTR"}
     named = {one.argval for one in code if one.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")}
+    named |= vars(law).keys()  # which functions that `torque` calls may name
     found = {}
     for name in dict.fromkeys([*law.remembers, *sorted(filter(lambda one: hasattr(law, one), named))]):
         value = getattr(law, name)

@@ -1,7 +1,7 @@
 """The energies by which a control law is proved passive, as functions of what its site recorded.
 
 Invariant: of energy that a law gives to a peer the peer takes no more than came; what a law stores is never
-below zero, nor is what it has taken for good. Then the arms get no more than they gave.
+below zero, and what it has taken for good never falls. Then the arms get no more than they gave.
 """
 
 from collections.abc import Mapping, Sequence

@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from .energy_laws import EnergyTanks, PassivityControl, WaveVariables
 from .fields import (
     MAX_QUANTITY,
     Frozen,
@@ -206,6 +207,7 @@ KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceRefle
 PluggedLaws = (
     FourChannels | SixChannels | SaturatedPositions | Authority | Synchronised | Impedances | SmithPredicted
 )
-ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | PluggedLaws | ImportedLaw
+EnergyLaws = WaveVariables | PassivityControl | EnergyTanks
+ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | PluggedLaws | EnergyLaws | ImportedLaw
 LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

@@ -18,6 +18,7 @@ from ..errors import ScenarioError
 from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
+from .energy_laws import EnergyLaw
 from .expect import find_expect_problem
 from .fields import TomlTable, reword_problem
 from .imported_law import ImportedLaw, PluggedLaw
@@ -101,7 +102,11 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
             f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f there",
             path=f"{path}.control.law",
         )
-    if isinstance(law, KnownGravityLaw) and not site.arm.known and law.gravity * site.arm.g_m_s2 > 0.0:
+    if (
+        isinstance(law, KnownGravityLaw | EnergyLaw)
+        and not site.arm.known
+        and law.gravity * site.arm.g_m_s2 > 0.0
+    ):
         raise ScenarioError(
             f"{law.__struct_config__.tag} takes gravity from the arm's masses, which are unknown "
             "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
@@ -142,6 +147,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_joint_space(scenario)
     _check_start_poses(scenario)
     _check_task_poses(scenario)
+    _check_energy_laws(scenario)
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
@@ -218,6 +224,29 @@ def _check_received(scenario: Scenario) -> None:
                         "them one length or two names",
                         path=f"sites.{peer}.control.sends.{name}",
                     )
+
+
+def _check_energy_laws(scenario: Scenario) -> None:
+    """Refuses sites of which only some keep account of energy, and what else such a law has against them."""
+    laws = {name: site.control for name, site in scenario.sites.items()}
+    for name, law in laws.items():
+        if not isinstance(law, EnergyLaw):
+            continue
+        tag = law.__struct_config__.tag
+        for other, theirs in laws.items():
+            if type(theirs) is not type(law):
+                problem = (
+                    f"{name} has {tag}, of which all sites are an end: choose {tag} here, or another there"
+                )
+                raise ScenarioError(problem, path=f"sites.{other}.control.law")
+        rates_hz = {one: site.rate_hz for one, site in scenario.sites.items()}
+        if scenario.scheme not in getattr(law.core_class, "schemes", (scenario.scheme,)):
+            problem = (
+                f"is {scenario.scheme!r}, and {tag} books the torque of a tick as held: choose 'digital'"
+            )
+            raise ScenarioError(problem, path="scheme")
+        if found := law.find_problem(rates_hz):
+            raise ScenarioError(found.problem, path=f"sites.{name}.{found.key}")
 
 
 def _check_start_poses(scenario: Scenario) -> None:

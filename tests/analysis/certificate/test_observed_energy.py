@@ -87,26 +87,6 @@ def test_a_wave_that_is_held_over_an_outage_is_energy_from_nowhere() -> None:
     assert found.stability is not Stability.STABLE
 
 
-@pytest.mark.parametrize(
-    ("damping", "finding"), [(0.4, ObservedFinding.NEGATIVE), (0.6, ObservedFinding.PASSIVE)]
-)
-def test_a_sampled_spring_needs_damping_of_half_its_stiffness_times_the_period(
-    damping: float, finding: ObservedFinding
-) -> None:
-    """d > K h / 2 = 0.5 N m s/rad (Colgate and Schenkel 1997): it takes sum (d qd - K dq / 2)' dq."""
-    K = 100.0
-    law = {"law": "tests.line_law:Spring", "K": K, "d": damping}
-    start = {"sites.m.q0_rad": [0.3, -0.2], "sites.m.hands": [], "sites.s.hands": [], "arm.g_m_s2": 0.0}
-    changes = {"control": law, **start, "rate_hz": 100, "duration_s": 5.0, "limits.tau_limit_nm": 1e6}
-    log = simulate_scenario(load_scenario(parse_scenario(PAIR, "line"), changes))
-    found = observe_energies(log, own_laws=True)
-    step = np.diff(log["m"].q, axis=0)
-    taken = np.cumsum(((damping * log["m"].qd[:-1] - 0.5 * K * step) * step).sum(axis=1))
-    least = {one.name: one.amount_j for one in found.least}
-    assert least["taken by m"] == pytest.approx(min(taken.min(), 0.0), abs=1e-12)
-    assert found.finding is finding
-
-
 def test_a_law_that_sends_more_than_it_got_is_found_by_its_books() -> None:
     found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
     assert found.finding is ObservedFinding.BROKEN

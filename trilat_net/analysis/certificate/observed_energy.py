@@ -1,8 +1,8 @@
 """ObservedEnergy of laws that declare what proves it: energy of lines, observers and tanks, from the records.
 
 Invariant: a law that declares energies is believed in nothing else. A line is what a site gave less what its
-peer took; the arm's port is the torque that was held times the step of the joints. Lines, stores and what
-laws have taken for good are never below zero, or the certificate says where.
+peer took; the arm's port is the torque that was held times the step of the joints. Lines and stores are
+never below zero, and what a law has taken for good never falls, or the certificate says where.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ LEAST_ENERGY_J = -1e-9
 ROUNDING_SHARE = 1e-12
 """And as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""Sampling may leave so much of an energy that a law does not book itself, as a share of the largest one."""
+"""The arms may get so much more than the laws book, as a share of the largest energy."""
 
 
 class ObservedFinding(StrEnum):
@@ -38,21 +38,11 @@ class ObservedFinding(StrEnum):
 
 
 class LeastEnergy(NamedTuple):
-    """An energy that must not be below zero, where it is least: "line m->s", "store of s", "taken by s".
-
-    Attributes:
-        sampled: True if it is what is left of the arm's work over whole periods: a little below zero may be.
-    """
+    """An energy that must not be below zero, where it is least: "line m->s", "store of s", "taken by s"."""
 
     name: str
     amount_j: float
     at_s: float
-    sampled: bool = False
-
-    def is_negative(self, scale: float) -> bool:
-        """True if it is below zero by more than rounding, or sampling; `scale` is the largest energy, J."""
-        share = SAMPLING_SHARE if self.sampled else ROUNDING_SHARE
-        return self.amount_j < LEAST_ENERGY_J - share * scale
 
 
 class ObservedEnergy(NamedTuple):
@@ -191,7 +181,7 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     """Returns the verdict on the books of all sites."""
     least, largest = [], 0.0
     for site, own in books.items():
-        energies = {f"taken by {site}": own.taken}
+        energies = {f"taken by {site}": own.taken - np.maximum.accumulate(own.taken)}
         if own.booked.store is not None:
             energies[f"store of {site}"] = own.booked.store
         for j, peer in enumerate(log[site].peers):  # what the peer had given by each tick of this site
@@ -201,18 +191,17 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
             energies[f"line {peer}->{site}"] = gave[row] - own.booked.took[j]
         for name, energy in energies.items():
             low = int(energy.argmin())
-            sampled = own.booked.taken is None and name.startswith("taken")
-            least.append(LeastEnergy(name, float(energy[low]), float(own.t_s[low]), sampled))
+            least.append(LeastEnergy(name, float(energy[low]), float(own.t_s[low])))
             largest = max(largest, float(energy.max()))
     scale = max(largest, *(float(np.abs(own.port).max()) for own in books.values()))
     residual = max(float(np.abs(own.residual).max()) for own in books.values())
     sampling = max(float(own.leak.max()) for own in books.values())
     premises = _check_premises(log, books, scale)
-    lowest = min((one for one in least if one.is_negative(scale)), key=lambda one: one.amount_j, default=None)
+    lowest = min(least, key=lambda one: one.amount_j)
     failed = [premise.name for premise in premises if not premise.holds]
     if not premises[0].holds:
         finding, text = ObservedFinding.BROKEN, premises[0].text
-    elif lowest is not None:
+    elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale:
         finding = ObservedFinding.NEGATIVE
         text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
     else:

@@ -110,7 +110,7 @@ class SearchSpace(NamedTuple):
         return tables
 
 
-_TORQUE_GAINS = ("Kp", "Kd", "K", "d")
+_TORQUE_GAINS = ("Kp", "Kd", "K", "d", "b", "B")
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
@@ -196,6 +196,18 @@ def _plugged(law: str, **masters: bool) -> Callable[[Scenario, ModelInformation,
     return controls
 
 
+def _wave(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    known = {"law": "wave", "b": gains["b"], "gravity": knowledge.gravity}
+    follows = {"slave": {"K": gains["K"], "B": gains["b"]}, "master": {}}
+    return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
+
+
+def _tdpa(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    known = {"law": "tdpa", "gravity": knowledge.gravity}
+    follows = {"slave": dict(gains), "master": {}}
+    return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
+
+
 _LAMBDA = GainRange("Lambda", "1/s", 0.2, 20.0)
 _KP = GainRange("Kp", "N m s/rad", 0.5, 200.0)
 _KD = GainRange("Kd", "N m s/rad", 0.1, 50.0)
@@ -213,6 +225,7 @@ _REFLECTING = (
     _D._replace(name="d_master", where="master"),
     GainRange("k_f", "", 0.05, 2.0, "master"),
 )
+_FOLLOWING = (_K._replace(where="slave"), _D._replace(name="B", where="slave"))
 _AS_FIRST = "gravity, as its first estimate"
 
 SEARCH_SPACES: dict[str, SearchSpace] = {
@@ -237,6 +250,9 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("smith", _PREDICTING, "gravity", _plugged("smith", predicts=True)),
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
+        SearchSpace("wave", (_D._replace(name="b"), _FOLLOWING[0]), "gravity", _wave),
+        SearchSpace("tdpa", _FOLLOWING, "gravity", _tdpa),
+        SearchSpace("tanks", (_K, _KD), "gravity", _knowing_gravity("tanks")),
     )
 }
 """The laws that can be tuned, by name; `known` is `adaptive` with Gamma = 0 and the true inertia."""

@@ -1,0 +1,50 @@
+"""Wave variables in plain Python, as a law of your own: the built-in `wave` where no sample is late or lost.
+
+In this folder:  trilat sim contact --set control.law=wave_law:Wave --set sites.s.control.K=100
+                 --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap
+
+Sites are joined by lines of impedance b, c = sqrt(2 b). A site without a spring of its own is pushed by -F,
+F = b qd - c v, where v is the wave that comes out of the line, and sends u = c qd - v into it. One with a
+spring K and a damper B follows q_sd, whose velocity solves c v = b qd_sd + F. See docs/laws.md.
+"""
+
+import math
+from typing import ClassVar
+
+from trilat_net.core.user_law import LawContext, LawInput
+
+
+class Wave:
+    """One end of a line to each peer."""
+
+    sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
+    remembers = ("q_sd",)
+
+    def __init__(self, facts: LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0) -> None:
+        self.b, self.K, self.B = b, K, B
+        self.c = math.sqrt(2.0 * b)
+        self.q_sd = [[0.0] * facts.joints for _ in facts.peers]
+
+    def torque(self, now: LawInput) -> list[float]:
+        """Returns the torque of each joint, and sends the waves."""
+        if now.k == 0:
+            self.q_sd = [list(peer.q) for peer in now.peers]  # they begin where they stand
+        tau = list(now.gravity)
+        for j, peer in enumerate(now.peers):
+            for i in range(now.joints):
+                v = now.received[j].u[i] if peer.new else 0.0  # a wave that does not come is none
+                if self.K == 0.0:  # the line pushes the arm
+                    force, wave = self.c * v - self.b * now.qd[i], self.c * now.qd[i] - v
+                else:
+                    force, wave = self.follow(now, j, i, v)
+                now.sent[j].u[i] = wave
+                tau[i] += force
+        return tau
+
+    def follow(self, now: LawInput, j: int, i: int, v: float) -> tuple[float, float]:
+        """Returns the torque of a spring whose far end the line moves, and the wave that goes back."""
+        stretch = self.q_sd[j][i] - now.q[i]
+        qd_sd = (self.c * v - self.K * stretch + self.B * now.qd[i]) / (self.b + self.B)
+        force = self.K * stretch + self.B * (qd_sd - now.qd[i])
+        self.q_sd[j][i] += now.h_s * qd_sd
+        return force, v - self.c / self.b * force

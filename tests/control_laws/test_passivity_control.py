@@ -1,0 +1,108 @@
+"""Time-domain passivity control on the unit arm: numbers of independent simulations, and what it is for."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, least_energy, ticked
+from tests.energy_runs import pair as pair_of
+from tests.unit_arm import CLAMP, H50, hand, unit_scenario
+from trilat_net.errors import ScenarioError
+
+PUBLISHED = {"energy": "velocity", "reserve_J": 0.0, "drift_rad_s": 0.0, "acceleration_rad_s2": 0.0}
+"""Energy as it is published: torque times velocity times period."""
+
+
+def run(delay_ms: float, *, clamped: bool, duration_s: float = 30.0, every: int = 10, **more: Any) -> Any:
+    control = {"law": "tdpa", **PUBLISHED, **more}
+    link = {**CONSTANT, "delay_ms": delay_ms}
+    return ticked(pair_of(control, clamped=clamped, duration_s=duration_s, link=link), every)
+
+
+def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any:
+    """Without controllers, which is no choice of a scenario; hands as they are sampled."""
+    law = {
+        "law": "trilat_net.core.laws.tdpa:Tdpa",
+        **PUBLISHED,
+        "gravity": 1.0,
+        "controlled": False,
+        "K": [0.0, 0.0],
+        "B": [0.0, 0.0],
+    }
+    env = [{**CLAMP, "sampled": True}] if clamped else []
+    sites = {
+        "m": {"hands": [{**H50, "sampled": True}]},
+        "s": {"hands": env, "control": {**law, "K": [100.0, 100.0], "B": [10.0, 10.0]}},
+    }
+    return ticked(
+        unit_scenario(sites, law, duration_s=duration_s, link={**CONSTANT, "delay_ms": delay_ms}), 10
+    )
+
+
+def felt(result: Any) -> float:
+    return float(abs(result["m"].tau_x[-1, 0] / result["m"].q[-1, 0]))
+
+
+def test_without_controllers_the_channel_is_active() -> None:
+    free = watching(50.0, clamped=False)
+    assert free["s"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
+    assert least_energy(free) == pytest.approx(-3.3e-3, abs=5e-5)
+    assert felt(watching(50.0, clamped=True)) == pytest.approx(90.91, abs=5e-3)
+    fast = watching(200.0, clamped=False)["m"].qd[:, 0]
+    assert np.abs(fast).max() > 50.0
+
+
+def test_without_controllers_contact_at_200_ms_diverges() -> None:
+    speed = np.abs(watching(200.0, clamped=True, duration_s=11.8)["m"].qd[:, 0])
+    assert 0.01 * (1 + np.argmax(speed > 999.0)) == pytest.approx(11.69, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "drift_rad_s", "slave"), [(50.0, 0.0, 0.2864), (200.0, 0.0, 0.2143), (200.0, 0.5, 0.3)]
+)
+def test_free_motion_drifts_unless_drift_is_paid_for(
+    delay_ms: float, drift_rad_s: float, slave: float
+) -> None:
+    result = run(delay_ms, clamped=False, drift_rad_s=drift_rad_s)
+    assert result["m"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
+    assert result["s"].q[-1, 0] == pytest.approx(slave, abs=5e-5)
+    assert least_energy(result) >= -1e-15
+
+
+def test_contact_stays_bounded() -> None:
+    near, far = run(50.0, clamped=True), run(200.0, clamped=True)
+    assert felt(near) == pytest.approx(68.88, rel=1e-3)
+    assert felt(far) == pytest.approx(26.7, rel=0.04)  # it chatters: the last digits are the integrator's
+    assert np.abs(far["m"].qd[-100:, 0]).max() < 0.03
+    assert least_energy(near) >= -1e-15
+    assert least_energy(far) >= -1e-15
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_energy_is_what_the_arm_gets(clamped: bool) -> None:
+    """The leader's account, told again from torque and step; books of velocity are off by tau qdd h^2 / 2."""
+    known = {"energy": "step", "reserve_J": 1e-3, "acceleration_rad_s2": 20.0}
+    result = run(50.0, clamped=clamped, duration_s=6.0, every=1, **known)
+    m, s = result["m"], result["s"]
+    step = -m.tau[:-1, 0] * np.diff(m.q[:, 0])
+    assert m.sent[0].E_led[-1, 0] == pytest.approx(np.maximum(step, 0.0).sum(), rel=1e-9)
+    out = np.cumsum(np.minimum(step, 0.0))
+    came = s.sent[0].E_followed[1:-50, 0]  # 50 ms ago
+    assert np.abs(m.sent[0].W_led[51:, 0] - (1e-3 + came + out[50:])).max() < 1e-12
+    assert least_energy(result) >= -1e-15
+
+
+@pytest.mark.long
+def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
+    shares = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
+    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
+    law = {"law": "tdpa", **FOLLOWER}
+    for link in ({"preset": "4g"}, JITTER):
+        scenario = unit_scenario(sites, law, duration_s=10.0, dominance=shares, link=link)
+        assert least_energy(ticked(scenario, every=7)) >= -1e-12
+
+
+def test_books_of_a_torque_that_is_held_are_for_digital_alone() -> None:
+    with pytest.raises(ScenarioError, match="choose 'digital'"):
+        pair_of({"law": "tdpa"}, clamped=False, duration_s=1.0, scheme="second_order")

@@ -1,0 +1,177 @@
+"""Wave variables on the unit arm: numbers of independent simulations, closed forms, what is not passive."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.energy_runs import CONSTANT, JITTER, pair, ticked
+from tests.unit_arm import CLAMP, hand, unit_scenario
+from tests.virtual_runs import trajectories
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.describe import describe_law_conditions
+
+b, h = 10.0, 1e-3
+c = math.sqrt(2.0 * b)
+CUT = {**CONSTANT, "outages_s": [[1.8, 2.8]]}
+WAVE = {"law": "wave"}
+
+
+def comparing(reception: str) -> dict[str, Any]:
+    """The class itself, as `hold` is no choice of a scenario."""
+    none = [0.0, 0.0]
+    gains = {"b": [b, b], "K": none, "B": none, "lines": {}, "beta": 1.0, "gravity": 1.0}
+    return {"law": "trilat_net.core.laws.wave:Wave", **gains, "reception": reception}
+
+
+def received(
+    reception: str, link: dict[str, Any], duration_s: float = 20.0, env: Any = (), push: Any = None
+) -> Scenario:
+    law = comparing(reception)
+    slave = {**law, "K": [100.0, 100.0], "B": [b, b]}
+    sites = {"m": {"hands": [push or hand(0.3)]}, "s": {"hands": list(env), "control": slave}}
+    return unit_scenario(sites, law, duration_s=duration_s, link=link)
+
+
+def stored(run: dict[str, Any]) -> tuple[Any, Any]:
+    """The energy in the line of joint 1, tick by tick: by its waves, and by the power at its ports."""
+    m, s = run["m"], run["s"]
+    u_m, u_s, force_m, force_s = m.sent[0].u[:, 0], s.sent[0].u[:, 0], -m.tau[:, 0], s.tau[:, 0]
+    v_m, v_s = c * m.qd[:, 0] - u_m, u_s + c / b * force_s
+    waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
+    ports = np.cumsum(h * (force_m * m.qd[:, 0] - force_s * (c * v_s - force_s) / b))
+    return waves, ports
+
+
+def test_a_free_slave_comes_to_where_the_master_is() -> None:
+    run = ticked(pair(WAVE, clamped=False, duration_s=20.0), every=4)
+    m, s = run["m"], run["s"]
+    assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
+    assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
+    assert np.abs(m.q - s.q)[:, 0].max() == pytest.approx(0.0476, abs=5e-5)
+    assert -m.tau[:, 0].min() == pytest.approx(1.763, abs=5e-4)
+
+
+def test_a_line_stores_what_its_ports_put_in() -> None:
+    waves, ports = stored(ticked(pair(WAVE, clamped=False, duration_s=5.0)))
+    assert np.abs(waves - ports).max() < 1e-12 * waves.max()
+    assert waves.min() >= 0.0
+    assert waves.max() == pytest.approx(0.149, abs=5e-4)
+
+
+def test_a_clamped_line_is_a_spring() -> None:
+    """Of stiffness b / T, in a row with the follower's K and what clamps it."""
+    run = ticked(pair(WAVE, clamped=True, duration_s=30.0), every=30000)
+    m, s = run["m"], run["s"]
+    assert m.q[-1, 0] == pytest.approx(0.182353, abs=5e-7)
+    assert s.q[-1, 0] == pytest.approx(0.005882, abs=5e-7)
+    assert abs(m.tau_x[-1, 0]) == pytest.approx(5.8824, abs=1e-4)
+    assert abs(m.tau_x[-1, 0]) / m.q[-1, 0] == pytest.approx(1.0 / (0.2 / b + 0.01 + 0.001), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "clamp_nm_rad", "ratio"),
+    [(0.01, 0.0, 4.0004 * 2.0 * math.pi * 0.01), (0.1, 0.0, 2.538), (0.1, 1e6, 51.88)],
+)
+def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio: float) -> None:
+    """|torque / velocity| at the master, N m s/rad: of a free slave the masses and b T."""
+    periods = 3 if frequency_hz < 0.1 else 6
+    push = {"kind": "multisine", "amplitude_nm": [0.2, 0.1], "frequencies_hz": [frequency_hz]}
+    env = [{**CLAMP, "stiffness_nm_rad": clamp_nm_rad}] if clamp_nm_rad else []
+    run = ticked(received("replay", CONSTANT, periods / frequency_hz, env, push), every=20)["m"]
+    last = round(50.0 / frequency_hz)  # rows of the last period
+    turn = np.exp(-2j * np.pi * np.arange(last) / last)
+    felt = abs(run.tau_x[-last:, 0] @ turn) / abs(run.qd[-last:, 0] @ turn)
+    assert felt == pytest.approx(ratio, rel=2e-4)
+
+
+@pytest.mark.parametrize(("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)])
+def test_an_outage_leaves_nothing_behind_but_where_waves_are_held_or_dropped(
+    reception: str, end: float
+) -> None:
+    slave = ticked(received(reception, CUT), every=20000)["s"]
+    assert slave.q[-1, 0] == pytest.approx(end, abs=1e-4)
+
+
+def varying(period_s: float = 2.0) -> dict[str, Any]:
+    """T(t) = 0.2 + 0.15 sin(pi t) at the time t of receipt, as a trace by stamps."""
+    t = np.arange(0.0, 12.0, 1e-3)
+    sent = t - 0.2 - 0.15 * np.sin(2.0 * np.pi * t / period_s)
+    stamps = np.arange(0.0, 10.0, 1e-3)
+    delays = np.interp(stamps, sent, t) - stamps
+    points = ", ".join(f"{n * 1000} {round(1e6 * one)}" for n, one in enumerate(delays))
+    return {"model": "trace", "trace": points}
+
+
+@pytest.mark.parametrize(("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)])
+def test_a_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str, least: float) -> None:
+    push = {**hand(0.3, damping=0.0), "move_end_s": 1.5}
+    env = [{**CLAMP, "stiffness_nm_rad": 200.0}]
+    waves, _ = stored(ticked(received(reception, varying(), 4.0, env, push)))
+    assert waves.min() == pytest.approx(least, abs=3e-4 if least else 1e-12)
+
+
+def test_play_out_makes_jitter_a_constant_delay() -> None:
+    jitter = {**JITTER, "loss": 0.0, "playout_ms": 400.0}
+    a, other = (
+        ticked(pair(WAVE, clamped=False, duration_s=5.0, link=link), every=5000)
+        for link in (jitter, {**CONSTANT, "delay_ms": 400.0})
+    )
+    assert np.array_equal(a["s"].q, other["s"].q)
+
+
+MESH = {"m1-m2": 2.0, "m1-s": 18.0, "m2-s": 4.0}
+SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
+
+
+def test_three_sites_are_the_network_of_springs_b_over_T() -> None:
+    law = {"law": "wave", "lines": MESH}
+    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
+    scenario = unit_scenario(sites, law, duration_s=40.0, dominance=SHARES)
+    run = ticked(scenario, every=40000)
+    springs = np.array([[100.0 + 50.0, -10.0, -90.0], [-10.0, 30.0 + 50.0, -20.0], [-90.0, -20.0, 110.0]])
+    rest = np.linalg.solve(springs, [15.0, -15.0, 0.0])
+    for name, q, known in zip(run, rest, (0.14602, -0.14602, 0.09292), strict=True):
+        assert q == pytest.approx(known, abs=5e-6)
+        assert run[name].q[-1, 0] == pytest.approx(q, abs=1e-5)
+    assert "m2 0.1, s 0.9" in describe_law_conditions(scenario)[0]
+
+
+@pytest.mark.long
+def test_weights_say_who_feels_whom() -> None:
+    """Torques of lines add to zero; beta divides what each site gets of them."""
+    sites = {
+        "m1": {"hands": [hand(0.0)], "control": {"law": "wave", "beta": 1.0}},
+        "m2": {"control": {"law": "wave", "beta": 0.5}},
+        "s": {
+            "hands": [{"kind": "recorded", "points": [[0.0, 5.0, 2.5], [1e4, 5.0, 2.5]]}],
+            "control": {"law": "wave", "beta": 1.5},
+        },
+    }
+    law = {"law": "wave", "lines": MESH}
+    run = ticked(unit_scenario(sites, law, duration_s=60.0, dominance=SHARES), every=60000)
+    assert abs(run["m1"].tau_x[-1, 0]) == pytest.approx(7.5, rel=3e-3)
+
+
+def test_a_law_of_ones_own_is_the_same_to_the_last_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """examples/wave_law.py."""
+    monkeypatch.chdir(Path(__file__).parents[2] / "examples")
+    ours, theirs = (
+        trajectories(pair({"law": law}, clamped=False, duration_s=1.3, link={**CONSTANT, "delay_ms": 50.0}))
+        for law in ("wave", "wave_law:Wave")
+    )
+    assert np.abs(ours.stack("q")).max() > 1e-3
+    for field in ("q", "qd", "tau"):
+        assert np.abs(ours.stack(field) - theirs.stack(field)).max() < 1e-12
+
+
+def test_all_sites_are_ends_of_lines_at_one_rate() -> None:
+    with pytest.raises(ScenarioError, match="all sites"):
+        unit_scenario({"m": {"control": WAVE}, "s": {"control": {"law": "p_d"}}}, WAVE)
+    with pytest.raises(ScenarioError, match="one tick rate"):
+        unit_scenario({"m": {}, "s": {"rate_hz": 500}}, WAVE)
+    with pytest.raises(ScenarioError, match="m-x"):
+        unit_scenario({"m": {}, "s": {}}, {**WAVE, "lines": {"m-x": 1.0}})

@@ -1,0 +1,160 @@
+"""Built-in control laws that keep account of energy: their gains and their conditions.
+
+Invariant: as for the laws of `laws.py`. Each is for sites that all have it: what one end sends, the other
+end books.
+"""
+
+from collections.abc import Mapping
+from itertools import permutations
+from typing import Literal
+
+from msgspec import field
+
+from ..core.laws.tanks import Tanks
+from ..core.laws.tdpa import Tdpa
+from ..core.laws.wave import Wave, find_line
+from .fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
+from .imported_law import PluggedLaw
+from .law_conditions import LawSituation, StabilityCondition
+
+_PASSIVE = "operators and environments are passive; *sufficient*, and of the loop in continuous time"
+
+
+class EnergyLaw(PluggedLaw, frozen=True):
+    """A law of which all sites of a scenario are an end.
+
+    Attributes:
+        gravity: share of gravity that it knows, 1: exactly.
+    """
+
+    gravity: NotNegative = 1.0
+
+    def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
+        """Returns what a site's law has against sites of such rates, or None."""
+        return None
+
+
+class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
+    """Wave variables: a line of impedance b between every two sites, whose waves carry its energy.
+
+    At an end without a spring of its own F = b qd - c v and u = c qd - v, c = sqrt(2 b), v being the wave
+    that comes and u the one that goes; an end with K and B follows by them. Dominance factors have no
+    effect: sites share as b_ij / sum b_ik. After Anderson and Spong (1989), Niemeyer and Slotine (1991).
+
+    Attributes:
+        b: impedance per joint, N m s/rad.
+        K: spring of an end that moves its arm by one, per joint, N m/rad; 0: none.
+        B: damper of such an end, per joint, N m s/rad; b matches it to the line.
+        lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0: no line.
+        beta: the site's torque is divided by it, dimensionless: who feels whom.
+        reception: how waves are played if samples are late or lost. "replay": what was missed is made up for,
+            as far as its energy allows; "zero": it is dropped, and positions drift; "scaled": the last wave
+            goes on, times sqrt(1 - T'), for delays that vary continuously.
+    """
+
+    core_class = Wave
+
+    b: PositiveJoints = (10.0,)
+    K: NotNegativeJoints = (0.0,)
+    B: NotNegativeJoints = (0.0,)
+    lines: dict[str, NotNegative] = field(default_factory=dict)
+    beta: Positive = 1.0
+    reception: Literal["replay", "zero", "scaled"] = "replay"
+
+    def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
+        """Returns a line that joins no two sites, or rates that differ: a wave lasts for a tick."""
+        for line in self.lines:
+            if sorted(line.split("-", 1)) not in [sorted(two) for two in permutations(rates_hz, 2)]:
+                names = ", ".join(rates_hz)
+                return KeyProblem(
+                    f"control.lines.{line}", f"joins no two sites: name them as in m1-s, of {names}"
+                )
+        if len({*rates_hz.values()}) > 1:
+            return KeyProblem("rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick")
+        return None
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns that the lines are passive, and how sites share."""
+        here = situation.names[situation.site]
+        peers = [name for name in situation.names if name != here]
+        lines = [find_line(self.lines, here, peer) for peer in peers]
+        weights = [self.b[0] if line is None else line for line in lines]
+        shares = ", ".join(
+            f"{peer} {line / (sum(weights) or 1.0):.4g}" for peer, line in zip(peers, weights, strict=True)
+        )
+        text = (
+            f"lines are passive whatever delays, jitter and loss are, where {_PASSIVE} (held over a tick, "
+            f"arms and hands damp more than (sum b)^2 h / 2M, or echoes grow); the shares of {here}"
+        )
+        return StabilityCondition(True, f"{text} are b_ij / sum b_ik, {shares}, and no others")
+
+
+class EnergyTanks(EnergyLaw, frozen=True, tag_field="law", tag="tanks"):
+    """Two layers: springs to the reference, over a tank per site that pays for what they do.
+
+    Any shares, any delays: the tanks are passive. Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE
+    Transactions on Robotics 27 (4), 2011.
+
+    Attributes:
+        K: stiffness of the transparency layer per joint, N m/rad.
+        Kd: its damping of the error's velocity per joint, N m s/rad.
+        d: its damping of the arm's velocity per joint, N m s/rad.
+        level_J: level to which a tank is kept, J.
+        fill_nm_s_rad_J: damping of the arm per energy that is missing from it, N m s/rad/J.
+        packet_1_s: rate at which a tank is emptied towards the peers, 1/s.
+        by_shares: true: peers get parts by this site's dominance factors; false: equal ones.
+    """
+
+    core_class = Tanks
+
+    K: PositiveJoints = (100.0,)
+    Kd: NotNegativeJoints = (2.0,)
+    d: NotNegativeJoints = (0.0,)
+    level_J: Positive = 0.1
+    fill_nm_s_rad_J: NotNegative = 50.0
+    packet_1_s: NotNegative = 10.0
+    by_shares: bool = False
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns that tanks are passive, if no more than all of a tank is sent in a tick."""
+        text = f"tanks are passive for any shares, delays and loss, where {_PASSIVE}"
+        share = self.packet_1_s / situation.rate_hz
+        if share > 1.0:
+            return StabilityCondition(
+                False, f"a tank sends {share:.3g} of its energy a tick, more than it has"
+            )
+        return StabilityCondition(True, text)
+
+
+class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
+    """Time-domain passivity control with delay: each end watches the energy of its coupling, and damps.
+
+    Followers are moved by K and B towards the integral of their leaders' velocities, and leaders feel that
+    torque. After Ryu, Artigas and Preusche (2010).
+
+    Attributes:
+        K: spring by which the site follows, per joint, N m/rad; 0: it follows nobody.
+        B: damper by which it follows, per joint, N m s/rad.
+        acceleration_rad_s2: most by which a joint accelerates, as far as leaders' controllers cover it: in
+            the period to come it moves by qd h and half of this times h^2 more.
+        drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
+        reserve_J: energy per joint and peer with which a leader's end begins.
+        energy: "step": what the arm gets, torque times the step in q; "velocity": torque times velocity times
+            period, as it is published.
+    """
+
+    core_class = Tdpa
+
+    K: NotNegativeJoints = (0.0,)
+    B: NotNegativeJoints = (0.0,)
+    acceleration_rad_s2: NotNegative = 20.0
+    drift_rad_s: NotNegative = 0.5
+    reserve_J: NotNegative = 1e-3
+    energy: Literal["step", "velocity"] = "step"
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
+        """Returns that the couplings are passive as far as their leaders' joints do not accelerate more."""
+        leak = "" if self.energy == "step" else " in books that leak tau qdd h^2 / 2 a tick"
+        most = f"leaders' joints accelerate by {self.acceleration_rad_s2:g} rad/s^2 at most"
+        text = f"couplings are passive{leak} for any delays, jitter and loss, where {_PASSIVE}, and {most}"
+        return StabilityCondition(True, text)
