@@ -15,7 +15,7 @@ MOBILE = {"preset": "4g"}
 FOLLOWER = {"K": 100.0, "B": 10.0}
 LAWS: dict[str, dict[str, Any]] = {
     "wave": {"law": "wave"},
-    "tdpa": {"law": "tdpa"},
+    "tdpa": {"law": "tdpa", "acceleration_rad_s2": 100.0},  # torque that jumps makes joints jump
     "tanks": {"law": "tanks"},
 }
 

@@ -24,7 +24,7 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
     """Free and in contact, over a mobile network and over 0 to 400 ms with 10 % loss."""
     for link in (MOBILE, JITTER):
         for clamped in (False, True):
-            scenario = pair({"law": law}, clamped=clamped, duration_s=12.0, link=link, seed=seed)
+            scenario = pair(LAWS[law], clamped=clamped, duration_s=12.0, link=link, seed=seed)
             run = ticked(scenario, every=11)
             assert least_energy(run) >= -1e-9
             assert np.abs(run["s"].qd).max() < 5.0
@@ -32,7 +32,7 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
-    scenario = pair({"law": law}, clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0})
+    scenario = pair(LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0})
     run, last = trajectories(scenario), sampled(scenario, (1.6,))[:, -1]
     for n, name in enumerate(scenario.names):
         columns, site = scenario.layout(name).columns(), run.sites[name]
@@ -40,7 +40,7 @@ def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()
     stream = io.BytesIO()
-    virtual.write_virtual_log(pair({"law": law}, clamped=True, duration_s=0.3, link=MOBILE), stream)
+    virtual.write_virtual_log(pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE), stream)
     verdict = verify(opened(stream.getvalue()))
     assert verdict.passed
     assert verdict.identical == verdict.records == 600
@@ -48,7 +48,7 @@ def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_a_scenario_says_what_its_law_rests_on(law: str) -> None:
-    (line, *_) = describe_law_conditions(pair({"law": law}, clamped=False, duration_s=1.0))
+    (line, *_) = describe_law_conditions(pair(LAWS[law], clamped=False, duration_s=1.0))
     assert line.startswith(f"condition of {law} at m")
     assert "holds: " in line
     assert "sufficient" in line
