@@ -1,6 +1,6 @@
 """Wave variables in plain Python, as a law of your own: the built-in `wave` where no sample is late or lost.
 
-In this folder:  trilat sim contact --set control.law=wave_law:Wave --set sites.s.control.K=100
+In this folder:  trilat sim two_sites --set control.law=wave_law:Wave --set sites.s.control.K=100
                  --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap
 
 Sites are joined by lines of impedance b, c = sqrt(2 b). A site without a spring of its own is pushed by -F,
