@@ -11,6 +11,19 @@ settings.register_profile("ci", settings.get_profile("desk"), derandomize=True, 
 settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 
+OTHER_LAYOUTS = {"seven_joints", "unlike_arms"}
+"""Scenarios for which the core is compiled anew, which takes longer than most tests: their runs are long tests."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the tests that run such a scenario."""
+    for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        runs = {"execution", "log", "golden"} & set(item.path.parts)
+        if runs and OTHER_LAYOUTS.intersection(value for value in values if isinstance(value, str)):
+            item.add_marker(pytest.mark.long)
+
+
 @pytest.fixture
 def log_file(short_log: bytes, tmp_path: Path) -> Path:
     """A short log, as long as the folder's tests want it, as a file of the test's own."""

@@ -382,7 +382,7 @@ PAGES: dict[str, dict[str, Make]] = {
             test_energy.booked("paper", "digital").residual,
             *[test_energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
-        "{} runs of the twenty": lambda: [len(shipped_trials())],
+        "{} runs of the twenty-one": lambda: [len(shipped_trials())],
         "run once): {} s simulated": lambda: [sum(one.scenario.duration_s for one in shipped_trials())],
     },
     "README.md": {

@@ -14,6 +14,7 @@ from trilat_net.reporting.figures.registry import list_drawable_figures
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.theory.operating_point import derive_operating_conditions
 
+pytestmark = pytest.mark.long  # compiled for arms of seven joints that follow places
 SHORT = {"duration_s": 1.0}
 
 

@@ -25,12 +25,7 @@ from trilat_net.scenario import list_shipped, load_scenario
 TICKS = 120
 
 
-LONG = ("seven_joints",)  # compiled for seven
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in list_shipped()]
-)
+@pytest.mark.parametrize("name", list_shipped())
 def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):

@@ -30,10 +30,16 @@ BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of 
 (-1: never)."""
 
 
-@cache
-def sent_dtype(floats: int) -> np.dtype[np.void]:
-    """Returns the layout of a tick's record, which is kept as long as a peer may still want it."""
-    return np.dtype((np.record, [("t_ns", "i8"), ("row", "f8", (floats,))]))
+class KeptRecords(NamedTuple):
+    """The last records of a site, kept as long as a peer may still want them; of all sites one axis more.
+
+    Attributes:
+        t_ns: their nominal times, ns since the epoch, shape (a power of two,).
+        rows: their floats, see `Layout.columns`, a row each.
+    """
+
+    t_ns: IntArray
+    rows: Array
 
 
 @cache
@@ -75,7 +81,7 @@ def _receive(
     peer: Row,
     made: int,
     next_sample: int,
-    sent: RowArray,
+    sent: KeptRecords,
     link: LinkArrays,
 ) -> int:
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
@@ -84,10 +90,10 @@ def _receive(
     if peer.task:
         q, qd, tau_x = sent_at - 3 * m, sent_at - 2 * m, sent_at - m
     while next_sample < made:
-        record: Row = sent[next_sample & (sent.shape[0] - 1)]
-        if record.t_ns >= t_ns:
+        page = next_sample & (sent.t_ns.shape[0] - 1)
+        if sent.t_ns[page] >= t_ns:
             break
-        row = record.row
+        row = sent.rows[page]
         accept_sample(k, rate_hz, next_sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
         next_sample += 1
     return next_sample
@@ -228,7 +234,7 @@ def sense_site(
     i: int,
     progress: RowArray,
     taken: IntArray,
-    sent: RowArray,
+    sent: KeptRecords,
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
@@ -248,7 +254,8 @@ def sense_site(
             channel_of(channel_of(arrays.channel, i), p),
         )
         sender: Row = arrays.site[j, 0]
-        taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], sent[j], link)
+        kept = KeptRecords(sent.t_ns[j], sent.rows[j])
+        taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], kept, link)
         recall_sample(k, rate_hz, link)
     reference_stages(k, t_ns, site, links, arrays.ramps[i], arrays.actors[i], arrays.table, chain)
 
@@ -258,7 +265,7 @@ def finish_site(
     i: int,
     apart_rad: float,
     progress: RowArray,
-    sent: RowArray,
+    sent: KeptRecords,
     peaks: Array,
     sums: RowArray,
     arrays: SiteArrays,
@@ -269,13 +276,14 @@ def finish_site(
     own: Row = progress[i]
     k, t_ns, rate_hz, site = own.tick, own.t_ns, own.rate_hz, arrays.site[i]
     _find_torque(i, own, arrays, chain, laws)
-    record: Row = sent[i, k & (sent.shape[1] - 1)]
-    record.t_ns = t_ns
-    act_stages(k, t_ns, site, arrays.actors[i], arrays.table, chain, record.row)
-    _record_sent(site[0], i, record.row, laws)
+    page = k & (sent.t_ns.shape[1] - 1)
+    sent.t_ns[i, page] = t_ns
+    record = sent.rows[i, page]
+    act_stages(k, t_ns, site, arrays.actors[i], arrays.table, chain, record)
+    _record_sent(site[0], i, record, laws)
     total: Row = sums[i]
-    _update_peaks(record.row, t_ns, apart_rad, site[0], own, peaks[i], total)
-    _update_sums(k, t_ns, site[0], chain, arrays.actors[i], arrays.table, record.row, total)
+    _update_peaks(record, t_ns, apart_rad, site[0], own, peaks[i], total)
+    _update_sums(k, t_ns, site[0], chain, arrays.actors[i], arrays.table, record, total)
     own.tick = k + 1
     own.t_ns = tick_ns(k + 1, rate_hz) if k + 1 < own.ticks else NEVER_NS
     mode: int = site[0].mode
@@ -288,7 +296,7 @@ def run_until(
     apart_rad: float,
     progress: RowArray,
     taken: IntArray,
-    sent: RowArray,
+    sent: KeptRecords,
     peaks: Array,
     sums: RowArray,
     arrays: SiteArrays,
@@ -302,7 +310,7 @@ def run_until(
         apart_rad: the time of the last |e| of this or more is kept, see PROGRESS_DTYPE.
         progress: of each site, shape (N,), PROGRESS_DTYPE.
         taken: the next sample of each peer to accept, shape (N, P).
-        sent: each site's last records, shape (N, a power of two), see `sent_dtype`.
+        sent: each site's last records.
         peaks: of each bucket per joint the largest |e|, then per joint the largest |qd|, then the last q of
             each; -1 where there is no record; shape (N, buckets, 3 n).
         sums: of each site, shape (N,), see `sums_dtype`.

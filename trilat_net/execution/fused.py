@@ -16,12 +16,12 @@ from ..core.compiled_law import CompiledLaw, plug_law
 from ..core.fused_run import (
     NEVER_NS,
     PROGRESS_DTYPE,
+    KeptRecords,
     LawArrays,
     finish_site,
     largest_of_joints,
     run_until,
     sense_site,
-    sent_dtype,
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
@@ -97,9 +97,8 @@ class FusedRun:
         self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
         kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
-        self._sent: RowArray = np.zeros(
-            (count, kept), sent_dtype(max(layout.floats for layout in self._layouts))
-        )
+        floats = max(layout.floats for layout in self._layouts)
+        self._sent = KeptRecords(np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats)))
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
         self._sums["first_environment"] = [
@@ -258,7 +257,7 @@ class FusedRun:
     def records(self) -> Array:
         """Last record of each site, floats as in `Layout.columns`, a row per site."""
         rows = [
-            self._sent[n, (int(progress["tick"]) - 1) % self._sent.shape[1]]["row"]
+            self._sent.rows[n, (int(progress["tick"]) - 1) % self._sent.t_ns.shape[1]]
             for n, progress in enumerate(self._progress)
         ]
         return np.array(rows)

@@ -55,6 +55,7 @@ def test_damping_near_a_singular_pose_is_a_premise_that_fails_and_work_that_is_b
     assert share(found, "unexplained") <= 2e-4
 
 
+@pytest.mark.long
 def test_an_axis_that_only_one_follows_dissipates() -> None:
     """The arm of seven joints begins beside the plane of its masters, which cannot leave it."""
     q0 = [0.3, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
