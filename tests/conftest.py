@@ -12,7 +12,7 @@ settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 
 OTHER_LAYOUTS = {"seven_joints", "unlike_arms"}
-"""Scenarios for which the core is compiled anew, which takes longer than most tests: their runs are long tests."""
+"""Scenarios for which the core is compiled anew: their runs are long tests."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
