@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo setup test pytest live containers lint test-long bench lock clean
+.PHONY: help demo setup test pytest sessions live containers lint test-long bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -40,10 +40,14 @@ $(VENV)/robots.stamp: requirements/robots.lock $(VENV)/dev.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/robots.lock
 	@touch $@
 
-test: pytest live lint
+test: pytest
+	@$(MAKE) --no-print-directory -j2 sessions lint
+	@$(MAKE) --no-print-directory live
 
 pytest: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
+
+sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long"
 
 test-long: $(VENV)/robots.stamp

@@ -37,7 +37,7 @@ from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
-WORDS = {"Twenty": "20", "eleven": "11", "−": "-"}
+WORDS = {"Twenty-one": "21", "eleven": "11", "−": "-"}
 G = 9.81
 WALL = "sites.s.environment.0"
 DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
@@ -406,6 +406,8 @@ LONG = (
     "from the link",
     "integrate it",
     "gravity known",
+    "the same with `digital`",
+    "part of max V",
 )
 """Beginnings of words whose numbers take more than 3 s; other tests have their facts."""
 ROWS = [
