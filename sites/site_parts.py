@@ -141,7 +141,6 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     """
     setup, law = scenario.setup(name), scenario.sites[name].control
     site = Site(setup)
-    site.compile()  # which takes longer than a watchdog waits for a law
     try:
         if isinstance(law, ImportedLaw):
             with LawWatchdog(site, law.code, clock or SystemClock()) as watchdog:

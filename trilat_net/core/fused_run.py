@@ -106,7 +106,7 @@ def _update_peaks(
     """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
     error = 0.0
     bucket, joints = progress.bucket, peaks.shape[1] // 3
-    here = 4 * s.joints + 2 * s.shared + s.parameters if s.task else 0
+    here = _first_sent(s) - 3 * s.shared if s.task else 0
     for i in range(joints):  # where a task has more or fewer coordinates than there are joints, zeros stand
         e = speed = angle = 0.0
         if i < s.shared:

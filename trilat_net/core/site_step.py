@@ -18,7 +18,6 @@ from .compiled_law import plug_law
 from .delay import DelayKind
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
-from .law_view import update_law_view
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
@@ -93,15 +92,6 @@ class Site:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of its shares")
             add_ramp(self._arrays, command.ramp)
 
-    def compile(self) -> Callable[..., None]:
-        """Compiles the stages of a tick, else the first tick does; returns the whole tick, bound."""
-        if self._law is None:
-            return bind_leaf(site_tick, 0, 0, 0, *self._tick_arrays)
-        a, record = self._arrays, self._buffers.record
-        bind_leaf(sense_stages, 0, 0, 0, a, self._buffers)
-        bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
-        return bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, record)
-
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one tick and returns its record.
 
@@ -123,7 +113,7 @@ class Site:
         memory: list[float] = []
         if self._law is None:
             if self._tick is None:
-                self._tick = self.compile()
+                self._tick = bind_leaf(site_tick, 0, 0, 0, *self._tick_arrays)
             self._tick(tick.k, t_ns, count, *self._tick_arrays)
         else:
             self._sense(tick.k, t_ns, count, self._arrays, self._buffers)

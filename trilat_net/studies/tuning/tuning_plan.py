@@ -174,7 +174,10 @@ class TuningResult(NamedTuple):
     def shared(self, found: CandidateSearch) -> list[int]:
         """Returns the places of a law's front that no candidate of any law dominates."""
         points = [
-            (other.space.law, place, other.points[place]) for other in self.found for place in other.front
+            (other.space.law, place, points[place])
+            for other in self.found
+            for points in [other.points]
+            for place in other.front
         ]
         kept = [points[n] for n in find_pareto_front([point for _, _, point in points])]
         return [place for law, place, _ in kept if law == found.space.law]

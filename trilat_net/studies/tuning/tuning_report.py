@@ -43,15 +43,15 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
 
 
 def _law_row(tuned: TuningResult, found: CandidateSearch) -> tuple[str, ...]:
-    counts = found.outcomes
-    ends = [found.points[place] or (None, None) for place in found.front[-1:] + found.front[:1]]
+    counts, points, front = found.outcomes, found.points, found.front
+    ends = [points[place] or (None, None) for place in front[-1:] + front[:1]]
     best, cheapest = ends or [(None, None)] * 2
     numbers = (*best, *cheapest[::-1])
     return (
         found.space.law,
         str(len(found.tried)),
         *(str(counts[outcome]) for outcome in reversed(CandidateClass)),
-        str(len(found.front)),
+        str(len(front)),
         str(len(tuned.shared(found))),
         *map(_number, numbers),
     )
@@ -269,8 +269,9 @@ def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
     place = list(SEARCH_SPACES).index(found.space.law)
     colour, mark = style.SITE_COLOURS[place % len(style.SITE_COLOURS)], _MARKS[place % len(_MARKS)]
-    settled = [point for point in found.points if point is not None]
-    front = [point for place in found.front if (point := found.points[place]) is not None]
+    points = found.points
+    settled = [point for point in points if point is not None]
+    front = [point for place in found.front if (point := points[place]) is not None]
     faint: dict[str, Any] = {"linestyle": "", "markersize": 2.0, "alpha": 0.3, "markeredgewidth": 0.0}
     plain: dict[str, Any] = {"marker": mark, "markersize": 3.5, "linewidth": 1.1, "color": colour}
     axes.plot([x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint)
