@@ -190,8 +190,9 @@ def compare_command(
         _option(
             "--law",
             metavar="LAW,LAW...",
-            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: p_f, known, "
-            "wave, tdpa, tanks.",
+            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
+            "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
+            "authority, impedance, smith.",
         ),
     ] = None,
     budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,

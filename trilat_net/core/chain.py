@@ -239,7 +239,7 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
 
 
 @leaf
-def _friction(row: Row, speed: float) -> float:
+def friction_torque(row: Row, speed: float) -> float:
     """Returns the torque that friction takes at a speed; it rises with the speed everywhere."""
     x = speed / COULOMB_SPEED
     torque: float = row.viscous * speed + row.coulomb * (x / sqrt(1.0 + x * x))
@@ -322,7 +322,7 @@ def inverse_dynamics(chain: RowArray, theta: Vector, v: Vector, a: Vector, torqu
     for i in range(n - 1, -1, -1):
         row = chain[i]
         borne = _along_axis(row, three(row.f_lin), three(row.f_ang))
-        torque[i] = borne + row.armature_kg_m2 * a[i] + _friction(row, v[i])
+        torque[i] = borne + row.armature_kg_m2 * a[i] + friction_torque(row, v[i])
         if i > 0:
             _pass_force(row, chain[i - 1])
 
@@ -446,7 +446,7 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         put_three(row.f_ang, add(f[1], turning[1]))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        row.bias = _along_axis(row, three(row.f_lin), three(row.f_ang)) + _friction(row, qd[i])
+        row.bias = _along_axis(row, three(row.f_lin), three(row.f_ang)) + friction_torque(row, qd[i])
         row.bias -= _stop_torque(row, q[i], qd[i])
         if i > 0:
             _pass_force(row, chain[i - 1])

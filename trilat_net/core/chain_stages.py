@@ -8,13 +8,14 @@ from math import isfinite
 
 from .chain import (
     find_acceleration,
+    friction_torque,
     inverse_dynamics,
     parameter_gradient,
     place_joints,
     propagate_motion,
     put_model,
 )
-from .control import limit_torque
+from .control import limit_torque, robust_torque
 from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
 from .jit import leaf
 from .site_setup import Law
@@ -87,6 +88,10 @@ def update_torque(s: Row, chain: RowArray) -> None:
                 torque += s.k_f[i] * s.felt[i] - s.K[i] * s.e[i]
         if s.law == _ADAPTIVE:
             torque -= s.Kp[i] * s.r[i]
+            if s.friction[i] != 1.0:
+                torque -= (1.0 - s.friction[i]) * friction_torque(chain[i], s.v[i])
+            if s.rho[i] > 0.0:
+                torque -= robust_torque(s.rho[i], s.width[i], s.r[i])
         else:
             torque -= s.d[i] * s.qd[i]
         s.tau[i] = limit_torque(torque, s.tau_limit[i])

@@ -10,9 +10,14 @@ direct force reflection after Lawrence, "Stability and transparency in bilateral
 Trans. Robotics and Automation 9 (1993).
 """
 
+from math import sqrt
+
 from .jit import leaf
 from .two_link_arm import gravity
 from .vectors import Five, Pair, Vector
+
+ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
+"""The largest value of x - x^2 / sqrt(1 + x^2)."""
 
 
 @leaf
@@ -71,6 +76,15 @@ def adaptive_torque(
     total_0 -= Kp[0] * r[0] + Kd[0] * ed[0]
     total_1 -= Kp[1] * r[1] + Kd[1] * ed[1]
     return limit_torque(total_0, limit), limit_torque(total_1, limit)
+
+
+@leaf
+def robust_torque(rho: float, width: float, r: float) -> float:
+    """Returns rho r / sqrt(r^2 + width^2), which opposes r: all of rho where it is fast, never a step.
+
+    Against a disturbance of at most rho, r times both is never above ROBUST_RESIDUE rho width.
+    """
+    return rho * (r / sqrt(r * r + width * width))
 
 
 @leaf

@@ -31,7 +31,7 @@ _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
-    *("r", "u", "tau_x", "q_before", "G", "bias"),
+    *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
 )
 _PER_COORDINATE = (
     *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),

@@ -200,6 +200,9 @@ class Gains(NamedTuple):
         K: stiffness of KNOWN, shape (n,), N m/rad.
         d: damping of KNOWN, shape (n,), N m s/rad.
         k_f: gain of the reflected force of KNOWN, shape (n,), dimensionless.
+        rho: largest robust torque of ADAPTIVE, shape (n,), N m.
+        width: speed r at which it is 0.71 of that, shape (n,), rad/s.
+        friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
     """
 
     law: Law
@@ -214,6 +217,9 @@ class Gains(NamedTuple):
     K: Vector = (0.0,)
     d: Vector = (0.0,)
     k_f: Vector = (0.0,)
+    rho: Vector = (0.0,)
+    width: Vector = (1.0,)
+    friction: Vector = (1.0,)
 
 
 class SiteSetup(NamedTuple):

@@ -45,6 +45,12 @@ def update_torque(s: Row) -> None:
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
         tau = control.adaptive_torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, inf)
+        if s.rho[0] > 0.0 or s.rho[1] > 0.0:
+            opposing = (
+                control.robust_torque(s.rho[0], s.width[0], s.r[0]),
+                control.robust_torque(s.rho[1], s.width[1], s.r[1]),
+            )
+            tau = (tau[0] - opposing[0], tau[1] - opposing[1])
     else:
         gains = (s.K, s.d, s.Kd, s.k_f)
         tau = control.damped_torque(s.known, s.g, *gains, s.q, s.qd, s.e, s.ed, s.felt, inf)

@@ -19,6 +19,7 @@ from .law_conditions import LawSituation, StabilityCondition, find_link_delays
 from .laws import (
     Adaptive,
     AdaptiveBox,
+    AdaptiveRobust,
     ControlLaw,
     LeeSpong,
     ProportionalDamped,
@@ -55,7 +56,7 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     laws = tuple(site.control for site in scenario.sites.values())
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for n, (name, site) in enumerate(scenario.sites.items()):
-        if isinstance(law := site.control, PluggedLaw | LeeSpong):
+        if isinstance(law := site.control, PluggedLaw | LeeSpong | AdaptiveRobust):
             limits = np.atleast_1d(site.limits.tau_limit_nm).tolist()
             situation = LawSituation(
                 n, scenario.names, laws, scenario.alpha, delay_s, tuple(limits), site.rate_hz

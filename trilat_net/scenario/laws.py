@@ -6,8 +6,10 @@ only sufficient. Symbols are the paper's; gains are diagonal, one number per joi
 
 from typing import get_args
 
+import numpy as np
 from msgspec.structs import asdict
 
+from ..core.control import ROBUST_RESIDUE
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
 from ..errors import ScenarioError
@@ -98,6 +100,42 @@ class AdaptiveBox(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive_box
             if not low <= first <= high:
                 problem = f"must lie in its box from {low:g} to {high:g}, is {first:g}"
                 raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
+
+
+class AdaptiveRobust(AdaptiveBox, frozen=True, tag_field="law", tag="adaptive_robust"):
+    """The law with a box, and a term against torque that no estimate explains: - rho r / sqrt(r^2 + width^2).
+
+    For constant delays, no operator, theta in its box and a disturbance of at most rho at every joint, the
+    mean over time of what V dissipates is at most 0.3003 sum_i beta_i sum rho width; no more is claimed.
+    Smoothed after Slotine and Li, "Applied Nonlinear Control" (1991), 7.1; docs/laws.md derives the bound.
+
+    Attributes:
+        rho_nm: bound of the disturbance per joint, N m (of a sliding joint N).
+        width_rad_s: r at which 0.71 of it opposes, per joint, rad/s (m/s).
+        friction: share of the joints' own friction that the law knows, 0: nothing.
+    """
+
+    rho_nm: NotNegativeJoints = (1.0,)
+    width_rad_s: PositiveJoints = (0.1,)
+    friction: NotNegative = 0.0
+
+    def gains(self, theta: Array) -> Gains:
+        """Returns the gains for the core."""
+        return AdaptiveBox.gains(self, theta)._replace(
+            rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,)
+        )
+
+    def condition(self, situation: LawSituation) -> StabilityCondition:
+        """Returns the bound in the mean square, W, of this site's part of what V dissipates."""
+        pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
+        bound_w = ROBUST_RESIDUE * sum(rho * width for rho, width in pairs)
+        constant = not np.isnan(situation.longest_s)
+        return StabilityCondition(
+            True if constant else None,
+            f"delays are {'constant' if constant else 'to be constant, and vary here'}, theta is in its box: "
+            f"with torque of at most rho_nm that no estimate explains the mean of beta times r'Kp r and the "
+            f"disagreement is at most beta times {bound_w:.3g} W here; sufficient",
+        )
 
 
 class KnownGravity(Frozen, frozen=True):
@@ -208,6 +246,8 @@ PluggedLaws = (
     FourChannels | SixChannels | SaturatedPositions | Authority | Synchronised | Impedances | SmithPredicted
 )
 EnergyLaws = WaveVariables | PassivityControl | EnergyTanks
-ControlLaw = Adaptive | AdaptiveBox | KnownGravityLaw | PluggedLaws | EnergyLaws | ImportedLaw
+ControlLaw = (
+    Adaptive | AdaptiveBox | AdaptiveRobust | KnownGravityLaw | PluggedLaws | EnergyLaws | ImportedLaw
+)
 LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

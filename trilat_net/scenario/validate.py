@@ -193,7 +193,7 @@ def _check_joint_space(scenario: Scenario) -> None:
         if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
         gains = site.control.gains(model.theta)
-        damping = np.zeros(counts[name]) + gains.Kp + gains.d
+        damping = np.zeros(counts[name]) + gains.Kp + gains.d + np.divide(gains.rho, gains.width)
         damping += gains.Kd if spaces[name] == "joints" else 0.0
         scaled = np.sqrt(damping)
         spread, modes = np.linalg.eigh(

@@ -155,6 +155,8 @@ def _evaluate_law(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> 
     Lambda, Kp = _as_columns(gains.Lambda, q), _as_columns(gains.Kp, q)
     v, a, r = -Lambda * e, -Lambda * ed, qd + Lambda * e
     tau = arm.required_torque(estimate, qd, v, a) - Kp * r - Kd * ed
+    rho, width, known = (_as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction))
+    tau = tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)
     Y = arm.regressor_matrix(qd, v, a)
     rate = -_as_columns(gains.Gamma, q) * multiply_columns(np.swapaxes(Y, 0, 1), r)
     return tau, np.where(_is_at_bound(site, estimate, rate), 0.0, rate)

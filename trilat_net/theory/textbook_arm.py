@@ -121,6 +121,10 @@ class PlacedArm(NamedTuple):
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m."""
         return required_torque(theta, self.g_m_s2, self.q, qd, v, a)
 
+    def friction_torque(self, v: Numbers) -> Numbers:
+        """Returns zeros: this arm has no friction in its joints."""
+        return 0.0 * v
+
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns G(q), shape (2, ...), N m."""
         return gravity_torque(theta, self.g_m_s2, self.q)
@@ -238,10 +242,17 @@ class PlacedChain:
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q) with the drives' inertia and friction at v, shape (n, ...)."""
-        x = v / COULOMB_SPEED
-        friction = self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(1.0 + x * x)
+        friction = self.friction_torque(v)
         body = multiply_columns(self.regressor_matrix(qd, v, a), theta)
         torque: Numbers = body + self._per_joint("armature_kg_m2") * a + friction
+        return torque
+
+    def friction_torque(self, v: Numbers) -> Numbers:
+        """Returns the torque of the joints' friction at speeds v, shape (n, ...), N m."""
+        x = v / COULOMB_SPEED
+        torque: Numbers = self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(
+            1.0 + x * x
+        )
         return torque
 
     def gravity_torque(self, theta: Numbers) -> Numbers:

@@ -123,7 +123,7 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
     [
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
-        ("", ["no law ''", "tuned are adaptive, adaptive_box, p_d, pd_d, saturated_pd"]),
+        ("", ["no law ''", "tuned are adaptive, adaptive_box, adaptive_robust, p_d, pd_d, saturated_pd"]),
         ("my.file:Law", ["a law of your own has no search ranges"]),
         ("own", ["a law of your own"]),
     ],

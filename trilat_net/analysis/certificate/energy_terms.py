@@ -44,6 +44,8 @@ class SiteConstants(NamedTuple):
         outside: True if the arm is outside of the program: theta is then what its author states.
         axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and Kd are 0;
             () in joint space.
+        rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of that, rad/s.
+        friction: share of the joints' friction that the law compensates.
     """
 
     arm: ArmRows
@@ -56,6 +58,9 @@ class SiteConstants(NamedTuple):
     tau_limit: Array
     outside: bool = False
     axes: tuple[float, ...] = ()
+    rho: Array | float = 0.0
+    width: Array | float = 1.0
+    friction: Array | float = 1.0
 
     @property
     def theta(self) -> Array:
@@ -67,6 +72,17 @@ class SiteConstants(NamedTuple):
         """Kd as the weights of V see it: NaN along an axis that the site does not follow, shape (m,)."""
         return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd) if self.axes else self.Kd
 
+    def robust_torque(self, r: Array) -> Array:
+        """Returns the torque that opposes r besides Kp r, shape (K, n), N m."""
+        torque: Array = self.rho * r / np.sqrt(r**2 + self.width**2)
+        return torque
+
+    @property
+    def unknown_friction(self) -> bool:
+        """True if the joints have friction of which the law does not compensate all."""
+        moving = np.ones((1, len(self.Kp)))
+        return bool(np.any((self.friction != 1.0) & (self.arm.friction(moving) != 0.0)))
+
     @property
     def adapts(self) -> Bools:
         """True for each parameter that the law adapts, shape (P,)."""
@@ -77,7 +93,8 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
     spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
-    of_law = {name: np.array(getattr(gains, name)) for name in ("Lambda", "Kp", "Kd", "Gamma", "low", "high")}
+    names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction")
+    of_law = {name: np.array(getattr(gains, name)) for name in names}
     task = arm.task
     if task is not None:
         of_law |= {name: np.array(task.axes) * of_law[name] for name in ("Lambda", "Kd")}
@@ -179,8 +196,8 @@ class SiteMotion:
         at, c = self.records, self.constants
         v, a = self.follows.reference(rows, e, ed)
         model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
-        found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed)
-        return found
+        found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
+        return found - (1.0 - c.friction) * c.arm.friction(v)
 
     @cached_property
     def ends(self) -> PeriodEnds:
@@ -280,8 +297,8 @@ def _nothing(site: SiteMotion) -> Increment:
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2.
 
-    And r'(friction(qd) - friction(qd - r)) of joints with friction, which the law knows; and along axes that
-    not all sites follow what they do not give back to each other.
+    And r'(friction(qd) - friction(qd - r)) of joints with friction; r times a robust torque; and along axes
+    that not all sites follow what they do not give back to each other.
     """
     at, c, ends, alpha = site.records, site.constants, site.ends, site.dominance
     rate = at.shared_rate
@@ -289,7 +306,7 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     for j, view in enumerate(site.peers.values()):
         left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.seen.qd[:-1])
         right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.kept.qd)
-    damping = ((c.Kp * r**2).sum(axis=1) for r in (ends.r_left, ends.r_right))
+    damping = ((r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right))
     found = {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
     if not all(site.common):
         found["open axes"] = _compute_transfer(site, 1.0 - np.array(site.common))
@@ -335,6 +352,7 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
         "rule": stale_rule_work(site),
         "torque limit": torque_limit_work(site),
         "estimates": estimate_work(site),
+        **({"friction": unknown_friction_work(site)} if site.constants.unknown_friction else {}),
         **({"singular poses": singular_pose_work(site)} if site.constants.axes else {}),
     }
 
@@ -405,6 +423,16 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     if len(cut):
         power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
+
+
+def unknown_friction_work(site: SiteMotion) -> Increment:
+    """Returns the work -int r' friction(v) of the share of friction that the law does not compensate."""
+    at, c, ends = site.records, site.constants, site.ends
+    left, right = (
+        -(r * (1.0 - c.friction) * c.arm.friction(qd - r)).sum(axis=1)
+        for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
+    )
+    return _trapezoid(site, left, right)
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:

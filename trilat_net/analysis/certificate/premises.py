@@ -83,6 +83,8 @@ def _check_parameters(scenario: Scenario, constants: Mapping[str, SiteConstants]
         first = np.clip(scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high)
         if (~c.adapts & (first != c.theta)).any():
             faults.append(f"{site}: a parameter is not learnt, and not known either")
+        if c.unknown_friction:
+            faults.append(f"{site}: its law does not compensate all friction of the joints")
     text = "every parameter is learnt or known, and no box shuts it out"
     return Premise("parameters", not faults, _list(faults) or text)
 

@@ -110,7 +110,7 @@ class SearchSpace(NamedTuple):
         return tables
 
 
-_TORQUE_GAINS = ("Kp", "Kd", "K", "d", "b", "B")
+_TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "b", "B")
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
@@ -147,6 +147,14 @@ def _adaptive_box(scenario: Scenario, knowledge: ModelInformation, gains: GainVa
     for name, table in controls.items():
         table["law"] = "adaptive_box"
         table["theta_low"], table["theta_high"] = knowledge.box_sides(scenario, name)
+    return controls
+
+
+def _adaptive_robust(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    """Where r = 0 the robust term damps by a tenth of Kp, which the joints can take besides."""
+    controls = _adaptive_box(scenario, knowledge, gains)
+    for table in controls.values():
+        table |= {"law": "adaptive_robust", "width_rad_s": 10.0 * gains["rho_nm"] / gains["Kp"]}
     return controls
 
 
@@ -233,6 +241,12 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
     for space in (
         SearchSpace("adaptive", _ADAPTING, _AS_FIRST, _adaptive),
         SearchSpace("adaptive_box", _ADAPTING, f"{_AS_FIRST}; the box is around it", _adaptive_box),
+        SearchSpace(
+            "adaptive_robust",
+            (*_ADAPTING, GainRange("rho_nm", "N m", 0.05, 5.0)),
+            f"{_AS_FIRST}; the box is around it",
+            _adaptive_robust,
+        ),
         SearchSpace("p_d", (_K, _D), "gravity", _knowing_gravity("p_d")),
         SearchSpace("pd_d", (_K, _KD, _D), "gravity", _knowing_gravity("pd_d")),
         SearchSpace(

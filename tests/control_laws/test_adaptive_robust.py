@@ -1,0 +1,105 @@
+"""`adaptive_robust`: its torque, its mean-square bound under a disturbance, its energy, its linear loop.
+
+With d the disturbance, abs(d_j) <= rho_j, V' = - D + sum_i beta_i r'(d - rho r / sqrt(r^2 + w^2)), D what V
+dissipates without the robust term. Of x = abs(r) / w the last is at most rho w (x - x^2 / sqrt(1 + x^2)).
+"""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+import trilat_net
+from tests.analysis.rough_arms import ROUGH, rough_urdf
+from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_terms import compute_dissipation, compute_work
+from trilat_net.core.control import ROBUST_RESIDUE, robust_torque
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import parse_scenario
+from trilat_net.theory.equilibrium import find_equilibrium
+from trilat_net.theory.linear_loop import linearise_scenario
+
+RHO_NM, WIDTH_RAD_S = 3.0, 0.03
+SHAKEN = """name = "shaken"
+duration_s = 20.0
+[link]
+delay_ms = 100
+[arm]
+[control]
+law = "{law}"
+theta_low = -1.0
+theta_high = 10.0
+{more}
+[sites.m1]
+q0_rad = [0.5, 0.2]
+hands = [{{ kind = "multisine", amplitude_nm = [1.4, 1.4], frequencies_hz = [0.31, 0.83] }}]
+[sites.m2]
+q0_rad = [0.1, 0.1]
+hands = [{{ kind = "multisine", amplitude_nm = [1.4, 1.4], frequencies_hz = [0.47, 1.1] }}]
+[sites.s]
+role = "slave"
+q0_rad = [0.3, 0.4]
+[dominance]
+m1 = {{ m2 = 0.5, s = 0.5 }}
+m2 = {{ m1 = 0.5, s = 0.5 }}
+s = {{ m1 = 0.5, m2 = 0.5 }}
+"""
+ROBUST = f"rho_nm = {RHO_NM}\nwidth_rad_s = {WIDTH_RAD_S}"
+
+
+def run(law: str, more: str = "") -> Log:
+    return trilat_net.simulate(parse_scenario(SHAKEN.format(law=law, more=more)))
+
+
+def mean_dissipation(log: Log, without: float) -> float:
+    """Mean over time of sum beta (r'Kp r + disagreement), and V at the start spread over it, W."""
+    energies = compute_site_energies(log)
+    beta = compute_energy_balance(energies).beta[0]
+    total = 0.0
+    for weight, energy in zip(beta, energies.values(), strict=True):
+        motion = energy.motion
+        found = {name: one.total.sum() for name, one in compute_dissipation(motion).items()}
+        opposed = (motion.r * motion.constants.robust_torque(motion.r)).sum() * motion.records.h_s
+        total += weight * (found["damping"] + found["disagreement"] - without * opposed)
+    return float(total / log.scenario.duration_s)
+
+
+def test_the_residue_is_the_largest_of_its_function() -> None:
+    found = minimize_scalar(lambda x: x * x / np.sqrt(1.0 + x * x) - x, bounds=(0.0, 5.0), method="bounded")
+    assert -found.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
+    r = np.linspace(-30.0, 30.0, 2001)
+    worst = max(abs(x) * 2.0 - x * robust_torque(2.0, 0.4, x) for x in r)
+    assert worst <= ROBUST_RESIDUE * 2.0 * 0.4
+
+
+def test_what_it_dissipates_stays_below_its_bound_and_that_of_the_box_does_not() -> None:
+    def bound(log: Log) -> float:
+        balance = compute_energy_balance(compute_site_energies(log))
+        robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S
+        return robust_w + float(balance.V[0] - balance.V[-1]) / log.scenario.duration_s
+
+    robust, box = run("adaptive_robust", ROBUST), run("adaptive_box")
+    assert mean_dissipation(robust, 1.0) <= bound(robust)
+    assert mean_dissipation(box, 0.0) > bound(box)
+
+
+def test_its_energy_closes_with_friction_that_it_does_not_know() -> None:
+    robust = 'law = "adaptive_robust"\nrho_nm = 1.5\nwidth_rad_s = 0.1\nfriction = 0.25'
+    text = ROUGH.replace('law = "adaptive"', robust)
+    log = trilat_net.simulate(parse_scenario(f"{text}{rough_urdf()}'''"))
+    energies = compute_site_energies(log)
+    balance = compute_energy_balance(energies)
+    friction = sum(one.total for one in (compute_work(e.motion)["friction"] for e in energies.values()))
+    assert np.abs(np.cumsum(friction)).max() >= 0.01 * balance.V.max()
+    assert np.abs(balance.unexplained).max() <= 2e-4 * balance.V.max()
+
+
+def test_to_a_small_motion_it_is_a_larger_kp() -> None:
+    """The slope of the robust term where r = 0 is rho / width."""
+
+    def static(law: str, more: str) -> np.ndarray:
+        scenario = parse_scenario(SHAKEN.format(law=law, more=more))
+        return linearise_scenario(scenario, find_equilibrium(scenario, (0.3, 0.2))).A
+
+    robust = static("adaptive_robust", f"Kp = 1.0\n{ROBUST}")
+    larger = static("adaptive_box", f"Kp = {1.0 + RHO_NM / WIDTH_RAD_S}")
+    np.testing.assert_allclose(robust, larger, rtol=1e-12, atol=1e-12)
