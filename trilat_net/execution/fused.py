@@ -28,7 +28,7 @@ from ..core.law_view import PlainLaw
 from ..core.site_arrays import select_site, stack_site_arrays
 from ..core.site_setup import SiteSetup
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, Mode, tick_ns
-from ..core.vectors import Array, Row, RowArray
+from ..core.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError
 from ..scenario import Scenario
 from ..scenario.operators import Wall
@@ -77,12 +77,13 @@ class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
     Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
+    `keep` of a site's last records are kept for `take_records`.
 
     Raises:
         ScenarioError: see `check_fusable`; or a law cannot be made.
     """
 
-    def __init__(self, scenario: Scenario, apart_rad: float = 0.01) -> None:
+    def __init__(self, scenario: Scenario, apart_rad: float = 0.01, keep: int = 0) -> None:
         check_fusable(scenario)
         self._scenario = scenario
         self._apart_rad = apart_rad
@@ -96,7 +97,7 @@ class FusedRun:
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
         self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
-        kept = 1 << (_largest_ratio(scenario) + 1).bit_length()
+        kept = 1 << max(_largest_ratio(scenario) + 1, keep).bit_length()
         floats = max(layout.floats for layout in self._layouts)
         self._sent = KeptRecords(np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats)))
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
@@ -104,6 +105,7 @@ class FusedRun:
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
+        self._taken_ticks = [0] * count
         self.ran_s = 0.0
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
@@ -252,6 +254,18 @@ class FusedRun:
         return [
             row[layout.columns()["tau_x"]] for row, layout in zip(self.records, self._layouts, strict=True)
         ]
+
+    def take_records(self) -> list[tuple[IntArray, Array]]:
+        """Returns of each site the records since the last call, as far as they are kept: t, ns, and a row."""
+        found = []
+        for n, progress in enumerate(self._progress):
+            pages = self._sent.t_ns.shape[1]
+            first = max(self._taken_ticks[n], int(progress["tick"]) - pages)
+            at = np.arange(first, int(progress["tick"])) % pages
+            floats = self._layouts[n].floats
+            found.append((self._sent.t_ns[n, at], self._sent.rows[n, at, :floats]))
+            self._taken_ticks[n] = int(progress["tick"])
+        return found
 
     @property
     def records(self) -> Array:

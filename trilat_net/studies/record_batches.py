@@ -16,6 +16,7 @@ from ..core.site_step import Site
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
 from ..core.vectors import Array
 from ..execution import virtual
+from ..execution.fused import FusedRun
 from ..log.record_columns import Ints
 from ..log.site_log import find_task_errors
 from ..scenario import Scenario
@@ -34,7 +35,7 @@ class RecordBatch(NamedTuple):
         e: its error against the reference, Eq. (9), shape (K, m), rad; m in task space.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        used: tick of the sample in use, -1 before the first, shape (K, P).
+        used: tick of the sample in use, -1 before the first, shape (K, P); of a compiled run none, (K, 0).
     """
 
     t_ns: Ints
@@ -122,3 +123,26 @@ def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch]
     for records in pending.values():
         records.flush()
     return BatchedRun(diverged_at_s, sum(count.late for site in sites.values() for count in site.counts()))
+
+
+def run_compiled_in_batches(
+    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+) -> float | None:
+    """Does as `run_in_batches`, in the compiled loop, which does not say which samples are in use.
+
+    Returns:
+        when the first site left its limits, s, or None.
+    """
+    run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
+    columns = [scenario.layout(name).columns() for name in scenario.names]
+    period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
+    while run.ran_s < scenario.duration_s and run.diverged_s is None:
+        run.advance(min(run.ran_s + period_s, scenario.duration_s))
+        for name, place, (t_ns, rows) in zip(scenario.names, columns, run.take_records(), strict=True):
+            if not len(t_ns):
+                continue
+            q, qd, q_des, tau, tau_x = (rows[:, place[key]] for key in ("q", "qd", "q_des", "tau", "tau_x"))
+            x, axes = rows[:, place.get("x", slice(0, 0))], scenario.arms[name].axes
+            e = find_task_errors(x, q_des, axes) if x.size else q - q_des
+            take[name](RecordBatch(t_ns, q, qd, e, tau, tau_x, np.zeros((len(t_ns), 0), np.int64)))
+    return run.diverged_s

@@ -14,7 +14,13 @@ from trilat_net.core.two_link_arm import end_effector_jacobian
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import ExpectWindow, window_quantities
-from trilat_net.studies.record_batches import BATCH_RECORDS, RecordBatch
+from trilat_net.studies.record_batches import (
+    BATCH_RECORDS,
+    RecordBatch,
+    join_batches,
+    run_compiled_in_batches,
+    run_in_batches,
+)
 from trilat_net.studies.trials.measure_run import (
     RunMetrics,
     SiteStats,
@@ -294,3 +300,22 @@ def test_a_window_of_all_sites_has_the_largest_of_them(log: Log) -> None:
 
 def test_a_run_that_ended_before_measures_nothing() -> None:
     assert measure_virtual_run(windowed(**{"limits.qd_limit_rad_s": 0.05})).windows == ({},)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, RANDOM, {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333}, {"limits.qd_limit_rad_s": 0.3}],
+    ids=["plain", "random", "rates", "diverged"],
+)
+def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any]) -> None:
+    asked = scenario(**changes)
+    ticked: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+    looped: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+    run = run_in_batches(asked, {name: taken.append for name, taken in ticked.items()})
+    assert (
+        run_compiled_in_batches(asked, {n: taken.append for n, taken in looped.items()}) == run.diverged_at_s
+    )
+    for name in asked.names:
+        one, other = join_batches(ticked[name]), join_batches(looped[name])
+        for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
+            np.testing.assert_array_equal(getattr(one, field), getattr(other, field))

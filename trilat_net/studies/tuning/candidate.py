@@ -22,7 +22,7 @@ from ...scenario import Scenario, load_scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
 from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
-from ..record_batches import RecordBatch, join_batches, run_in_batches
+from ..record_batches import RecordBatch, join_batches, run_compiled_in_batches
 from .final_posture import CandidateClass, build_twin, classify_candidate, compute_consensus_pose
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
@@ -103,7 +103,7 @@ class _Run(NamedTuple):
 
 def _run(scenario: Scenario) -> _Run:
     kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    diverged_s = run_in_batches(scenario, {name: kept[name].append for name in kept}).diverged_at_s
+    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
     records = list(map(join_batches, kept.values()))
     trace = RunTrace([one.reduce() for one in records], [one.tau_x[-1] for one in records], diverged_s)
     t_s, q, e = _aligned(records)

@@ -110,7 +110,7 @@ class SearchSpace(NamedTuple):
         return tables
 
 
-_TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "b", "B")
+_TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
@@ -216,6 +216,20 @@ def _tdpa(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) ->
     return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
 
 
+def _sync(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    known = {"law": "sync", "Lambda": gains["Lambda"], "K": gains["Kp"], "Gamma": gains["Gamma"]}
+    return {name: {**known, "theta_hat0": knowledge.prior(scenario, name)} for name in scenario.names}
+
+
+def _lee_spong(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+    """T_max is half of the longest mean round trip: for delays that vary its bound is not proved."""
+    mean_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
+    trips_ms = [there + mean_ms["->".join(reversed(name.split("->")))] for name, there in mean_ms.items()]
+    bound = {"law": "lee_spong", "T_max_ms": 0.5 * max(trips_ms), "P_e": gains["d_extra"]}
+    told = {"K": gains["K"], "Kd": gains["Kd"], "gravity": knowledge.gravity}
+    return {name: {**bound, **told} for name in scenario.names}
+
+
 _LAMBDA = GainRange("Lambda", "1/s", 0.2, 20.0)
 _KP = GainRange("Kp", "N m s/rad", 0.5, 200.0)
 _KD = GainRange("Kd", "N m s/rad", 0.1, 50.0)
@@ -261,6 +275,8 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
             "gravity AND inertia exactly: more than the others",
             _plugged("impedance", follows=False),
         ),
+        SearchSpace("sync", (_LAMBDA, _KP, _GAMMA), _AS_FIRST, _sync),
+        SearchSpace("lee_spong", (_K, _KD, _D._replace(name="d_extra")), "gravity", _lee_spong),
         SearchSpace("smith", _PREDICTING, "gravity", _plugged("smith", predicts=True)),
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from ...core.jit import is_core_cached
 from ...errors import ScenarioError, UsageError
-from ...execution import virtual
+from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
@@ -20,6 +22,7 @@ from .candidate import (
     TuningScenario,
     build_candidate_task,
     load_tuning_scenario,
+    measure_candidate,
     measure_candidate_task,
 )
 from .final_posture import build_twin, check_comparable
@@ -90,18 +93,14 @@ class TuningPlan(NamedTuple):
     def estimate_s(self, jobs: int | None = None) -> float:
         """Returns about how long the search will take, s: by a short run of the experiment."""
         scenario = self.base.scenario
-        if not is_core_cached():
-            next(virtual.execute_virtual(scenario))  # compiles, once for all processes
-        ticks = sum(map(scenario.ticks, scenario.names))
-        few = min(ticks, _PROBE_TICKS)
+        brief_s = min(scenario.duration_s, _PROBE_S)
+        brief = msgspec.structs.replace(scenario, duration_s=brief_s).text
+        measure_candidate(brief, None)  # loads the compiled core
         clock = SystemClock()
-        steps = virtual.execute_virtual(scenario)
-        next(steps)  # loads the compiled core
         began_ns = clock.monotonic_ns()
-        made = 1 + sum(1 for _ in zip(range(few), steps, strict=False))
-        per_tick_s = (clock.monotonic_ns() - began_ns) * 1e-9 / made
-        processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
-        return _MEASURING_FACTOR * per_tick_s * ticks * self.runs / processes
+        measure_candidate(brief, None)
+        run_s = (clock.monotonic_ns() - began_ns) * 1e-9 * scenario.duration_s / brief_s
+        return run_s * self.runs / min(jobs or count_cores(), len(self.spaces) * self.budget)
 
     def run(
         self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
@@ -121,7 +120,7 @@ class TuningPlan(NamedTuple):
             progress(done + more, total)
 
         if not is_core_cached():
-            next(virtual.execute_virtual(self.base.scenario))  # compiles, once for all processes
+            FusedRun(self.base.scenario).advance(_PROBE_S)  # compiles, once for all processes
         with open_worker_pool(jobs, on, most=total) as pool:
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
@@ -144,9 +143,8 @@ class TuningPlan(NamedTuple):
 
 _EDGE = 1.02
 """A gain within 2 % of the end of its range is at its edge."""
-_PROBE_TICKS = 3000
-_MEASURING_FACTOR = 1.3
-"""What keeping and measuring its records adds to a run."""
+_PROBE_S = 2.0
+"""Duration of the run by which a search is estimated, s."""
 
 
 class TuningResult(NamedTuple):
