@@ -35,6 +35,7 @@ from .plugged_laws import (
     SixChannels,
     SmithPredicted,
     Synchronised,
+    UnknownLengths,
 )
 
 
@@ -243,7 +244,14 @@ class LeeSpong(Frozen, frozen=True, tag_field="law", tag="lee_spong"):
 
 KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting | LeeSpong
 PluggedLaws = (
-    FourChannels | SixChannels | SaturatedPositions | Authority | Synchronised | Impedances | SmithPredicted
+    FourChannels
+    | SixChannels
+    | SaturatedPositions
+    | Authority
+    | Synchronised
+    | UnknownLengths
+    | Impedances
+    | SmithPredicted
 )
 EnergyLaws = WaveVariables | PassivityControl | EnergyTanks
 ControlLaw = (

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..core.laws.adaptive_jacobian import LEAST_SINE, AdaptiveJacobian
 from ..core.laws.four_channel import FourChannel, SixChannel
 from ..core.laws.impedance_control import ImpedanceControl
 from ..core.laws.saturated_pd import SaturatedPd
@@ -22,6 +23,7 @@ from .fields import (
     NotNegativeJoints,
     NotNegativeParameters,
     Parameters,
+    Positive,
     PositiveJoints,
     Share,
 )
@@ -186,6 +188,48 @@ class Synchronised(PluggedLaw, frozen=True, tag_field="law", tag="sync"):
         text = "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 (sufficient)"
         return StabilityCondition(
             True, f"{text}; but under gravity the arms end at q = 0, wherever they are led"
+        )
+
+
+class UnknownLengths(PluggedLaw, frozen=True, tag_field="law", tag="adaptive_kinematics"):
+    """The paper's law between the places of end effectors, of planar arms whose lengths nobody knows.
+
+    The place and velocity of the end effector are measured, and compared in the frame of the bases; masses
+    and lengths are learnt. C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots
+    with unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
+
+    Attributes:
+        Lambda: per coordinate x and y, 1/s.
+        Kp: per joint, N m s/rad.
+        Kd: per coordinate, N s/m.
+        Gamma: adaptation gain per parameter.
+        theta_hat0: first estimate of theta, Eq. (24).
+        length_gain_m_n: adaptation gain of the lengths, m/N.
+        lengths0_m: first estimate of the two lengths.
+        least_m: lower bound of both.
+        most_m: upper bound.
+    """
+
+    core_class = AdaptiveJacobian
+
+    Lambda: PositiveJoints = (1.0,)
+    Kp: PositiveJoints = (1.0,)
+    Kd: PositiveJoints = (3.0,)
+    Gamma: NotNegativeParameters = (1.0,)
+    theta_hat0: Parameters = (0.0,)
+    length_gain_m_n: NotNegative = 0.01
+    lengths0_m: PositiveJoints = (1.0,)
+    least_m: Positive = 0.2
+    most_m: Positive = 3.0
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the premises: constant delays, elbows that stay bent, lengths within their bounds."""
+        if np.isnan(situation.longest_s):
+            return StabilityCondition(None, "proved for constant delays, and a delay here varies")
+        return StabilityCondition(
+            None,
+            f"for every constant delay, while abs(sin q2) > {LEAST_SINE:g} and the lengths are within "
+            f"{self.least_m:g} and {self.most_m:g} m (sufficient); the run shows if elbows stay bent",
         )
 
 

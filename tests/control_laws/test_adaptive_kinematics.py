@@ -1,0 +1,133 @@
+"""`adaptive_kinematics`: of known lengths the law of task space; of unknown ones V falls, and arms meet."""
+
+import numpy as np
+import pytest
+
+import trilat_net
+from trilat_net.analysis.arm_rows import inertia_product_rows
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import parse_scenario
+
+SCENARIO = """
+name = "places"
+duration_s = {duration_s}
+[arm]
+g_m_s2 = {gravity}
+[control]
+{control}
+[link]
+delay_ms = 60
+[sites.m]
+q0_rad = [0.3, {elbow_rad}]
+{hands}
+[sites.s]
+role = "slave"
+q0_rad = [0.3, 1.5]
+[sites.s.arm]
+l2_m = {slave_m}
+[dominance]
+m = {{ s = 1.0 }}
+s = {{ m = 1.0 }}
+"""
+GAINS = "Lambda = 1.5\nKp = [6, 4]\nGamma = {Gamma}\n"
+UNKNOWN = """law = "adaptive_kinematics"
+Kd = [8, 5]
+length_gain_m_n = {gain}
+lengths0_m = [{first_m}, {second_m}]
+"""
+KNOWN = 'law = "adaptive"\nKd = [8, 5, 1]\n[task]\nspace = "position"\naxes = ["x", "y"]\n'
+PUSH = 'hands = [{ kind = "pulse", start_s = 0.5, end_s = 1.5, peak_nm = [6.0, -4.0] }]'
+
+
+def run(
+    law: str, *, Gamma: float, gravity: float = 9.81, elbow_rad: float = 1.2, hands: str = "", **more: float
+) -> Log:
+    keys = {"duration_s": 10.0, "gain": 0.0, "first_m": 1.0, "second_m": 1.0, "slave_m": 1.0, **more}
+    control = (GAINS + law).format(Gamma=Gamma, **keys)
+    text = SCENARIO.format(control=control, gravity=gravity, elbow_rad=elbow_rad, hands=hands, **keys)
+    return trilat_net.simulate(parse_scenario(text))
+
+
+def places(log: Log, site: str) -> np.ndarray:
+    lengths_m = log.scenario.arms[site].lengths_m
+    inner, outer = log[site].q[:, 0], log[site].q.sum(axis=1)
+    return np.stack(
+        [
+            lengths_m[0] * np.cos(inner) + lengths_m[1] * np.cos(outer),
+            lengths_m[0] * np.sin(inner) + lengths_m[1] * np.sin(outer),
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.long
+def test_of_known_lengths_it_is_the_law_of_task_space() -> None:
+    pushed = {"Gamma": 0.0, "gravity": 0.0, "elbow_rad": 1.5, "hands": PUSH, "duration_s": 3.0}
+    own, chain = run(UNKNOWN, **pushed), run(KNOWN, **pushed)
+    for site in own.sites:
+        np.testing.assert_allclose(own[site].q, chain[site].q, rtol=0.0, atol=1e-9)
+    assert np.ptp(own["s"].q[:, 0]) > 0.1
+
+
+def jacobians(lengths_m: np.ndarray, q: np.ndarray) -> np.ndarray:
+    inner, outer = q[:, 0], q.sum(axis=1)
+    reach = lengths_m[:, [1]] * np.stack([-np.sin(outer), np.cos(outer)], axis=1)
+    elbow = lengths_m[:, [0]] * np.stack([-np.sin(inner), np.cos(inner)], axis=1)
+    return np.stack([elbow + reach, reach], axis=2)
+
+
+def speeds(log: Log, site: str) -> np.ndarray:
+    lengths_m = np.tile(log.scenario.arms[site].lengths_m, (len(log[site]), 1))
+    return np.einsum("kij,kj->ki", jacobians(lengths_m, log[site].q), log[site].qd)
+
+
+def integral(power: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(0.5e-3 * (power[1:] + power[:-1]))])
+
+
+DELAY = 60  # ticks
+
+
+def functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """V and the integral of sum_i (r'Kp r + 1/2 |xd_i - xd_j(t - T)|^2), from the second tick with samples.
+
+    V = 1/2 sum_i (r'M r + theta~^2 / Gamma + l~^2 / Gamma_l + e'Lambda Kd e + int over T of xd_j'Kd xd_j)
+    """
+    Lambda, Kp, Kd = 1.5, np.array([6.0, 4.0]), np.array([8.0, 5.0])
+    V, lost = np.zeros(len(log["m"]) - DELAY), np.zeros(len(log["m"]) - DELAY)
+    for site, peer in (("m", "s"), ("s", "m")):
+        here, arm = log[site], log.scenario.arms[site]
+        lengths_m = np.array([state.mem[-4:-2] for state in here.states])[DELAY:]
+        q = here.q[DELAY:]
+        e = places(log, site)[DELAY:] - places(log, peer)[:-DELAY]
+        r = here.qd[DELAY:] + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
+        speed = speeds(log, peer)
+        stored = integral((Kd * speed**2).sum(axis=1))
+        V += 0.5 * (
+            (r * inertia_product_rows(arm.theta, q, r)).sum(axis=1)
+            + ((here.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
+            + ((lengths_m - arm.lengths_m) ** 2).sum(axis=1) / LENGTH_GAIN
+            + Lambda * (Kd * e**2).sum(axis=1)
+            + (stored[DELAY:] - stored[:-DELAY])
+        )
+        ed = speeds(log, site)[DELAY:] - speed[:-DELAY]
+        lost += integral((Kp * r**2).sum(axis=1) + 0.5 * (Kd * ed**2).sum(axis=1))
+    return V[2:], lost[2:] - lost[2]  # the torque is extrapolated over the jump of e
+
+
+LENGTH_GAIN = 0.02
+WRONG = {"Gamma": 1.0, "first_m": 0.7, "second_m": 1.4, "slave_m": 1.2, "duration_s": 10.0}
+
+
+def test_of_unknown_lengths_v_falls_by_what_is_dissipated_and_the_places_meet() -> None:
+    log = run(UNKNOWN, gain=LENGTH_GAIN, **WRONG)
+    V, lost = functional(log)
+    assert np.abs(V + lost - V[0]).max() <= 1e-5 * V[0]
+    assert (V - np.minimum.accumulate(V)).max() <= 1e-9 * V[0]
+    apart_m = np.abs(places(log, "m") - places(log, "s")).max(axis=1)
+    assert apart_m[-1] <= 0.1 * apart_m[0]
+
+
+def test_without_learning_lengths_v_falls_by_something_else() -> None:
+    V, lost = functional(run(UNKNOWN, gain=0.0, **WRONG))
+    assert np.abs(V + lost - V[0]).max() > 1e-3 * V[0]

@@ -1,0 +1,125 @@
+"""The paper's law between the places of end effectors, with unknown masses and unknown lengths of the links.
+
+The place x and its velocity are measured; the Jacobian is that of estimated lengths, J_hat = J + J~. With
+e = x - sum_j alpha_ij x_j(t - T), v = -J_hat^-1 Lambda e, a = v' and r = qd - v
+
+    tau = Y(q, qd, v, a) theta_hat - Kp r - J_hat' Kd ed
+    theta_hat' = -Gamma Y' r,    l_hat' = Gamma_l Y_k' Kd ed,    Y_k l_hat = J_hat qd
+
+J_hat r = x' + Y_k (l_hat - l) + Lambda e: what the wrong lengths add to -r'J_hat' Kd ed the derivative of 1/2
+(l_hat - l)' Gamma_l^-1 (l_hat - l) takes away, and V' is that of known lengths (docs/laws.md).
+
+Invariant: both estimates advance by the trapezoid rule, as that of the adaptive law; lengths stay in their
+box, which lets that term fall no less. Adaptive Jacobian after C. C. Cheah, C. Liu and J.-J. E. Slotine, Int.
+J. Robotics Research 25 (2006).
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from ..compiled_law import compiled
+from ..jit import leaf
+from ..sincos import sincos
+from ..two_link_arm import regressor
+from ..user_law import LawContext, LawInput
+
+LEAST_SINE = 0.1
+"""A stretched elbow: where abs(sin q2) is below this, J_hat is inverted as if it were this."""
+
+
+@leaf
+def _solve(l1: float, l2: float, q0: float, q1: float, b0: float, b1: float) -> tuple[float, float]:
+    """Returns J^-1 b of the planar arm with these lengths."""
+    s0, c0 = sincos(q0)
+    s01, c01 = sincos(q0 + q1)
+    bend, _ = sincos(q1)
+    if abs(bend) < LEAST_SINE:
+        bend = LEAST_SINE if bend >= 0.0 else -LEAST_SINE
+    x, y = l1 * c0 + l2 * c01, l1 * s0 + l2 * s01
+    determinant = l1 * l2 * bend
+    return l2 * (c01 * b0 + s01 * b1) / determinant, -(x * b0 + y * b1) / determinant
+
+
+@compiled
+class AdaptiveJacobian:
+    """The law of a site with a planar arm; Lambda and Kd are per coordinate x and y, Kp per joint."""
+
+    sends: ClassVar[Any] = {"x": {"unit": "m", "length": 2}, "xd": {"unit": "m/s", "length": 2}}
+    remembers: ClassVar[tuple[str, ...]] = ("theta_hat", "Yr", "lengths_m", "rate_m_s")
+
+    def __init__(
+        self,
+        facts: LawContext,
+        Lambda: Sequence[float],
+        Kp: Sequence[float],
+        Kd: Sequence[float],
+        Gamma: Sequence[float],
+        theta_hat0: Sequence[float],
+        length_gain_m_n: float,
+        lengths0_m: Sequence[float],
+        least_m: float,
+        most_m: float,
+    ) -> None:
+        if not any(facts.lengths_m):
+            raise ValueError("it has the regressor of the planar arm of two links, and this is a chain")
+        self.Lambda, self.Kp, self.Kd, self.Gamma = Lambda, Kp, Kd, Gamma
+        self.length_gain, self.least_m, self.most_m = length_gain_m_n, least_m, most_m
+        self.theta_hat, self.lengths_m = list(theta_hat0), list(lengths0_m)
+        self.Yr, self.rate_m_s = [0.0] * len(self.theta_hat), [0.0, 0.0]
+        self.measured = list(facts.lengths_m)  # what an instrument at the end effector goes by
+        self.g_m_s2 = facts.g_m_s2
+
+    def torque(self, now: LawInput) -> None:
+        """Writes the torque, the estimate, and what peers get of the end effector."""
+        q0, q1, w0, w1 = now.q[0], now.q[1], now.qd[0], now.qd[1]
+        s0, c0 = sincos(q0)
+        s01, c01 = sincos(q0 + q1)
+        w01 = w0 + w1
+        x0 = self.measured[0] * c0 + self.measured[1] * c01
+        x1 = self.measured[0] * s0 + self.measured[1] * s01
+        xd0 = -self.measured[0] * s0 * w0 - self.measured[1] * s01 * w01
+        xd1 = self.measured[0] * c0 * w0 + self.measured[1] * c01 * w01
+        now.to_all.x[0], now.to_all.x[1] = x0, x1
+        now.to_all.xd[0], now.to_all.xd[1] = xd0, xd1
+        e0 = e1 = 0.0
+        ed0 = ed1 = 0.0
+        for j in range(len(now.peers)):
+            peer = now.peers[j]
+            if peer.tick >= 0:  # a peer of whom nothing came yet is where the arm itself is
+                came = now.received[j]
+                e0 += peer.alpha * (x0 - came.x[0])
+                e1 += peer.alpha * (x1 - came.x[1])
+                ed0 += peer.alpha * (xd0 - came.xd[0])
+                ed1 += peer.alpha * (xd1 - came.xd[1])
+            else:
+                ed0 += peer.alpha * xd0
+                ed1 += peer.alpha * xd1
+        f0, f1 = self.Kd[0] * ed0, self.Kd[1] * ed1
+        pull = (w0 * (c0 * f1 - s0 * f0), w01 * (c01 * f1 - s01 * f0))  # Y_k' Kd ed
+        for i in range(2):
+            rate = self.length_gain * pull[i]
+            if now.k > 0:
+                length = self.lengths_m[i] + 0.5 * now.h_s * (self.rate_m_s[i] + rate)
+                self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
+            self.rate_m_s[i] = rate
+        l1, l2 = self.lengths_m[0], self.lengths_m[1]
+        v0, v1 = _solve(l1, l2, q0, q1, -self.Lambda[0] * e0, -self.Lambda[1] * e1)
+        v01 = v0 + v1
+        g1 = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
+        g2 = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
+        turned0 = -(l1 * c0 * w0 + g1 * s0) * v0 - (l2 * c01 * w01 + g2 * s01) * v01  # J_hat' v
+        turned1 = (g1 * c0 - l1 * s0 * w0) * v0 + (g2 * c01 - l2 * s01 * w01) * v01
+        a = _solve(l1, l2, q0, q1, -self.Lambda[0] * ed0 - turned0, -self.Lambda[1] * ed1 - turned1)
+        r0, r1 = w0 - v0, w1 - v1
+        reach = l2 * (c01 * f1 - s01 * f0)  # J_hat' Kd ed of joint 2
+        now.tau[0] = -self.Kp[0] * r0 - (l1 * (c0 * f1 - s0 * f0) + reach)
+        now.tau[1] = -self.Kp[1] * r1 - reach
+        first, second = regressor(self.g_m_s2, (q0, q1), (w0, w1), (v0, v1), a)
+        for p in range(len(self.Yr)):
+            Yr = first[p] * r0 + second[p] * r1
+            if now.k > 0:
+                self.theta_hat[p] -= 0.5 * now.h_s * self.Gamma[p] * (self.Yr[p] + Yr)
+            self.Yr[p] = Yr
+            now.theta_hat[p] = self.theta_hat[p]
+            now.tau[0] += first[p] * self.theta_hat[p]
+            now.tau[1] += second[p] * self.theta_hat[p]
