@@ -20,6 +20,8 @@ LAWS: dict[str, tuple[str, dict[str, Any]]] = {
     "sync": ("paper", {}),
     "smith": ("two_sites", {"sites.m.control.predicts": True}),
     "lee_spong": ("paper", {}),
+    "adaptive_kinematics": ("paper", {}),
+    "adaptive_robust": ("paper", {}),
 }
 """Per law a shipped scenario and settings."""
 LONG = [name if name == "saturated_pd" else pytest.param(name, marks=pytest.mark.long) for name in LAWS]

@@ -30,14 +30,41 @@ LEAST_SINE = 0.1
 @leaf
 def _solve(l1: float, l2: float, q0: float, q1: float, b0: float, b1: float) -> tuple[float, float]:
     """Returns J^-1 b of the planar arm with these lengths."""
-    s0, c0 = sincos(q0)
-    s01, c01 = sincos(q0 + q1)
-    bend, _ = sincos(q1)
+    (s0, c0), (s01, c01), (bend, _) = sincos(q0), sincos(q0 + q1), sincos(q1)
     if abs(bend) < LEAST_SINE:
         bend = LEAST_SINE if bend >= 0.0 else -LEAST_SINE
     x, y = l1 * c0 + l2 * c01, l1 * s0 + l2 * s01
     determinant = l1 * l2 * bend
     return l2 * (c01 * b0 + s01 * b1) / determinant, -(x * b0 + y * b1) / determinant
+
+
+@leaf
+def _move(
+    lengths: tuple[float, float], q: tuple[float, float], qd: tuple[float, float]
+) -> tuple[float, float, float, float]:
+    """Returns place and velocity of the end effector."""
+    (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
+    inner, outer = lengths[0] * qd[0], lengths[1] * (qd[0] + qd[1])
+    x, y = lengths[0] * c0 + lengths[1] * c01, lengths[0] * s0 + lengths[1] * s01
+    return x, y, -s0 * inner - s01 * outer, c0 * inner + c01 * outer
+
+
+@leaf
+def _turn(
+    lengths: tuple[float, float],
+    rates: tuple[float, float],
+    q: tuple[float, float],
+    qd: tuple[float, float],
+    v: tuple[float, float],
+) -> tuple[float, float]:
+    """Returns the derivative of the Jacobian, with the joints and the lengths at these rates, times v."""
+    (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
+    inner, outer = lengths[0] * qd[0], lengths[1] * (qd[0] + qd[1])
+    v01 = v[0] + v[1]
+    return (
+        -(inner * c0 + rates[0] * s0) * v[0] - (outer * c01 + rates[1] * s01) * v01,
+        (rates[0] * c0 - inner * s0) * v[0] + (rates[1] * c01 - outer * s01) * v01,
+    )
 
 
 @compiled
@@ -71,52 +98,38 @@ class AdaptiveJacobian:
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, the estimate, and what peers get of the end effector."""
-        q0, q1, w0, w1 = now.q[0], now.q[1], now.qd[0], now.qd[1]
-        s0, c0 = sincos(q0)
-        s01, c01 = sincos(q0 + q1)
-        w01 = w0 + w1
-        x0 = self.measured[0] * c0 + self.measured[1] * c01
-        x1 = self.measured[0] * s0 + self.measured[1] * s01
-        xd0 = -self.measured[0] * s0 * w0 - self.measured[1] * s01 * w01
-        xd1 = self.measured[0] * c0 * w0 + self.measured[1] * c01 * w01
-        now.to_all.x[0], now.to_all.x[1] = x0, x1
-        now.to_all.xd[0], now.to_all.xd[1] = xd0, xd1
-        e0 = e1 = 0.0
-        ed0 = ed1 = 0.0
+        q, qd = (now.q[0], now.q[1]), (now.qd[0], now.qd[1])
+        x, y, xd, yd = _move((self.measured[0], self.measured[1]), q, qd)
+        now.to_all.x[0], now.to_all.x[1], now.to_all.xd[0], now.to_all.xd[1] = x, y, xd, yd
+        e0, e1, ed0, ed1 = 0.0, 0.0, xd, yd
         for j in range(len(now.peers)):
-            peer = now.peers[j]
-            if peer.tick >= 0:  # a peer of whom nothing came yet is where the arm itself is
-                came = now.received[j]
-                e0 += peer.alpha * (x0 - came.x[0])
-                e1 += peer.alpha * (x1 - came.x[1])
-                ed0 += peer.alpha * (xd0 - came.xd[0])
-                ed1 += peer.alpha * (xd1 - came.xd[1])
-            else:
-                ed0 += peer.alpha * xd0
-                ed1 += peer.alpha * xd1
+            peer, came = now.peers[j], now.received[j]
+            if peer.tick >= 0:  # a peer of whom nothing came yet is where the arm itself is, and stands
+                e0 += peer.alpha * (x - came.x[0])
+                e1 += peer.alpha * (y - came.x[1])
+                ed0 -= peer.alpha * came.xd[0]
+                ed1 -= peer.alpha * came.xd[1]
+        (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
         f0, f1 = self.Kd[0] * ed0, self.Kd[1] * ed1
-        pull = (w0 * (c0 * f1 - s0 * f0), w01 * (c01 * f1 - s01 * f0))  # Y_k' Kd ed
+        pull = (c0 * f1 - s0 * f0, c01 * f1 - s01 * f0)
         for i in range(2):
-            rate = self.length_gain * pull[i]
+            rate = self.length_gain * pull[i] * (qd[0] + i * qd[1])  # Y_k' Kd ed
             if now.k > 0:
                 length = self.lengths_m[i] + 0.5 * now.h_s * (self.rate_m_s[i] + rate)
                 self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
             self.rate_m_s[i] = rate
         l1, l2 = self.lengths_m[0], self.lengths_m[1]
-        v0, v1 = _solve(l1, l2, q0, q1, -self.Lambda[0] * e0, -self.Lambda[1] * e1)
-        v01 = v0 + v1
         g1 = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
         g2 = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
-        turned0 = -(l1 * c0 * w0 + g1 * s0) * v0 - (l2 * c01 * w01 + g2 * s01) * v01  # J_hat' v
-        turned1 = (g1 * c0 - l1 * s0 * w0) * v0 + (g2 * c01 - l2 * s01 * w01) * v01
-        a = _solve(l1, l2, q0, q1, -self.Lambda[0] * ed0 - turned0, -self.Lambda[1] * ed1 - turned1)
-        r0, r1 = w0 - v0, w1 - v1
-        reach = l2 * (c01 * f1 - s01 * f0)  # J_hat' Kd ed of joint 2
-        now.tau[0] = -self.Kp[0] * r0 - (l1 * (c0 * f1 - s0 * f0) + reach)
-        now.tau[1] = -self.Kp[1] * r1 - reach
-        first, second = regressor(self.g_m_s2, (q0, q1), (w0, w1), (v0, v1), a)
+        v = _solve(l1, l2, q[0], q[1], -self.Lambda[0] * e0, -self.Lambda[1] * e1)
+        turned = _turn((l1, l2), (g1, g2), q, qd, v)
+        a = _solve(l1, l2, q[0], q[1], -self.Lambda[0] * ed0 - turned[0], -self.Lambda[1] * ed1 - turned[1])
+        r = (qd[0] - v[0], qd[1] - v[1])
+        now.tau[0] = -self.Kp[0] * r[0] - (l1 * pull[0] + l2 * pull[1])
+        now.tau[1] = -self.Kp[1] * r[1] - l2 * pull[1]
+        first, second = regressor(self.g_m_s2, q, qd, v, a)
         for p in range(len(self.Yr)):
-            Yr = first[p] * r0 + second[p] * r1
+            Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
                 self.theta_hat[p] -= 0.5 * now.h_s * self.Gamma[p] * (self.Yr[p] + Yr)
             self.Yr[p] = Yr
