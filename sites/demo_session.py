@@ -7,8 +7,8 @@ sessions of their own, so that Ctrl-C reaches them through this process, in that
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -66,8 +66,8 @@ class _Child:
     def problem(self) -> str | None:
         """Describes how the process failed; None if it did not."""
         code = self.code()
-        if code in (0, None) or (self._signalled and code == 128 + signal.SIGINT):
-            return None
+        if code in (0, None) or (self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)):
+            return None  # a process that ends anyway has no handler any more
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
         lines = self._output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -80,7 +80,14 @@ def demo_session_name(scenario: Scenario) -> str:
     return f"{scenario.name}-demo"
 
 
-def run_demo(scenario: Scenario, folder: Path, display: SessionDisplay) -> SessionResult:
+SessionAttendant = Callable[[str, Sequence[str]], AbstractContextManager[Callable[[], bool]]]
+"""Given a session's name and the endpoints of its sites, a context that lasts as long as the session; what it
+yields returns true once the session is to end."""
+
+
+def run_demo(
+    scenario: Scenario, folder: Path, display: SessionDisplay, attend: SessionAttendant | None = None
+) -> SessionResult:
     """Runs a session of all sites and a recorder; its log is valid whenever the session began."""
     result = SessionResult(folder / "run.mcap")
     session, clock = demo_session_name(scenario), SystemClock()
@@ -97,10 +104,11 @@ def run_demo(scenario: Scenario, folder: Path, display: SessionDisplay) -> Sessi
         for name in scenario.external:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
             display.say(f"{name} waits for its arm on {place}; see docs/external-arm.md")
+        attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints)
         try:
-            with closing(ZenohBus([], endpoints)) as bus:
+            with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario.names)
-                while not (interrupt.requested() or _is_over([*sites, recorder], result)):
+                while not (interrupt.requested() or is_enough() or _is_over([*sites, recorder], result)):
                     monitor.poll()
                     display.update(monitor.latest)
                     for text in monitor.take_news():

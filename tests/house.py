@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TOPS = ("trilat_net", "sites", "recorder")
+TOPS = ("trilat_net", "sites", "recorder", "live")
 BELOW_ALL = {"errors", "process", "files", "deprecated"}
 
 

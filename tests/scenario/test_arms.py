@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tests.core.chain_references import chain_references
 from tests.scenario.chains import SIX, six
+from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.errors import ScenarioError
-from trilat_net.reporting.figures.arm_poses import joint_positions_m
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 from trilat_net.scenario.scenario_reader import reseed_scenario

@@ -27,9 +27,10 @@ from ..core.chain import (
 )
 from ..core.jit import leaf
 from ..core.site_setup import ChainSetup, TaskSetup
-from ..core.two_link_arm import JOINTS
+from ..core.two_link_arm import JOINTS, forward_kinematics
 from ..core.vectors import Array, Row, RowArray
 from ..scenario import Scenario
+from ..scenario.arms import ArmModel
 
 HANGING_RAD = 0.3
 """A link within this of straight down hangs."""
@@ -364,3 +365,33 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     if task is not None and not task.posture:
         chain = chain._replace(task=task._replace(posture=scenario.sites[site].q0_rad))
     return ChainArmRows(model.theta, chain)
+
+
+def joint_positions_m(arm: ArmModel, q: Array) -> Array:
+    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K, L, 3)."""
+    if arm.chain is None:
+        points = np.zeros((len(q), 1 + JOINTS, 2))
+        for pose, angles in zip(points, q, strict=True):
+            pose[1:] = forward_kinematics(arm.lengths_m, angles)
+        return points
+    rows, tip_m = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
+    points = np.zeros((len(q), len(rows) + 2, 3))
+    for pose, angles in zip(points, q, strict=True):
+        place_joints(rows, np.ascontiguousarray(angles))
+        pose[-1] = place_end_effector(rows, tip_m)
+        at, turned = np.zeros(3), np.eye(3)
+        for n, row in enumerate(rows, 1):
+            at = at + turned @ row.p
+            pose[n], turned = at, row.R_base.copy()
+    return points
+
+
+def upright_axes(chain: ChainSetup) -> Array:
+    """Returns two directions of the floor and the one up, as rows in the base's frame, shape (3, 3)."""
+    down = np.array(chain.gravity_m_s2)
+    size = float(np.linalg.norm(down))
+    up = -down / size if size else np.array([0.0, 0.0, 1.0])
+    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along it
+    ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return np.array([ahead, np.cross(up, ahead), up])

@@ -12,6 +12,7 @@ import numpy as np
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
 from ..log.log_reader import Log
+from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
 """Half of the nanosecond in which ramps begin and end."""
@@ -46,15 +47,31 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     Raises:
         LogError: a record names a change that is none.
     """
-    scenario = log.scenario
+    start, scripted = list_scripted_ramps(log.scenario, site)
+    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
+    return evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / log.scenario.sites[site].rate_hz)
+
+
+def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
+    """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's timeline."""
     start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
-    scripted = [
+    return start, [
         scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
         for change in scenario.timeline
         if change.dominance == site
     ]
-    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
-    return evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / scenario.sites[site].rate_hz)
+
+
+def forget_ramps(
+    start: Array, ramps: Sequence[DominanceRamp], from_s: float
+) -> tuple[Array, list[DominanceRamp]]:
+    """Returns factors and ramps that give the same history from a time on, without the ramps before it."""
+    ordered = sorted(ramps, key=lambda ramp: ramp.start_ns)
+    begun = sum(ramp.start_ns * 1e-9 <= from_s for ramp in ordered)
+    if begun < 2:
+        return start, ordered
+    turn_s = np.array([ordered[begun - 1].start_ns * 1e-9])
+    return evaluate_ramps(start, ordered[: begun - 1], turn_s, 0.0).alpha[0], ordered[begun - 1 :]
 
 
 def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..analysis import site_signals
+from ..analysis.arm_rows import joint_positions_m
 from ..analysis.json_values import JsonObject
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
 from ..analysis.trace_decimation import decimate
@@ -233,7 +234,7 @@ class Charts:
         part, arm = self._log[site], self._log.scenario.arms[site]
         rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
         actual, desired = (
-            arm_poses.joint_positions_m(arm, q[rows]) for q in (part.q, site_signals.reference_angles(part))
+            joint_positions_m(arm, q[rows]) for q in (part.q, site_signals.reference_angles(part))
         )
         pictures = (
             arm_poses.project_arm_m(arm, actual),

@@ -5,7 +5,7 @@ V(0) + dissipation - work vanishes for the weighted sum, whatever the operators 
 was not produced by the equations that it claims.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,8 +14,9 @@ import numpy as np
 from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, PeerTrajectory, align_records, view_delayed_peer
-from ..dominance_history import trace_dominance
+from ..dominance_history import DominanceHistory, trace_dominance
 from ..lyapunov_weights import compute_lyapunov_weights
 from ..torque_sources import split_torque
 from . import energy_terms
@@ -110,18 +111,34 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     """
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(own) for site, own in records.items()}
+    energies = derive_site_energies(
+        log.scenario, records, pasts, lambda site, t_s: trace_dominance(log, site, t_s)
+    )
+    return energies if energies and len(_find_common_times(energies)) > 1 else {}
+
+
+def derive_site_energies(
+    scenario: Scenario,
+    records: Mapping[str, AlignedRecords],
+    pasts: Mapping[str, PeerTrajectory],
+    dominance: Callable[[str, Array], DominanceHistory],
+) -> dict[str, SiteEnergy]:
+    """Returns the energies of sites over some of their records, each of which has a functional.
+
+    `pasts` reach back to the samples that were in use then; `dominance` gives a site's factors at times, s.
+    """
     energies = {}
-    constants = {site: energy_terms.derive_site_constants(log.scenario, site) for site in records}
+    constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
     axes = [c.axes for c in constants.values() if c.axes]
     common = tuple(np.prod(axes, axis=0).tolist()) if axes else ()
     for site, own in records.items():
         motion = SiteMotion(
             own,
             constants[site],
-            trace_dominance(log, site, own.t_s),
+            dominance(site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
-            split_torque(own, log.scenario),
-            Scheme[log.scenario.scheme.upper()] is Scheme.DIGITAL,
+            split_torque(own, scenario),
+            Scheme[scenario.scheme.upper()] is Scheme.DIGITAL,
             common,
         )
         views = enumerate(motion.peers.values())
@@ -135,7 +152,7 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
             energy_terms.compute_sampling_work(motion),
             np.logical_and.reduce(known),
         )
-    return energies if energies and len(_find_common_times(energies)) > 1 else {}
+    return energies
 
 
 def _find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:

@@ -13,11 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis import site_signals
+from ...analysis.arm_rows import joint_positions_m, upright_axes
 from ...analysis.site_signals import reference_angles
 from ...analysis.timeline import recorded_end_s
-from ...core.chain import build_chain, place_end_effector, place_joints
-from ...core.site_setup import ChainSetup
-from ...core.two_link_arm import JOINTS, forward_kinematics
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario.arms import ArmModel
@@ -49,36 +47,6 @@ class ArmPose(NamedTuple):
     shadow: Array
 
 
-def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K, L, 3)."""
-    if arm.chain is None:
-        points = np.zeros((len(q), 1 + JOINTS, 2))
-        for pose, angles in zip(points, q, strict=True):
-            pose[1:] = forward_kinematics(arm.lengths_m, angles)
-        return points
-    rows, tip_m = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
-    points = np.zeros((len(q), len(rows) + 2, 3))
-    for pose, angles in zip(points, q, strict=True):
-        place_joints(rows, np.ascontiguousarray(angles))
-        pose[-1] = place_end_effector(rows, tip_m)
-        at, turned = np.zeros(3), np.eye(3)
-        for n, row in enumerate(rows, 1):
-            at = at + turned @ row.p
-            pose[n], turned = at, row.R_base.copy()
-    return points
-
-
-def _upright_axes(chain: ChainSetup) -> Array:
-    """Returns two directions of the floor and the one up, as rows in the base's frame, shape (3, 3)."""
-    down = np.array(chain.gravity_m_s2)
-    size = float(np.linalg.norm(down))
-    up = -down / size if size else np.array([0.0, 0.0, 1.0])
-    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along it
-    ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    return np.array([ahead, np.cross(up, ahead), up])
-
-
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
     """Returns points of an arm in the plane of a picture, shape (..., 2), m: a planar arm's are that already.
 
@@ -86,7 +54,7 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     """
     if arm.chain is None:
         return points
-    x, y, z = np.moveaxis(points @ _upright_axes(arm.chain).T, -1, 0)
+    x, y, z = np.moveaxis(points @ upright_axes(arm.chain).T, -1, 0)
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
     towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
     height = np.zeros_like(z) if onto_floor else z

@@ -1,0 +1,198 @@
+// One card for each arm: where it is, where its peers want it, what its hand and its wall do, and its alarms.
+// Bodies are painted by three.js, or on a plain canvas where there is no WebGL; arrows and marks lie on top.
+import { PlainPainter } from "./painter2d.js";
+
+export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const siteColour = (index) => css(`--site-${index % 6}`);
+const MODES = { hold: "HOLDS: peer stale", brake: "BRAKED: peer stale", return: "RETURNS", diverged: "DIVERGED" };
+const element = (parent, tag, name = "") => {
+  const made = document.createElement(tag);
+  if (name) made.className = name;
+  return parent.appendChild(made);
+};
+
+export function arrow(g, from, to, colour, width) {
+  const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
+  const length = Math.hypot(dx, dy);
+  if (length < 3) return;
+  const head = Math.min(4.2 * width, 0.6 * length);
+  const [ux, uy] = [dx / length, dy / length];
+  const base = [to[0] - head * ux, to[1] - head * uy];
+  g.strokeStyle = g.fillStyle = colour;
+  g.lineWidth = width;
+  g.lineCap = "butt";
+  g.beginPath(); g.moveTo(...from); g.lineTo(...base); g.stroke();
+  g.beginPath();
+  g.moveTo(...to);
+  g.lineTo(base[0] - 0.45 * head * uy, base[1] + 0.45 * head * ux);
+  g.lineTo(base[0] + 0.45 * head * uy, base[1] - 0.45 * head * ux);
+  g.fill();
+}
+
+class ArmCard {
+  constructor(parent, name, about, index) {
+    Object.assign(this, { name, about, index });
+    this.card = element(parent, "article", "card arm watched");
+    this.card.tabIndex = 0;
+    this.card.setAttribute("aria-label", `arm ${name}, ${about.role}`);
+    this.canvas = element(this.card, "canvas");
+    const head = element(this.card, "div", "head");
+    const swatch = element(head, "span", "swatch");
+    swatch.style.background = `var(--site-${index % 6})`;
+    element(head, "b").textContent = name;
+    element(head, "span", "soft").textContent = about.role;
+    this.alarms = element(head, "span");
+    this.alarms.setAttribute("role", "status");
+    this.alarms.style.cssText = "display:contents";
+    this.foot = element(this.card, "div", "foot");
+    this.view = { centre: this.middle(), half: 1.05 * about.reach, dark: false };
+    this.hold = null; // what this page's hand does: { at, to } in the arm's frame
+    this.trail = [];
+  }
+
+  middle() {
+    const { start, reach } = this.about;
+    const tip = start[start.length - 1];
+    const size = Math.hypot(...tip) || 1;
+    return tip.map((x) => 0.3 * reach * (x / size));
+  }
+
+  chips(site) {
+    const list = [];
+    if (site.mode in MODES) list.push([MODES[site.mode], "bad"]);
+    if (site.clamped) list.push(["TORQUE LIMIT", "bad"]);
+    if (site.hand_limited) list.push(["FORCE LIMIT", "bad"]);
+    if (site.silent) list.push(["SILENT", "bad"]);
+    if (this.hold) list.push(["you hold it", "good"]);
+    else if (site.holder) list.push([`held by ${site.holder}`, "warn"]);
+    const text = JSON.stringify(list);
+    if (text !== this.shown) {
+      this.shown = text;
+      this.alarms.replaceChildren(...list.map(([words, kind]) => {
+        const chip = document.createElement("span");
+        chip.className = `chip ${kind}`;
+        chip.textContent = words;
+        return chip;
+      }));
+    }
+    this.card.classList.toggle("alarm", list.some(([, kind]) => kind === "bad"));
+  }
+
+  numbers(site) {
+    const size = (force) => Math.hypot(...force);
+    const parts = [["|e|", `${site.e.toPrecision(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
+      ["hand", `${size(site.hand).toFixed(1)} N`, "more"]];
+    if (this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, ""]);
+    const text = parts.map(([key, value, kind]) => `<span class="${kind}">${key} <b>${value}</b></span>`).join("");
+    if (text !== this.written) { this.written = text; this.foot.innerHTML = text; }
+  }
+
+  fit(site) {
+    const { view } = this;
+    const aspect = this.canvas.width / this.canvas.height;
+    let needed = 0.62 * this.about.reach;
+    for (const point of [...site.points, ...(this.about.task ? [] : site.ghost)]) {
+      const [x, y] = this.flat(point);
+      const [cx, cy] = this.flat(view.centre);
+      needed = Math.max(needed, 1.18 * Math.abs(y - cy), (1.12 * Math.abs(x - cx)) / aspect);
+    }
+    view.half += (needed > view.half ? 0.2 : 0.01) * (needed - view.half);
+  }
+
+  flat(point) { // seen from the front: planar arms as they are, chains along their floor
+    if (this.about.planar) return point;
+    const [ahead, side, up] = this.about.up.map((axis) => axis.reduce((sum, v, n) => sum + v * point[n], 0));
+    const across = side * 0.64 + ahead * 0.77;
+    return [across, 0.93 * up - 0.37 * (ahead * 0.64 - side * 0.77)];
+  }
+
+  size() {
+    const ratio = Math.min(devicePixelRatio || 1, 2);
+    const { clientWidth, clientHeight } = this.canvas;
+    const [width, height] = [Math.max(1, Math.round(clientWidth * ratio)), Math.max(1, Math.round(clientHeight * ratio))];
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    return ratio;
+  }
+
+  draw(painter, site, scale) {
+    const ratio = this.size();
+    if (this.canvas.width < 2) return;
+    this.fit(site);
+    const g = this.canvas.getContext("2d");
+    const tip = site.points[site.points.length - 1];
+    this.trail.push(tip);
+    if (this.trail.length > 90) this.trail.shift();
+    painter.paint(this, site, g);
+    this.project = (point) => painter.project(this, point);
+    this.over(g, site, ratio, scale);
+    this.chips(site);
+    this.numbers(site);
+  }
+
+  over(g, site, ratio, scale) {
+    const tip = site.points[site.points.length - 1];
+    const at = this.project(tip);
+    g.lineJoin = "round";
+    g.strokeStyle = siteColour(this.index);
+    this.trail.forEach((point, n) => {
+      if (!n) return;
+      g.globalAlpha = (0.5 * n) / this.trail.length;
+      g.lineWidth = 1.5 * ratio;
+      g.beginPath(); g.moveTo(...this.project(this.trail[n - 1])); g.lineTo(...this.project(point)); g.stroke();
+    });
+    g.globalAlpha = 1;
+    const push = (force, colour, label) => {
+      const size = Math.hypot(...force);
+      if (size < 0.02 * scale) return;
+      const length = Math.min(1.6, size / scale) * 0.55 * this.about.reach;
+      const end = this.project(tip.map((x, n) => x + (length * (force[n] || 0)) / size));
+      arrow(g, at, end, colour, 3.2 * ratio);
+      g.font = `600 ${11.5 * ratio}px system-ui, sans-serif`;
+      g.fillStyle = colour;
+      g.textAlign = end[0] < at[0] ? "right" : "left";
+      g.fillText(`${label} ${size.toFixed(size < 10 ? 1 : 0)} N`, end[0] + (end[0] < at[0] ? -6 : 6) * ratio, end[1] + 4 * ratio);
+    };
+    push(site.wall, css("--bad"), "wall");
+    push(site.hand, css("--good"), "hand");
+    if (this.hold?.to) {
+      const to = this.project(this.hold.to);
+      g.strokeStyle = css("--good");
+      g.lineWidth = 1.5 * ratio;
+      g.setLineDash([4 * ratio, 3 * ratio]);
+      g.beginPath(); g.moveTo(...at); g.lineTo(...to); g.stroke();
+      g.setLineDash([]);
+      g.beginPath(); g.arc(...to, 8 * ratio, 0, 2 * Math.PI); g.stroke();
+    } else if (this.graspable) {
+      g.strokeStyle = css("--ink");
+      g.globalAlpha = this.near ? 0.9 : 0.3;
+      g.lineWidth = 1.5 * ratio;
+      g.beginPath(); g.arc(...at, 13 * ratio, 0, 2 * Math.PI); g.stroke();
+      g.globalAlpha = 1;
+    }
+  }
+}
+
+export class Arms {
+  constructor(parent, hello, say) {
+    this.cards = Object.entries(hello.sites).map(([name, about], index) => new ArmCard(parent, name, about, index));
+    this.byName = Object.fromEntries(this.cards.map((card) => [card.name, card]));
+    this.painter = new PlainPainter();
+    this.scale = 10;
+    say("drawing without WebGL ...");
+    const plain = new URLSearchParams(location.search).has("plain");
+    import("./painter3d.js").then(({ makeScenePainter }) => {
+      const painter = plain ? null : makeScenePainter(this.cards);
+      if (painter) this.painter = painter;
+      say(painter ? "drawn with WebGL" : "no WebGL here: drawn flat, on a plain canvas");
+    }).catch((error) => say(`no WebGL here (${error.message}): drawn flat, on a plain canvas`));
+  }
+
+  draw(frame) {
+    // one scale for all forces, so that they compare: the largest of late, in round steps
+    const sizes = Object.values(frame.sites).flatMap((site) => [Math.hypot(...site.hand), Math.hypot(...site.wall)]);
+    this.most = Math.max(5, ...sizes, 0.995 * (this.most || 0));
+    this.scale = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 1e4].find((step) => step >= 0.9 * this.most) || 1e4;
+    this.painter.begin?.();
+    for (const card of this.cards) card.draw(this.painter, frame.sites[card.name], this.scale);
+  }
+}

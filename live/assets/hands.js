@@ -1,0 +1,146 @@
+// People's hands: drag an end effector, a gamepad, or keys. What they ask for goes to the server at most sixty
+// times a second, and again while they rest, so that the site knows that they still hold.
+const EVERY_MS = 1000 / 60;
+const REACH_PX = 34;
+
+export class Hands {
+  constructor(arms, hello, send, page) {
+    Object.assign(this, { arms, send, page, chosen: null, pads: [] });
+    for (const card of arms.cards) this.listen(card);
+    addEventListener("keydown", (event) => this.key(event, true));
+    addEventListener("keyup", (event) => this.key(event, false));
+    addEventListener("blur", () => this.letGo());
+    document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
+    this.keys = new Set();
+    setInterval(() => this.beat(), EVERY_MS);
+  }
+
+  can(card) { return this.page.takesPart && Boolean(card.about.hand) && Boolean(card.project); }
+
+  pixel(card, event) {
+    const box = card.canvas.getBoundingClientRect();
+    const ratio = card.canvas.width / box.width;
+    return [(event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio, ratio];
+  }
+
+  tip(card) {
+    const site = this.page.frame?.sites[card.name];
+    return site ? site.points[site.points.length - 1] : null;
+  }
+
+  listen(card) {
+    const near = (event) => {
+      const tip = this.tip(card);
+      if (!tip || !this.can(card)) return false;
+      const [x, y, ratio] = this.pixel(card, event);
+      const [tx, ty] = card.project(tip);
+      return Math.hypot(x - tx, y - ty) < REACH_PX * ratio;
+    };
+    card.card.addEventListener("focus", () => this.choose(card));
+    card.canvas.addEventListener("pointerdown", (event) => {
+      this.choose(card);
+      if (!near(event)) return;
+      event.preventDefault();
+      card.canvas.setPointerCapture(event.pointerId);
+      const [x, y] = this.pixel(card, event);
+      const [tx, ty] = card.project(this.tip(card));
+      this.take(card, [...this.tip(card)], { pointer: event.pointerId, offset: [tx - x, ty - y] });
+    });
+    card.canvas.addEventListener("pointermove", (event) => {
+      card.near = near(event);
+      const hold = card.hold;
+      if (!hold || hold.pointer !== event.pointerId) return;
+      const [x, y] = this.pixel(card, event);
+      hold.to = this.arms.painter.unproject(card, [x + hold.offset[0], y + hold.offset[1]], hold.to);
+      this.tell(card);
+    });
+    for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      card.canvas.addEventListener(kind, (event) => { if (card.hold?.pointer === event.pointerId) this.release(card); });
+    }
+  }
+
+  choose(card) {
+    this.chosen = card;
+    for (const other of this.arms.cards) other.card.classList.toggle("chosen", other === card);
+  }
+
+  take(card, to, how) {
+    card.hold = { to, told: 0, ...how };
+    card.card.classList.add("held");
+    this.tell(card);
+  }
+
+  release(card) {
+    if (!card.hold) return;
+    card.hold = null;
+    card.card.classList.remove("held");
+    this.send({ do: "hand", site: card.name, grip: false });
+  }
+
+  letGo() { for (const card of this.arms.cards) this.release(card); this.keys?.clear(); }
+
+  tell(card) {
+    const now = performance.now();
+    if (now - card.hold.told < EVERY_MS - 1) return;
+    card.hold.told = now;
+    this.send({ do: "hand", site: card.name, grip: true, to: card.hold.to });
+  }
+
+  beat() {
+    this.gamepads();
+    this.steer();
+    for (const card of this.arms.cards) {
+      card.graspable = this.can(card);
+      card.card.classList.toggle("watched", !card.graspable);
+      if (!card.hold) continue;
+      if (!card.graspable || this.page.frame?.ended) this.release(card);
+      else this.tell(card);
+    }
+  }
+
+  key(event, down) {
+    if (event.target.matches("input, select, textarea, button")) return;
+    const { key } = event;
+    if (down && /^[1-9]$/.test(key) && this.arms.cards[key - 1]) this.arms.cards[key - 1].card.focus();
+    else if (key === "Escape" && down) this.letGo();
+    else if (key === " " && this.chosen) {
+      event.preventDefault();
+      if (down && !event.repeat) {
+        if (this.chosen.hold) this.release(this.chosen);
+        else if (this.can(this.chosen) && this.tip(this.chosen)) this.take(this.chosen, [...this.tip(this.chosen)], { keys: true });
+      }
+    } else if (key.startsWith("Arrow") && this.chosen?.hold) {
+      event.preventDefault();
+      if (down) this.keys.add(key); else this.keys.delete(key);
+    } else if (key.startsWith("Arrow")) this.keys.delete(key);
+  }
+
+  steer() {
+    const card = this.chosen;
+    if (!card?.hold?.keys || !this.keys.size) return;
+    const step = (0.35 * card.about.reach * EVERY_MS) / 1000;
+    const way = (plus, minus) => (this.keys.has(plus) ? step : 0) - (this.keys.has(minus) ? step : 0);
+    this.shift(card, way("ArrowRight", "ArrowLeft"), way("ArrowUp", "ArrowDown"));
+  }
+
+  shift(card, right, up) {
+    const at = this.arms.painter.project(card, card.hold.to);
+    const unit = card.canvas.height / (2 * card.view.half);
+    card.hold.to = this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to);
+  }
+
+  gamepads() { // the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad
+    const pads = (navigator.getGamepads?.() || []).filter(Boolean);
+    pads.forEach((pad, n) => {
+      const card = pads.length > 1 ? this.arms.cards[n] : this.chosen || this.arms.cards[0];
+      if (!card || !this.can(card)) return;
+      const pressed = pad.buttons[0]?.pressed || (pad.buttons[7]?.value || 0) > 0.3;
+      if (pressed && !card.hold && this.tip(card)) this.take(card, [...this.tip(card)], { pad: pad.index });
+      if (!pressed && card.hold?.pad === pad.index) this.release(card);
+      if (card.hold?.pad !== pad.index) return;
+      const live = (axis) => (Math.abs(pad.axes[axis] || 0) > 0.12 ? pad.axes[axis] : 0);
+      const step = (0.6 * card.about.reach * EVERY_MS) / 1000;
+      this.shift(card, step * live(0), -step * live(1));
+    });
+  }
+}

@@ -1,0 +1,149 @@
+// The page of a running session: the socket, the state of the page, and what belongs to no single part.
+// Newest state wins: the server sends a frame when this page has drawn the one before.
+import { Arms } from "./arms.js";
+import { Hands } from "./hands.js";
+import { Network } from "./network.js";
+import { Plots } from "./plots.js";
+import { Shares } from "./shares.js";
+
+const $ = (id) => document.getElementById(id);
+const page = { hello: null, frame: null, takesPart: false, sent: 0, frames: 0, energies: [] };
+window.trilat = page; // for tests, and for whoever opens the console
+
+let socket = null;
+let parts = null;
+let pause = 500;
+
+export function send(message) {
+  if (socket === null || socket.readyState !== WebSocket.OPEN) return false;
+  socket.send(JSON.stringify(message));
+  page.sent += 1;
+  return true;
+}
+
+let hidesAt = 0;
+function notice(text, ms = 6000) {
+  $("notice").textContent = text;
+  $("notice").hidden = false;
+  hidesAt = performance.now() + ms;
+}
+
+function state(text, kind = "") {
+  if ($("state").textContent === text) return;
+  $("state").textContent = text;
+  $("state").className = `chip ${kind}`;
+}
+
+function begin(hello) {
+  page.hello = hello;
+  $("title").textContent = hello.title || "trilat live";
+  $("session").textContent = `session ${hello.session}`;
+  $("end").hidden = !hello.ends;
+  document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
+  if (!hello.running) {
+    const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
+    state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
+    return;
+  }
+  if (parts !== null) return;
+  const names = Object.keys(hello.sites);
+  const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
+  const hands = new Hands(arms, hello, send, page);
+  parts = {
+    arms, hands, names,
+    network: new Network(hello, send, page),
+    plots: new Plots($("plots"), hello, page),
+    shares: new Shares($("shares"), $("share-rows"), hello, send, page),
+  };
+  page.parts = parts;
+}
+
+function take(frame) {
+  if (parts === null) return;
+  page.frame = frame;
+  page.frames += 1;
+  if (page.takesPart !== frame.takes_part) {
+    page.takesPart = frame.takes_part;
+    for (const control of document.querySelectorAll("#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end")) {
+      control.disabled = !frame.takes_part;
+    }
+    $("part").setAttribute("aria-pressed", frame.takes_part);
+    $("part").textContent = frame.takes_part ? "taking part" : "take part";
+  }
+  $("clock").textContent = `${frame.t.toFixed(1)} s`;
+  const silent = parts.names.filter((name) => frame.sites[name].silent);
+  const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
+  if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
+  else if (frame.ended) state("ended");
+  else if (silent.length) state(`${silent.join(", ")} silent`, "bad");
+  else state("running", "good");
+  for (const { ok, text } of frame.notices) if (!ok) notice(text);
+  if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
+  events(frame.events);
+  parts.plots.take(frame);
+  const pages = frame.pages === 1 ? "1 page" : `${frame.pages} pages`;
+  const late = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
+  const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";
+  const missing = parts.names.reduce((sum, name) => sum + frame.sites[name].missing, 0);
+  $("counts").textContent = `${pages} · loops late by at most ${late} µs · ${missing} records missing${refused}`;
+}
+
+const LOUD = ["lost", "diverged", "failed", "refused", "clock fault"];
+function events(list) {
+  for (const { t, member, kind, text } of list) {
+    const item = document.createElement("li");
+    const [time, who, what] = ["time", "span", "span"].map((tag) => item.appendChild(document.createElement(tag)));
+    time.textContent = t === null ? "" : `${t.toFixed(2)} s`;
+    who.textContent = member;
+    what.textContent = text;
+    if (LOUD.includes(kind)) what.className = "bad";
+    $("event-list").prepend(item);
+  }
+  while ($("event-list").children.length > 200) $("event-list").lastChild.remove();
+}
+
+let waiting = false;
+function draw() {
+  waiting = false;
+  const frame = page.frame;
+  if (parts === null || frame === null) return;
+  parts.arms.draw(frame);
+  parts.network.draw(frame);
+  parts.shares.draw(frame);
+  parts.plots.draw();
+  send({ do: "seen", n: frame.n });
+}
+
+function connect() {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  socket = new WebSocket(`${scheme}://${location.host}/socket${location.search}`);
+  socket.addEventListener("open", () => { pause = 500; });
+  socket.addEventListener("message", ({ data }) => {
+    const message = JSON.parse(data);
+    if (message.hello) {
+      begin(message.hello);
+      send({ do: "seen", n: message.hello.n });
+      return;
+    }
+    take(message);
+    if (!waiting) { waiting = true; requestAnimationFrame(draw); }
+    if (document.hidden) draw(); // no animation frames then: the connection stays alive all the same
+  });
+  socket.addEventListener("close", ({ code, reason }) => {
+    state(page.frame?.ended ? "ended" : "not connected", page.frame?.ended ? "" : "bad");
+    parts?.hands.letGo();
+    if (code === 1008) return notice(`the server closed this page: ${reason}`, 1e9);
+    setTimeout(connect, pause);
+    pause = Math.min(2 * pause, 8000);
+  });
+}
+
+$("part").addEventListener("click", () => send({ do: "control", want: !page.takesPart }));
+$("end").addEventListener("click", () => { if (confirm("End the session for everybody?")) send({ do: "end" }); });
+const mark = () => { send({ do: "mark", text: $("mark-text").value.trim() || "mark" }); $("mark-text").value = ""; };
+$("mark").addEventListener("click", mark);
+$("mark-text").addEventListener("keydown", (event) => { if (event.key === "Enter") mark(); });
+addEventListener("keydown", (event) => {
+  if (!event.target.matches("input, select, textarea") && event.key.toLowerCase() === "m" && !event.ctrlKey && !event.metaKey) mark();
+});
+connect();

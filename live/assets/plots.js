@@ -1,0 +1,115 @@
+// Streaming plots of the last seconds: errors, torques, forces of hands and walls, ages, and V.
+import { css, siteColour } from "./arms.js";
+
+const SPAN_S = 20;
+const KEPT = 1500;
+const EVERY_MS = 66;
+
+class Plot {
+  constructor(parent, title, unit, series, note = "") {
+    this.series = series;
+    this.card = document.createElement("figure");
+    this.card.className = "card plot";
+    this.card.style.margin = 0;
+    const head = this.card.appendChild(document.createElement("h2"));
+    head.textContent = `${title} (${unit})`;
+    const keys = head.appendChild(document.createElement("span"));
+    keys.className = "keys";
+    for (const { label, colour, dash } of series) {
+      const key = keys.appendChild(document.createElement("span"));
+      const swatch = key.appendChild(document.createElement("span"));
+      swatch.className = `swatch${dash ? " dashed" : ""}`;
+      swatch.style.background = colour.startsWith("--") ? `var(${colour})` : colour;
+      if (dash) swatch.style.backgroundColor = `var(${colour})`;
+      key.append(label);
+    }
+    this.box = this.card.appendChild(document.createElement("div"));
+    this.note = this.card.appendChild(document.createElement("p"));
+    this.note.className = "soft";
+    this.say(note);
+    parent.append(this.card);
+    this.data = [[], ...series.map(() => [])];
+    this.build();
+  }
+
+  say(text) { this.note.textContent = text; this.note.hidden = !text; this.box.hidden = Boolean(text); }
+
+  build() {
+    this.plot?.destroy();
+    const axis = (size) => ({ stroke: css("--soft"), font: "11px system-ui, sans-serif", size, grid: { stroke: css("--grid"), width: 1 }, ticks: { show: false } });
+    const range = (u, low, high) => {
+      if (low === null || low === undefined) return [0, 1];
+      const [bottom, top] = [Math.min(0, low), Math.max(high, 1e-9)];
+      return [bottom < 0 ? bottom - 0.06 * (top - bottom) : 0, top + 0.1 * (top - bottom)];
+    };
+    this.plot = new uPlot({
+      width: Math.max(this.box.clientWidth, 120), height: 132, padding: [6, 8, 0, 0], legend: { show: false }, cursor: { show: false },
+      scales: { x: { time: false, range: () => [this.now - SPAN_S, this.now] }, y: { range } },
+      axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => `${v} s`) }, axis(46)],
+      series: [{}, ...this.series.map(({ colour, dash, width = 1.6 }) => ({
+        stroke: css(colour), width, dash: dash ? [5, 3] : undefined, points: { show: false }, pxAlign: 0, spanGaps: false,
+      }))],
+    }, this.data, this.box);
+  }
+
+  add(row) {
+    this.data.forEach((column, n) => { column.push(row[n]); if (column.length > KEPT) column.splice(0, column.length - KEPT); });
+  }
+
+  draw(now) {
+    if (this.box.hidden || !this.data[0].length) return;
+    this.now = now;
+    const width = Math.max(this.box.clientWidth, 120);
+    if (width !== this.plot.width) this.plot.setSize({ width, height: 132 });
+    this.plot.setData(this.data);
+  }
+}
+
+export class Plots {
+  constructor(parent, hello, page) {
+    this.page = page;
+    this.columns = hello.columns;
+    const sites = Object.keys(hello.sites);
+    const column = (name) => 1 + this.columns.indexOf(name);
+    const per = (kind, extra = {}) => sites.map((site, n) => ({ label: site, colour: `--site-${n % 6}`, from: column(`${site}.${kind}`), ...extra }));
+    const unit = hello.sites[sites[0]].unit;
+    const walled = sites.filter((site) => hello.sites[site].walls.length);
+    const walls = walled.map((site) => ({ label: `wall at ${site}`, colour: `--site-${sites.indexOf(site) % 6}`, dash: true, from: column(`${site}.wall`) }));
+    const links = Object.entries(hello.links).map(([name, [from, to]]) => ({
+      label: name.replace("->", "→"), colour: `--site-${sites.indexOf(from) % 6}`, dash: sites.indexOf(to) > sites.indexOf(from), from: column(`${name}.age`),
+    }));
+    this.streams = [
+      [new Plot(parent, "error |e|", unit, per("e")), per("e")],
+      [new Plot(parent, "largest torque", "N m", per("tau")), per("tau")],
+      [new Plot(parent, "force of hands", "N", [...per("hand"), ...walls]), [...per("hand"), ...walls]],
+      [new Plot(parent, "age of samples in use", "ms", links), links],
+    ].map(([plot, series]) => ({ plot, from: series.map((one) => one.from) }));
+    this.energy = new Plot(parent, "V", "J", [
+      { label: "V", colour: "--ink", width: 2 }, { label: "V less what hands and walls gave: must not rise", colour: "--accent", dash: true },
+    ], "V follows from every record, a moment later");
+    this.drawn = 0;
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      for (const { plot } of [...this.streams, { plot: this.energy }]) plot.build();
+    });
+  }
+
+  take(frame) {
+    for (const row of frame.points) for (const { plot, from } of this.streams) plot.add([row[0], ...from.map((n) => row[n])]);
+    for (const [t, V, supplied] of frame.energies) {
+      this.energy.add([t, V, V - supplied]);
+      this.page.energies.push([t, V, supplied]);
+    }
+    if (this.page.energies.length > 4000) this.page.energies.splice(0, 1000);
+    if (frame.energy) this.energy.say(`no V: ${frame.energy}`);
+    else if (this.energy.box.hidden && frame.energies.length) this.energy.say("");
+    this.now = frame.t;
+  }
+
+  draw() {
+    const now = performance.now();
+    if (now - this.drawn < EVERY_MS) return;
+    this.drawn = now;
+    for (const { plot } of this.streams) plot.draw(this.now);
+    this.energy.draw(this.now);
+  }
+}

@@ -1,0 +1,250 @@
+"""Frames of a session for pages: what never changes, what is now, and the newest points of the plots.
+
+Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next frame
+is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people by the transpose of
+the Jacobian, which near a singular pose gives the least force that explains the torque.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from trilat_net.analysis.aligned import AlignedRecords
+from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m, upright_axes
+from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
+from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.vectors import Array
+from trilat_net.net.messages import Event, LinkStats
+from trilat_net.scenario import Scenario
+
+from .session_view import SessionView, SiteView, Tail
+
+POINTS_KEPT = 1200
+"""Points of a plot that a new page gets: 40 s."""
+ENERGY_EVERY_S = 0.025
+LONGEST_FRAME_S = 0.5
+"""A frame looks at no more records than this, s."""
+_LEAST_SINGULAR_VALUE = 0.05
+"""Forces along directions in which the end effector moves less are not told apart from none, m/rad."""
+
+Json = dict[str, Any]
+
+
+def _rounded(values: Array, digits: int = 5) -> list[Any]:
+    found: list[Any] = np.round(values, digits).tolist()
+    return found
+
+
+class ArmFrames:
+    """One arm in frames: its fixed shape, and its pose, ghost and forces in some records."""
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._scenario, self._site = scenario, site
+        self._model, self._spec = scenario.arms[site], scenario.sites[site]
+        self._walls = list_walls(self._spec)
+        counts = self._model.counts.joints
+        limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
+        self._tau_limit = limits
+        self._scale = self._model.chain.task.scale if self._model.chain and self._model.chain.task else 1.0
+        self._rows = build_arm_rows(scenario, site)
+
+    def describe(self) -> Json:
+        """Returns what never changes."""
+        chain = self._model.chain
+        start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[0]
+        reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
+        return {
+            "role": self._spec.role,
+            "rate_hz": self._spec.rate_hz,
+            "planar": chain is None,
+            "up": None if chain is None else _rounded(upright_axes(chain)),
+            "joints": len(self._spec.q0_rad),
+            "start": _rounded(start),
+            "reach": reach,
+            "tau_limit": _rounded(self._tau_limit),
+            "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
+            "task": self._model.shares_pose,
+            "unit": "m" if self._model.shares_pose else "rad",
+            "law": type(self._spec.control).__struct_config__.tag,
+        }
+
+    def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
+        """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
+        split = split_torque(own, self._scenario)
+        last = slice(len(own.known) - 1, None)
+        hand, wall = self._hand_force(own, split), self._wall_force(own, split)
+        e, tau = np.linalg.norm(own.e, axis=1), np.abs(own.tau)
+        points = joint_positions_m(self._model, own.q[last])[0]
+        if self._model.shares_pose:
+            ghost = own.q_des[-1, :3][np.newaxis] / self._scale
+        else:
+            ghost = joint_positions_m(self._model, own.q_des[last])[0]
+        now = {
+            "points": _rounded(points),
+            "ghost": _rounded(ghost),
+            "q": _rounded(own.q[-1]),
+            "e": float(e[-1]),
+            "tau": _rounded(own.tau[-1], 3),
+            "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
+            "hand": _rounded(hand[-1], 3),
+            "wall": _rounded(wall[-1], 3),
+        }
+        sizes = (np.linalg.norm(force, axis=1).max() for force in (hand, wall))
+        return now, [float(e.max()), float(tau.max()), *map(float, sizes)]
+
+    def _hand_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
+        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), N."""
+        torque = split.operator
+        if not self._spec.hands and np.abs(torque).max() < 1e-9 * (1.0 + np.abs(own.tau_x).max()):
+            return np.zeros_like(split.end_effector.at)
+        J = split.end_effector.J
+        inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=_LEAST_SINGULAR_VALUE)
+        found: Array = np.einsum("kij,kj->ki", inverse, torque)
+        return found
+
+    def _wall_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
+        total = np.zeros_like(split.end_effector.at)
+        for wall in self._walls:
+            force = wall_force(wall, own.nominal_s, split.end_effector)
+            total = total + force[:, np.newaxis] * np.array(wall.b)
+        return total
+
+
+class SessionFrames:
+    """The frames of one session; `make` is called at the rate of the pages.
+
+    Attributes:
+        points: rows of the plots, in the order of `columns`.
+        energies: rows of t, s, V and what operator and environment have supplied, J.
+    """
+
+    def __init__(self, view: SessionView) -> None:
+        self._view = view
+        self._arms: dict[str, ArmFrames] = {}
+        self._seen: dict[str, int] = {}
+        self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
+        self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
+        self._energy_s = -1.0
+
+    def describe(self) -> Json:
+        """Returns the session as a page needs it once: sites, links, columns of the plots."""
+        view, scenario = self._view, self._view.scenario
+        if scenario is None or not view.running:
+            here = sorted(view.met)
+            sites = [] if scenario is None else [name for name in scenario.names if name not in view.met]
+            return {"running": False, "session": view.session, "here": here, "missing": sites}
+        if not self._arms:
+            self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
+        links = {name: list(name.split("->")) for name in scenario.links}
+        return {
+            "running": True,
+            "session": view.session,
+            "name": scenario.name,
+            "title": scenario.title or scenario.name,
+            "about": scenario.about,
+            "duration_s": scenario.duration_s,
+            "sites": {site: arm.describe() for site, arm in self._arms.items()},
+            "links": links,
+            "shares": {site: scenario.dominance[site] for site in scenario.names},
+            "columns": [f"{site}.{kind}" for site in scenario.names for kind in ("e", "tau", "hand", "wall")]
+            + [f"{link}.age" for link in scenario.links],
+        }
+
+    def make(self) -> Json | None:
+        """Returns what is now; None until every site has a record."""
+        view = self._view
+        if not view.running or any(site.record is None for site in view.sites.values()):
+            return None
+        if not self._arms:
+            self.describe()
+        sites, row, t_s = {}, [], 0.0
+        for name, site in view.sites.items():
+            sites[name], extremes = self._site_now(name, site)
+            t_s = max(t_s, sites[name]["t"])
+            row += extremes
+        links = {name: self._link_now(name) for name in view.links}
+        row += [link["age_ms"] for link in links.values()]
+        if any(site["new"] for site in sites.values()):
+            self.points.add([round(t_s, 4), *(None if x is None else float(f"{x:.5g}") for x in row)])
+        self._add_energy()
+        energy = view.energy
+        return {
+            "t": t_s,
+            "sites": sites,
+            "links": links,
+            "shares": view.dominance,
+            "energy": "" if energy is None else energy.reason,
+            "ended": view.ended,
+            "dropped": sum(view.dropped.values()),
+        }
+
+    def _site_now(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
+        window, record, stats = site.window, site.record, site.stats
+        assert record is not None
+        newest = max(window.newest, 0)
+        longest = round(LONGEST_FRAME_S * window.rate_hz)
+        seen = self._seen.get(name, -1)
+        first = max(min(seen + 1, newest), newest - longest, window.first)
+        now, extremes = self._arms[name].now(window.rows(first, newest))
+        self._seen[name] = newest
+        account = site.reception.accounts["state"]
+        return {
+            **now,
+            "new": newest > seen,
+            "t": record.t_ns / NS_PER_S,
+            "tick": record.tick,
+            "mode": record.mode,
+            "silent": self._view.silent(site),
+            "late_us": stats.late_max_us if stats else 0,
+            "overruns": stats.overruns if stats else 0,
+            "missing": account.missing if site.holds_from == 0 else 0,
+        }, extremes
+
+    def _link_now(self, name: str) -> Json:
+        view = self._view
+        peer, _, receiver = name.partition("->")
+        own, other = view.sites[receiver], view.sites[peer]
+        record, stats, table = own.record, own.stats, view.links[name]
+        used = -1 if record is None else record.used.get(peer, -1)
+        rate_hz = other.window.rate_hz
+        age_ms = None
+        if record is not None and used >= 0:
+            age_ms = record.t_ns / 1e6 - used * 1e3 / rate_hz
+        newest = other.record.tick if other.record else used
+        counts = _link_counts(stats, peer)
+        return {
+            "age_ms": age_ms,
+            "under_way": max(0, min(newest - used, 100_000)) if used >= 0 else 0,
+            "stated": {key: value for key, value in table.items() if isinstance(value, str | int | float)},
+            "share": view.dominance.get(receiver, {}).get(peer, 0.0),
+            **counts,
+        }
+
+    def _add_energy(self) -> None:
+        view = self._view
+        if view.energy is None:
+            return
+        course = view.energy.advance({name: site.complete for name, site in view.sites.items()})
+        if course is None:
+            return
+        for t_s, V, supplied in zip(*(column.tolist() for column in course), strict=True):
+            if t_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
+                self._energy_s = t_s
+                self.energies.add([t_s, V, supplied])
+
+
+def _link_counts(stats: LinkStats | None, peer: str) -> Json:
+    if stats is None:
+        return {}
+    return {
+        "delay_us": stats.delay_us.get(peer, -1),
+        "accepted": stats.accepted.get(peer, 0),
+        "late": stats.late.get(peer, 0),
+        "lost": stats.lost.get(peer, 0),
+    }
+
+
+def show_event(event: Event) -> Json:
+    """Returns an event as a page lists it."""
+    t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
+    return {"t": t_s, "member": event.member, "kind": event.kind, "text": event.text}

@@ -1,0 +1,238 @@
+"""What a session does now: the records, statistics and events of its sites as they come in.
+
+Invariant: every record counts. What is missing is asked for as a recorder asks, from the same buffers, so
+that energies are those of the log; a page is shown fewer, and always the newest. A view that begins late asks
+for no records from before it, and for all events, which say what was changed.
+"""
+
+from collections import Counter, deque
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from recorder.backfill import GapRepair
+from recorder.inbound_queue import InboundMessage, InboundQueue
+from recorder.site_reception import SiteReception
+from trilat_net.analysis.certificate.running_energy import RunningEnergy
+from trilat_net.analysis.record_window import RecordWindow, make_windows
+from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import ScenarioError, WireError
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.membership import MemberQuery
+from trilat_net.net.messages import Event, Info, LinkStats, State
+from trilat_net.net.wire import split_states
+from trilat_net.scenario import (
+    Scenario,
+    initial_link_tables,
+    parse_core_change,
+    parse_embedded,
+    scheduled_link_tables,
+)
+
+LATE_S = 3.0
+"""A view whose first record of a site is of a later time has joined late."""
+GONE_NS = 2 * NS_PER_S
+"""A site that is silent for so long is shown as gone."""
+EVENTS_KEPT = 400
+
+T = TypeVar("T")
+
+
+class Tail(Generic[T]):
+    """The last entries of a sequence without end, for readers that come when they can."""
+
+    def __init__(self, most: int) -> None:
+        self._entries: deque[T] = deque(maxlen=most)
+        self.count = 0
+
+    def add(self, entry: T) -> None:
+        """Adds an entry."""
+        self._entries.append(entry)
+        self.count += 1
+
+    def since(self, count: int, most: int) -> list[T]:
+        """Returns the entries after the first `count`, of those that are kept; the newest `most` of them."""
+        new = min(self.count - count, most, len(self._entries))
+        return [self._entries[n] for n in range(len(self._entries) - new, len(self._entries))]
+
+
+class SiteView:
+    """One running site: its reception, its newest record and statistics.
+
+    Attributes:
+        reception: what came in, and what is missing.
+        window: its records.
+        record: the newest; None before the first.
+        stats: the newest; None before the first.
+        holds_from: its first tick that was seen.
+    """
+
+    def __init__(self, bus: Bus, session: str, reception: SiteReception, window: RecordWindow) -> None:
+        self.reception, self.window = reception, window
+        self.dropped: Counter[str] = Counter()
+        self.repair = GapRepair(bus, session, reception, self.dropped)
+        self.record: State | None = None
+        self.stats: LinkStats | None = None
+        self.holds_from = 0
+
+    @property
+    def complete(self) -> int:
+        """The last tick up to which all records are there or cannot be had; -1 before the first."""
+        account = self.reception.accounts[topics.STATE]
+        gap = account.wanted()
+        return account.last if gap is None else gap[0] - 1
+
+
+class SessionView:
+    """A session as an onlooker sees it; `poll` takes in what has come.
+
+    Attributes:
+        scenario: the session's; None until a member has told it.
+        sites: its running sites by name; {} until all of them run.
+        met: identities of the members that have answered.
+        links: every link as it is at present, as tables.
+        dominance: the dominance matrix that was asked for last, by site.
+        energy: V of the session.
+        events: what happened, oldest first.
+        dropped: messages that do not belong to the session, by reason.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+        self.session, self.bus, self._clock = session, bus, clock
+        self.scenario: Scenario | None = None
+        self.sites: dict[str, SiteView] = {}
+        self.met: dict[str, Info] = {}
+        self.links: dict[str, dict[str, Any]] = {}
+        self.dominance: dict[str, dict[str, float]] = {}
+        self.energy: RunningEnergy | None = None
+        self.events: Tail[Event] = Tail(EVENTS_KEPT)
+        self.dropped: Counter[str] = Counter()
+        self._planned: list[tuple[int, str, dict[str, Any]]] = []
+        self._changes: set[tuple[str, str]] = set()
+        self._query = MemberQuery(bus, clock, session)
+        self._queue = InboundQueue(clock)
+        for channel in (topics.STATE, topics.LINK, topics.EVENT):
+            bus.tap(topics.key(session, "*", channel), self._queue.take)
+
+    @property
+    def running(self) -> bool:
+        """True once every site runs."""
+        return bool(self.sites)
+
+    @property
+    def ended(self) -> bool:
+        """True once every site has said that it ends, or is silent for long."""
+        now_ns = self._clock.monotonic_ns()
+        return self.running and all(
+            site.reception.made is not None or now_ns - (site.reception.heard_ns or now_ns) > 15 * NS_PER_S
+            for site in self.sites.values()
+        )
+
+    def silent(self, site: SiteView) -> bool:
+        """True if a site has ended, or was not heard for long."""
+        heard_ns = site.reception.heard_ns
+        lately = heard_ns is None or self._clock.monotonic_ns() - heard_ns < GONE_NS
+        return site.reception.made is not None or not lately
+
+    def poll(self) -> None:
+        """Takes in what has come, and asks for what is missing."""
+        now_ns = self._clock.monotonic_ns()
+        if not self.running:
+            self._meet()
+        if not self.running:
+            return
+        for arrived in self._queue.drain(now_ns):
+            try:
+                self._take(arrived)
+            except WireError as error:
+                self.dropped[error.reason] += 1
+        for name, site in self.sites.items():
+            for channel, message, _ in site.repair.poll(now_ns, alive=not self.silent(site)):
+                self._keep(name, site, channel, message.content)
+        self._follow_timeline()
+
+    def _meet(self) -> None:
+        for info in self._query.poll():
+            self.met[info.member] = info
+            if self.scenario is None and info.scenario:
+                try:
+                    self.scenario = parse_embedded(info.scenario, info.member)
+                except ScenarioError:
+                    self.dropped["another scenario"] += 1
+        if self.scenario is None:
+            return
+        boots = {name: self.met[name].boot for name in self.scenario.names if name in self.met}
+        if len(boots) == len(self.scenario.names) and all(self.met[name].running for name in boots):
+            self._begin(self.scenario, boots)
+
+    def _begin(self, scenario: Scenario, boots: dict[str, int]) -> None:
+        windows = make_windows(scenario, scenario.names)
+        self.links, self._planned = initial_link_tables(scenario), scheduled_link_tables(scenario)
+        self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
+        self.energy = RunningEnergy(scenario, windows)
+        self.sites = {
+            name: SiteView(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name])
+            for name in scenario.names
+        }
+
+    def _take(self, arrived: InboundMessage) -> None:
+        parts = topics.parse_key(arrived.key)
+        if parts is None or (site := self.sites.get(parts.member)) is None:
+            return  # a recorder's own
+        single = parts.channel != topics.STATE
+        for payload in (arrived.payload,) if single else split_states(arrived.payload):
+            message = site.reception.read(parts.channel, payload)
+            if site.record is None and site.stats is None and parts.channel != topics.EVENT:
+                self._join(site, message.content)
+            if site.reception.take(parts.channel, message, arrived.mono_ns):
+                self._keep(parts.member, site, parts.channel, message.content)
+
+    def _join(self, site: SiteView, content: State | LinkStats | Event) -> None:
+        """Asks a site for no record from before a late first one, and for its events."""
+        tick = content.tick if isinstance(content, State | LinkStats) else 0
+        if tick / site.window.rate_hz < LATE_S:
+            return
+        site.holds_from = tick
+        for channel in (topics.STATE, topics.LINK):
+            site.reception.accounts[channel].give_up(tick)
+        site.repair.probe()
+
+    def _keep(self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event) -> None:
+        if isinstance(content, State):
+            if site.record is None or content.tick > site.record.tick:
+                site.record = content
+            site.window.take(content)
+            for text in content.cmd:
+                self._change(name, text)
+        elif isinstance(content, LinkStats):
+            site.stats = content
+        elif channel == topics.EVENT:
+            self.events.add(content)
+            if content.command:
+                self._change(name, content.command)
+
+    def _change(self, site: str, text: str) -> None:
+        """Notes a change that a site has taken in, once."""
+        if (site, text) in self._changes or self.scenario is None or self.energy is None:
+            return
+        self._changes.add((site, text))
+        try:
+            change = parse_core_change(self.scenario, site, text)
+        except ScenarioError:
+            self.dropped["no change"] += 1
+            return
+        self.energy.take_changes(site, [change])
+        table = msgspec.json.decode(text)
+        if "link" in table:
+            self.links[table["link"]] = table["to"]
+        else:
+            self.dominance[site] = table["to"]
+
+    def _follow_timeline(self) -> None:
+        """Takes the scenario's own changes of links into the tables when their time has come."""
+        newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
+        for planned in [one for one in self._planned if one[0] <= newest_ns]:
+            self._planned.remove(planned)
+            self.links[planned[1]] = planned[2]

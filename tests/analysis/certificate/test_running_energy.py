@@ -1,0 +1,65 @@
+"""V of a running session is that of `certify`, however the records come in."""
+
+import numpy as np
+import pytest
+
+from tests.analysis.certificate import runs
+from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy
+from trilat_net.analysis.record_window import make_windows
+from trilat_net.log.log_reader import Log
+
+BLOCK = 60
+
+
+def courses(log: Log, *, late: int = 0, without: frozenset[int] = frozenset()) -> list[EnergyCourse]:
+    """V of a log whose records come block by block, at its last site later; that lacks some."""
+    windows = make_windows(log.scenario, log.sites, kept_s=4.0)
+    running = RunningEnergy(log.scenario, windows)
+    found = []
+    blocks = max(len(log[site]) for site in log.sites) // BLOCK + late + 1
+    for n in range(blocks):
+        for site in log.sites:
+            first = (n - late if site == log.sites[-1] else n) * BLOCK
+            records = log[site].states[max(first, 0) : max(first + BLOCK, 0)]
+            for record in reversed(records):  # out of order
+                if site != log.sites[-1] or record.tick not in without:
+                    windows[site].take(record)
+        if (course := running.advance({site: windows[site].newest for site in log.sites})) is not None:
+            found.append(course)
+    assert running.reason == ""
+    return found
+
+
+def joined(found: list[EnergyCourse]) -> EnergyCourse:
+    return EnergyCourse(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+
+@pytest.mark.parametrize("late", [0, 7])
+def test_v_and_the_work_of_hands_and_walls_are_those_of_the_whole_log(late: int) -> None:
+    """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
+    whole = runs.run("rich").balance
+    course = joined(courses(runs.run("rich").log, late=late))
+    rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
+    assert len(set(rows.tolist())) > 0.95 * len(whole.t_s)
+    most = np.abs(whole.V).max()
+    assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * most
+    assert np.abs(course.supplied - whole.external_work[rows]).max() < 1e-10 * most
+
+
+def test_v_without_some_records_is_that_of_a_log_that_lacks_them() -> None:
+    """Records that cannot be had are passed over as `certify` passes over them."""
+    log = runs.run("rich").log
+    gap = frozenset(range(700, 760))
+    whole = runs.run("rich").balance
+    course = joined(courses(log, without=gap))
+    rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
+    far = (course.t_s < 1.3) | (course.t_s > 2.2)  # the gap and the samples of it that are in use
+    assert np.abs(course.V - whole.V[rows])[far].max() < 1e-6 * np.abs(whole.V).max()
+    assert np.isfinite(course.V).all()
+
+
+def test_a_law_without_such_a_v_says_so() -> None:
+    log = runs.run("jitter", {"duration_s": 0.3}).log
+    running = RunningEnergy(log.scenario, make_windows(log.scenario, log.sites))
+    assert "p_d" in running.reason or "law" in running.reason
+    assert running.advance(dict.fromkeys(log.sites, 100)) is None

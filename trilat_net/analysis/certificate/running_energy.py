@@ -1,0 +1,120 @@
+"""V of a session while it runs, and the work of operator and environment, from every record.
+
+Invariant: V is that of `certify` at the same instants, to rounding: the same functions over the records of a
+window that reaches back to the oldest sample in use. Nothing is estimated: a time whose records are not all
+there yet waits for them, and is passed over if they cannot be had.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.ticks import CoreChange
+from ...core.vectors import Array
+from ...scenario import Scenario
+from ..aligned import PeerTrajectory
+from ..dominance_history import DominanceHistory, evaluate_ramps, forget_ramps, list_scripted_ramps
+from ..lyapunov_weights import find_closed_groups
+from ..record_window import RecordWindow
+from .energy_balance import compute_energy_balance, derive_site_energies, find_dominance_matrices
+from .premises import check_scenario_premises, describe_closed_groups
+
+STEP_S = 0.1
+"""The least time that is computed at once, s."""
+LONGEST_STEP_S = 2.0
+"""The longest, s: what is behind by more catches up in several steps."""
+
+
+class EnergyCourse(NamedTuple):
+    """V over some instants.
+
+    Attributes:
+        t_s: instants, ticks of the fastest site, s.
+        V: the functional, J.
+        supplied: work of operator and environment since the first instant of all, J.
+    """
+
+    t_s: Array
+    V: Array
+    supplied: Array
+
+
+class RunningEnergy:
+    """V of a running session; `reason` says why there is none, "" if there is.
+
+    Args:
+        scenario: the session's scenario.
+        windows: the records of every site, as they come in.
+    """
+
+    def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
+        law = check_scenario_premises(scenario)[0]
+        self.reason = "" if law.holds else law.text
+        self._scenario, self._windows = scenario, windows
+        plans = {site: list_scripted_ramps(scenario, site) for site in windows}
+        self._start = {site: start for site, (start, _) in plans.items()}
+        self._ramps = {site: list(ramps) for site, (_, ramps) in plans.items()}
+        self._done_s: float | None = None
+        self._supplied = 0.0
+
+    def take_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
+        """Notes changes that a site took in; those of its dominance factors count."""
+        self._ramps[site] += [change.ramp for change in changes if change.ramp is not None]
+
+    def advance(self, complete: Mapping[str, int]) -> EnergyCourse | None:
+        """Returns V since the last call; None if it is not known yet.
+
+        `complete` has of every site the last tick up to which all records are there or cannot be had.
+        """
+        if self.reason or min(complete.values()) < 1:
+            return None
+        windows = self._windows
+        end_s = min(complete[site] / windows[site].rate_hz for site in windows)
+        if self._done_s is None:
+            self._done_s = max(window.first / window.rate_hz for window in windows.values())
+        if end_s - self._done_s < STEP_S:
+            return None
+        oldest_s = max(window.first / window.rate_hz for window in windows.values())
+        begin_s = max(self._done_s, oldest_s)
+        end_s = min(end_s, begin_s + LONGEST_STEP_S)
+        self._done_s = end_s
+        return self._compute(begin_s, end_s)
+
+    def _compute(self, begin_s: float, end_s: float) -> EnergyCourse | None:
+        """Returns V between two times; the first of them was there at the call before."""
+        spans = {
+            site: (int(np.ceil(begin_s * w.rate_hz - 1e-6)), int(np.floor(end_s * w.rate_hz + 1e-6)))
+            for site, w in self._windows.items()
+        }
+        if any(last - first < 1 for first, last in spans.values()):
+            return None
+        records = {site: self._windows[site].rows(*span) for site, span in spans.items()}
+        reach = {site: spans[site][0] for site in spans}
+        for own in records.values():
+            for peer, used in own.used.items():
+                reach[peer] = min(reach[peer], max(int(used.min()) - 2, 0))
+        pasts = {}
+        for site, window in self._windows.items():
+            from_tick = max(reach[site], window.first)
+            pasts[site] = PeerTrajectory(window.rows(from_tick, spans[site][1]))
+        energies = derive_site_energies(self._scenario, records, pasts, self._trace)
+        for alpha in find_dominance_matrices(energies):
+            if len(groups := find_closed_groups(alpha)) > 1:
+                names = tuple(tuple(records)[n] for n in groups[0])
+                others = tuple(tuple(records)[n] for n in groups[1])
+                self.reason = describe_closed_groups((names, others))
+                return None
+        balance = compute_energy_balance(energies)
+        for site in self._start:
+            self._start[site], self._ramps[site] = forget_ramps(
+                self._start[site], self._ramps[site], begin_s - 1.0
+            )
+        if len(balance.t_s) < 2:
+            return None
+        supplied = self._supplied + balance.external_work
+        self._supplied = float(supplied[-1])
+        return EnergyCourse(balance.t_s, balance.V, supplied)
+
+    def _trace(self, site: str, t_s: Array) -> DominanceHistory:
+        return evaluate_ramps(self._start[site], self._ramps[site], t_s, 1.0 / self._windows[site].rate_hz)

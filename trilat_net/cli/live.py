@@ -1,0 +1,95 @@
+"""`trilat live`: a session with a page that shows it and takes part, or a page of a session that runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import UsageError
+from ..reporting import terminal_output as terminal
+from . import options
+
+
+def live_command(
+    context: typer.Context,
+    scenario: options.ScenarioArgument = "paper",
+    session: Annotated[
+        str | None,
+        typer.Option("--session", metavar="ID", help="Show this running session instead of starting one."),
+    ] = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to serve the page at; others than loopback demand a token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow --host of a network, though nothing is encrypted.")
+    ] = False,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open a browser where there is one.")
+    ] = True,
+    duration: options.DurationOption = None,
+    folder: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder of the results; default: runs/NAME-N.")
+    ] = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    force: options.ForceOption = False,
+) -> None:
+    """Runs a scenario live with a page to watch and take part, until its button or Ctrl-C; then reports.
+
+    With --session it shows a session that runs already, and leaves it running.
+    """
+    from live.live_session import PageOptions, watch_with_page
+
+    from ..net.clock import SystemClock
+
+    page = PageOptions(host, port, insecure, browser)
+    page.check()
+    if session is not None:
+        alone = {"--duration", "--out", "--seed", "--set", "--force", "scenario"}
+        if extra := alone & set(options.given_options(context)):
+            raise UsageError(f"--session shows a session that runs: leave out {', '.join(sorted(extra))}")
+        connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
+        name = options.check_session_name(session)
+        code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)
+        raise typer.Exit(code)
+    if connect or router or zenoh_config:
+        raise UsageError("--connect, --router and --zenoh-config go with --session")
+    _run_session(page, scenario, folder, duration, seed, overrides, force=force)
+
+
+def _run_session(
+    page: object,
+    source: str,
+    folder: Path | None,
+    duration: float | None,
+    seed: int | None,
+    overrides: list[str] | None,
+    *,
+    force: bool,
+) -> None:
+    from live.live_session import LONGEST_S, PageOptions, attend_with_page
+    from sites.demo_session import run_demo
+    from sites.monitor import SessionDisplay
+
+    from ..files import make_results_folder
+    from ..net.clock import SystemClock
+
+    assert isinstance(page, PageOptions)
+    chosen = options.load_chosen_scenario(
+        source, overrides, LONGEST_S if duration is None else duration, seed
+    )
+    results = make_results_folder(folder, chosen.name, force=force)
+    terminal.print_text(chosen.title or chosen.name)
+    with SessionDisplay(chosen, terminal.out) as display:
+        outcome = run_demo(chosen, results, display, attend_with_page(page, SystemClock(), display.say))
+    for problem in outcome.problems:
+        terminal.print_error(problem)
+    if not outcome.log.exists():
+        raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else 1)
+    _, conclusion = terminal.conclude_files([outcome.log], results)
+    if outcome.problems or not conclusion.passed:
+        raise typer.Exit(1)
