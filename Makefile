@@ -45,6 +45,7 @@ test: pytest
 	@$(MAKE) --no-print-directory live
 
 pytest: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.compile_core
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
 
 sessions: $(VENV)/dev.stamp
