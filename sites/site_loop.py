@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
+from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.site_setup import Layout, LinkSetup
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
@@ -109,9 +110,13 @@ class StateBlock:
         self._records: list[tuple[Any, ...]] = []
 
     def add(self, output: TickRecord, *stamps: Any) -> bool:
-        """Adds a record, with the further arguments of `encode_state`; true if a block is sent after it."""
+        """Adds a record, with the further arguments of `encode_state`; true if a block is sent after it.
+
+        Whoever holds the arm gets every record at once.
+        """
         self._records.append((output, *stamps))
-        return (output.tick + 1) % self._ticks == self._turn
+        held = bool(output.hand) and HandInForce.read(output.hand).source > 0
+        return held or (output.tick + 1) % self._ticks == self._turn
 
     def flush(self) -> None:
         """Sends the records so far."""

@@ -23,9 +23,11 @@ from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_law import ImportedLaw
+from trilat_net.scenario.operators import find_live_hand
 
 from .change_server import ChangeServer
 from .external_arm import MEASUREMENTS_KEPT, ExternalArm
+from .hand_server import MESSAGES_KEPT, HandServer
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
@@ -63,6 +65,7 @@ class SiteParts:
         rings: the peers' records as they arrive.
         watchdog: steps the site under a user's law; None without one.
         arm: measurements of its external arm; None without one.
+        hand: whoever holds its arm; None without a live hand.
         publish_sample: publishes what peers need of a tick.
         states: the records that recorders have still to get.
         publish_link: publishes statistics, and keeps them.
@@ -97,6 +100,11 @@ class SiteParts:
             ring = bus.stamped(key, clock.monotonic_ns, MEASUREMENTS_KEPT)
             place = " at ".join([key, *map(str, options.connection.places[:1])])
             self.arm = ExternalArm(self.site, ring, clock, self.stats.dropped, place)
+        self.hand: HandServer | None = None
+        if (live := find_live_hand(scenario.sites[name].hands)) is not None:
+            inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
+            meets = (scenario.arms[name], inbox, self.stats.dropped, lambda: self.site.q)
+            self.hand = HandServer(name, self.site.rate_hz, live, *meets)
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))

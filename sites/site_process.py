@@ -189,18 +189,22 @@ class RunningSite:
         """See `LoopIO`."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
+        hand = () if parts.hand is None else parts.hand.take(k)
         try:
-            return self._step(TickInput(k, arrivals, parts.changes.take(k), measured))
+            return self._step(TickInput(k, arrivals, parts.changes.take(k), measured, hand))
         except LawFailed as failed:
             self._failure = failed
             return None
 
     def attend(self, k: int, t_ns: int) -> None:
-        """See `LoopIO`: answers queries, follows the leader's grid, and publishes who is gone."""
+        """See `LoopIO`: answers queries, follows the leader's grid, publishes who is gone, who holds."""
         self._publisher.update(ticks=k + 1)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
         self._parts.monitor.watch(self._publisher, t_ns)
+        for news in () if self._parts.hand is None else self._parts.hand.take_news():
+            self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
+            self._parts.say(news.text.partition(": ")[2])
 
     def report(self, output: TickRecord) -> None:
         """See `LoopIO`."""

@@ -22,7 +22,7 @@ from trilat_net.analysis.metrics import impedance, motion_metrics, static_window
 from trilat_net.core import delay, link, ticks, user_law
 from trilat_net.execution import difference
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
-from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
+from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve, scenario_reader
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.sweep import cell_result, live_confirmation, margin_search, sweep_plan, sweep_run
@@ -61,7 +61,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
     ("external-arm.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
     ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
-    ("external-arm.md", "older than 0.1 s", 0.1, arm_port.FRESH_NS / 1e9),
+    ("external-arm.md", "older than 0.1 s", 0.1, site_port.FRESH_NS / 1e9),
     ("fair-comparison.md", "`--budget`, 64 per law", 64, tuning_plan.DEFAULT_BUDGET),
     ("fair-comparison.md", "steps of 12, 8, 5, 3 %", 3, 100 * pareto_search.REFINEMENT_STEPS[-1]),
     ("fair-comparison.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 from . import deprecated
 
 if TYPE_CHECKING:
+    from sites.hand_session import hand
+
     from .api import simulate
     from .core.compiled_law import compiled
     from .execution.rerun import rerun
@@ -27,13 +29,25 @@ if TYPE_CHECKING:
     from .studies.trials.trial_runner import check
     from .theory.end_pose import certify_with_roots as certify
 
-__all__ = ["certify", "check", "compiled", "figure", "open_log", "rerun", "simulate", "trials", "verify"]
+__all__ = [
+    "certify",
+    "check",
+    "compiled",
+    "figure",
+    "hand",
+    "open_log",
+    "rerun",
+    "simulate",
+    "trials",
+    "verify",
+]
 
 _MODULES = {
     "certify": "theory.end_pose:certify_with_roots",
     "check": "studies.trials.trial_runner",
     "compiled": "core.compiled_law",
     "figure": "reporting.figures.registry",
+    "hand": "sites.hand_session",
     "open_log": "log.log_reader",
     "rerun": "execution.rerun",
     "trials": "studies.trials.trial",
@@ -47,5 +61,6 @@ def __getattr__(name: str) -> Any:
     """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
     if name in __all__:
         module, _, attribute = _MODULES.get(name, "api").partition(":")
-        return getattr(import_module(f".{module}", __name__), attribute or name)
+        place = module if module.startswith("sites.") else f"{__name__}.{module}"
+        return getattr(import_module(place), attribute or name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

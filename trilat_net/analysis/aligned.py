@@ -44,6 +44,7 @@ class AlignedRecords(NamedTuple):
         x, xd: in task space the end effector's place or pose and its derivative, shape (K, m); else empty.
         wrench: what tau_x amounts to there, likewise.
         axes: see `SiteLog`.
+        hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
     """
 
     site: str
@@ -63,6 +64,7 @@ class AlignedRecords(NamedTuple):
     xd: Array = _NONE
     wrench: Array = _NONE
     axes: tuple[float, ...] = ()
+    hand: Array = _NONE
 
     @property
     def shared(self) -> Array:
@@ -149,6 +151,7 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
     """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
     names = (*RECORD_COLUMNS, *(_TASK_COLUMNS if part.layout.task else ()))
+    names += ("hand",) if part.layout.hand else ()
     part.prepare(*names)
     tick = part.tick[rows]
     first = int(tick[0])

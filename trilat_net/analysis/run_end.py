@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core.exogenous import LIVE_KINDS
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -277,6 +278,8 @@ def trace_log(log: Log) -> RunTrace:
     parts = [log[site] for site in log.sites]
     recorded = [part for part in parts if len(part)]
     outside = [part for part in recorded if part.name in log.scenario.external]
+    pushed = [(part.t_s, part.tau_x.any(axis=1)) for part in outside]
+    pushed += [(part.t_s, part.hand[:, 0] > 0.0) for part in recorded if part.layout.hand]
     return RunTrace(
         [
             reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, NO_BUCKETS)
@@ -284,7 +287,7 @@ def trace_log(log: Log) -> RunTrace:
         ],
         [part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
         first_divergence_s(log),
-        max((float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)) for part in outside), default=0.0),
+        max((float(t_s[rows].max(initial=0.0)) for t_s, rows in pushed), default=0.0),
         max((tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)), default=0.0),
     )
 
@@ -508,7 +511,7 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
     for spec in scenario.sites.values():
-        for source in (hand.actor for hand in spec.hands):
+        for source in (one.actor for one in spec.hands if one.actor.acts not in LIVE_KINDS):
             script = compute_operator_script(source, t_s, np.eye(len(source.a)))
             changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
             edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]

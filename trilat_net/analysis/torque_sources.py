@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import LIVE_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.vectors import Array
 from ..scenario import Scenario, SiteSpec
 from ..scenario.operators import ActorBase
@@ -85,6 +85,23 @@ def compute_source_torque(
     return np.where(there[:, None], pushed, 0.0)
 
 
+def compute_live_torque(
+    source: TorqueSource, hand: Array, q: Array, qd: Array, end_effector: EndEffectorRows
+) -> Array:
+    """Returns the torque of a live hand ON the arm, shape (K, n), N m, by the `hand` of its records."""
+    size = (hand.shape[1] - 3) // 2
+    target, rate = hand[:, 3 : 3 + size], hand[:, 3 + size :]
+    at_joints = source.acts is TorqueKind.LIVE_JOINT
+    at, speed = (q, qd) if at_joints else (end_effector.at, end_effector.speed)
+    pull = target
+    if source.acts is not TorqueKind.LIVE_FORCE:
+        pull = np.array(source.K) * (target - at) + np.array(source.B) * (rate - speed)
+    norm = np.linalg.norm(pull, axis=1)
+    share = hand[:, 0] * np.where(norm > source.limit, source.limit / np.maximum(norm, source.limit), 1.0)
+    effort: Array = share[:, None] * pull
+    return effort if at_joints else np.einsum("kij,ki->kj", end_effector.J, effort)
+
+
 class TorqueSplit(NamedTuple):
     """The torque ON an arm over its rows, shape (K, n) each, N m; its stops are part of the arm.
 
@@ -122,7 +139,11 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
         total = np.zeros_like(records.q)
         for source in (one.actor for one in sources if one.actor.sampled is sampled):
-            total = total + compute_source_torque(source, t_s, records.q, records.qd, end_effector)
+            if source.acts in LIVE_KINDS:
+                torque = compute_live_torque(source, records.hand, records.q, records.qd, end_effector)
+            else:
+                torque = compute_source_torque(source, t_s, records.q, records.qd, end_effector)
+            total = total + torque
         return total
 
     now, held = add(spec.environment, sampled=False), add(spec.environment, sampled=True)
@@ -169,6 +190,11 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     split, t_s, spec = split_torque(records, scenario), records.nominal_s, scenario.sites[records.site]
     expected, scripts = np.zeros_like(records.q), np.zeros_like(records.q)
     for source in (one.actor for one in spec.hands):
+        if source.acts in LIVE_KINDS:
+            at_start = np.broadcast_to(records.q[0], records.q.shape)
+            still = build_arm_rows(scenario, records.site).place_end_effector(at_start, 0.0 * at_start)
+            scripts = scripts + compute_live_torque(source, records.hand, at_start, 0.0 * at_start, still)
+            continue
         script = compute_operator_script(source, t_s, split.end_effector.J[0])
         scripts = scripts + script
         if source.acts in SCRIPTED_KINDS:

@@ -28,7 +28,8 @@ class TorqueKind(IntEnum):
     target that moves along a minimum-jerk path, of the joints or of the end effector. RECORDED is torque by a
     table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-space, and never
     pulls. CHIRP is a sine whose frequency rises or falls in straight lines, again and again. MULTISINE is a
-    sum of sines of one amplitude.
+    sum of sines of one amplitude. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that
+    somebody moves while the run goes on, LIVE_FORCE is a force that somebody sets, see `live_hand`.
     """
 
     PULSE = 0
@@ -39,10 +40,15 @@ class TorqueKind(IntEnum):
     WALL = 5
     CHIRP = 6
     MULTISINE = 7
+    LIVE_TIP = 8
+    LIVE_FORCE = 9
+    LIVE_JOINT = 10
 
 
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
 """The kinds whose torque is a function of time alone."""
+LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
+"""The kinds that act only while somebody takes hold: they come last."""
 
 
 class TorqueSource(NamedTuple):
@@ -63,6 +69,9 @@ class TorqueSource(NamedTuple):
         sampled: true: evaluated once a tick and held.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n). MULTISINE:
             rows of frequency, Hz, phase at the start in turns, and columns that are not used.
+        limit: of a live hand: the largest norm of its force, N, or torque, N m.
+        grip: of a live hand: how much of its force acts, 0 to 1. Its `a` is its target, or its force, and its
+            `b` where the target would be a second later.
     """
 
     acts: TorqueKind
@@ -76,9 +85,12 @@ class TorqueSource(NamedTuple):
     B: tuple[float, ...] = ()
     sampled: bool = False
     table: Array | None = None
+    limit: float = math.inf
+    grip: float = 0.0
 
 
-_TIMES, _NUMBERS = ("start_s", "end_s", "move_start_s", "move_end_s"), ("a", "b", "K", "B")
+_SCALARS = ("start_s", "end_s", "move_start_s", "move_end_s", "limit", "grip")
+_NUMBERS = ("a", "b", "K", "B")
 
 
 @cache
@@ -86,7 +98,7 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     """Returns the layout of operators and environments whose vectors have up to so many numbers."""
     fields = [
         *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count")),
-        *((name, "f8") for name in _TIMES),
+        *((name, "f8") for name in _SCALARS),
         *((name, "f8", (width,)) for name in _NUMBERS),
     ]
     return np.dtype((np.record, fields))
@@ -100,6 +112,7 @@ SourceTorque = tuple[float, float, float]
 _PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
 _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
 _CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
+_LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 
 
 def torque_source_rows(
@@ -114,7 +127,7 @@ def torque_source_rows(
     first = 0
     row: Row
     for row, actor in zip(rows, actors, strict=True):
-        for name in _TIMES:
+        for name in _SCALARS:
             row[name] = getattr(actor, name)
         for name in _NUMBERS:
             row[name][: len(getattr(actor, name))] = getattr(actor, name)
@@ -152,12 +165,33 @@ def _spring_along(actor: Row, i: int, progress: float, rate: float, at: float, s
 
 
 @leaf
+def _target_progress(actor: Row, t_s: float) -> Pair:
+    """Returns how far a target has moved from `a` to `b`, and its rate, 1/s."""
+    if actor.acts >= _LIVE_TIP:
+        return 0.0, 1.0
+    return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+
+
+@leaf
+def _live_share(actor: Row, square: float) -> float:
+    """Returns the factor of a live hand's force, whose square is given: its grip, within its limit."""
+    share: float = actor.grip
+    if square > actor.limit * actor.limit:
+        share *= actor.limit / math.sqrt(square)
+    return share
+
+
+@leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
-    return (
-        _spring_along(actor, 0, progress, rate, at[0], speed[0]),
-        _spring_along(actor, 1, progress, rate, at[1], speed[1]),
-    )
+    progress, rate = _target_progress(actor, t_s)
+    x = _spring_along(actor, 0, progress, rate, at[0], speed[0])
+    y = _spring_along(actor, 1, progress, rate, at[1], speed[1])
+    if actor.acts < _LIVE_TIP:
+        return x, y
+    if actor.acts == _LIVE_FORCE:
+        x, y = actor.a[0], actor.a[1]
+    share = _live_share(actor, x * x + y * y)
+    return share * x, share * y
 
 
 @leaf
@@ -234,6 +268,12 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 
 @leaf
+def _is_at_end_effector(actor: Row) -> bool:
+    acts: int = actor.acts
+    return acts in (_TASK_HAND, _WALL, _LIVE_TIP, _LIVE_FORCE)
+
+
+@leaf
 def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> SourceTorque:
     """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a wall."""
     _, at = forward_kinematics(lengths, q)
@@ -255,13 +295,13 @@ def source_torque(
     """Returns the torque of one actor ON the planar arm at time t."""
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
-    if actor.acts == _HAND:
+    if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
         torque = _spring_force(actor, t_s, q, qd)
     elif actor.acts == _VISCOUS:
         torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
     elif actor.acts == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
-    elif actor.acts == _TASK_HAND or actor.acts == _WALL:
+    elif _is_at_end_effector(actor):
         return _end_effector_torque(actor, t_s, q, qd, lengths)
     else:
         size = _scripted_size(actor, t_s, table)
@@ -294,13 +334,17 @@ def torque_on_arm(
 @leaf
 def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three) -> Three:
     """Returns the force of a spring or a wall on an end effector in three dimensions, N."""
-    if actor.acts == _TASK_HAND:
-        progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
-        return (
-            _spring_along(actor, 0, progress, rate, at[0], speed[0]),
-            _spring_along(actor, 1, progress, rate, at[1], speed[1]),
-            _spring_along(actor, 2, progress, rate, at[2], speed[2]),
-        )
+    if actor.acts != _WALL:
+        progress, rate = _target_progress(actor, t_s)
+        x = _spring_along(actor, 0, progress, rate, at[0], speed[0])
+        y = _spring_along(actor, 1, progress, rate, at[1], speed[1])
+        z = _spring_along(actor, 2, progress, rate, at[2], speed[2])
+        if actor.acts == _TASK_HAND:
+            return x, y, z
+        if actor.acts == _LIVE_FORCE:
+            x, y, z = three(actor.a)
+        share = _live_share(actor, x * x + y * y + z * z)
+        return share * x, share * y, share * z
     normal, point = three(actor.b), three(actor.a)
     depth = dot(point, normal) - dot(at, normal)
     if not depth > 0.0:
@@ -314,10 +358,16 @@ def _add_joint_torque(
     actor: Row, t_s: float, q: Vector, qd: Vector, joints: int, table: TorqueTable, torque: Array
 ) -> None:
     """Adds the torque of an actor that acts on the joints themselves."""
-    if actor.acts == _HAND:
-        progress, rate = minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+    if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
+        progress, rate = _target_progress(actor, t_s)
+        share, square = 1.0, 0.0
+        if actor.acts == _LIVE_JOINT:
+            for i in range(joints):
+                pull = _spring_along(actor, i, progress, rate, q[i], qd[i])
+                square += pull * pull
+            share = _live_share(actor, square)
         for i in range(joints):
-            torque[i] += _spring_along(actor, i, progress, rate, q[i], qd[i])
+            torque[i] += share * _spring_along(actor, i, progress, rate, q[i], qd[i])
     elif actor.acts == _VISCOUS:
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
@@ -368,7 +418,7 @@ def put_torque_on_chain(
         actor: Row = actors[m]
         if actor.sampled != sampled or not actor.start_s <= t_s < actor.end_s:
             continue
-        if actor.acts != _TASK_HAND and actor.acts != _WALL:
+        if not _is_at_end_effector(actor):
             _add_joint_torque(actor, t_s, q, qd, n, table, torque)
             continue
         if not placed:

@@ -4,14 +4,16 @@ Invariant: nothing else influences a site's numbers.
 """
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 from itertools import accumulate
 from typing import NamedTuple
 
 from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
-from .exogenous import TorqueSource
+from .exogenous import LIVE_KINDS, TorqueKind, TorqueSource
 from .law_channel import LawChannel, SentVector, join_received
+from .live_hand import hand_numbers
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
 from .user_law import LawContext, UserLawFactory
@@ -106,6 +108,7 @@ class Layout(NamedTuple):
         chain: true: the arm is a chain of joints, else the planar two-link arm.
         task: true: the coordinates are those of the end effector, else the joint angles.
         sent: numbers that the law sends in a record, see `LawChannel.floats`.
+        hand: numbers that a live hand has in a record, see `live_hand`; 0: the site has none.
     """
 
     joints: int = JOINTS
@@ -114,27 +117,34 @@ class Layout(NamedTuple):
     chain: bool = False
     task: bool = False
     sent: int = 0
+    hand: int = 0
 
     @classmethod
-    def of_arm(cls, chain: "ChainSetup | None", sent: int = 0) -> "Layout":
+    def of_arm(
+        cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
+    ) -> "Layout":
         """Returns the layout of a chain, or without one of the planar two-link arm; its law sends so much."""
+        n = JOINTS if chain is None else len(chain.joints)
+        live = next((actor.acts for actor in actors if actor.acts in LIVE_KINDS), None)
+        size = n if live is TorqueKind.LIVE_JOINT else 2 if chain is None else 3
+        hand = 0 if live is None else hand_numbers(size)
         if chain is None:
-            return cls(sent=sent)
-        n = len(chain.joints)
+            return cls(sent=sent, hand=hand)
         task = chain.task
         shared = n if task is None else len(task.axes)
-        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None, sent)
+        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None, sent, hand)
 
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
         n, m = self.joints, self.shared
         vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
         shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
-        return {**vectors, "theta_hat": self.parameters, **shared, **({"ch": self.sent} if self.sent else {})}
+        others = {name: count for name, count in (("ch", self.sent), ("hand", self.hand)) if count}
+        return {**vectors, "theta_hat": self.parameters, **shared, **others}
 
     def columns(self) -> dict[str, slice]:
-        """Returns where the vectors of a record stand in its row of floats, in their order."""
-        lengths = self.lengths()
+        """Returns where the vectors that a tick computes stand in its row of floats, in their order."""
+        lengths = {name: count for name, count in self.lengths().items() if name != "hand"}
         ends = accumulate(lengths.values())
         return {
             name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
@@ -272,7 +282,7 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain, self.channel.floats)
+        return Layout.of_arm(self.chain, self.channel.floats, self.actors)
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:

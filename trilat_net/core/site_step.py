@@ -16,8 +16,10 @@ import numpy as np
 from .channel import LOST
 from .compiled_law import plug_law
 from .delay import DelayKind
+from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
+from .live_hand import HandInForce, free_hand
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
@@ -73,6 +75,8 @@ class Site:
             self._law.bind()  # compiled now, and not within the time that the law has for a tick
             self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
             self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
+        live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
+        self._hand = self._arrays.actors[live[0]] if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
@@ -109,6 +113,7 @@ class Site:
             s: Row = self._site[0]
             s.q, s.qd = tick.measured.q, tick.measured.qd
             s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
+        hand = self._take_hand(tick.hand)
         t_ns = tick.k * NS_PER_S // self.rate_hz
         memory: list[float] = []
         if self._law is None:
@@ -140,7 +145,27 @@ class Site:
             [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
             *(row[column] for column in task),
         )
-        return record._replace(ch=self._sent.tolist()) if self._sends else record
+        if self._sends:
+            record = record._replace(ch=self._sent.tolist())
+        return record._replace(hand=hand) if hand else record
+
+    @property
+    def q(self) -> list[float]:
+        """Joint angles at the next tick, rad."""
+        angles: list[float] = self._site[0]["q"][: self.layout.joints].tolist()
+        return angles
+
+    def _take_hand(self, vector: Sequence[float]) -> list[float]:
+        """Puts what a live hand does into its row; returns it as a record has it, [] if there is none."""
+        row = self._hand
+        if row is None:
+            return []
+        size = (self.layout.hand - 3) // 2
+        taken = list(vector) or free_hand(size)
+        hand = HandInForce.read(taken)
+        row["grip"], row["a"][:size] = hand.grip, hand.target
+        row["b"][:size] = [x + v for x, v in zip(hand.target, hand.rate, strict=True)]
+        return taken
 
     def _crc(self, packed: int, arrivals: int) -> int:
         """Returns `TickRecord.rx_crc`."""
@@ -195,6 +220,7 @@ class Site:
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
         self._sent[:] = last.ch or 0.0
+        self._take_hand(last.hand)
         if self._law is not None:
             self._law.recall(last.mem[held + 1 :])
         resume_stages(last.tick, self._arrays)

@@ -125,12 +125,14 @@ class TickInput(NamedTuple):
         arrivals: the samples since the tick before, in order.
         commands: the changes ordered since then.
         measured: the present state of an external plant; None: unchanged.
+        hand: what a live hand does in this tick, see `live_hand.free_hand`; empty: nobody holds the arm.
     """
 
     k: int
     arrivals: Sequence[Arrival] = ()
     commands: Sequence[CoreChange] = ()
     measured: PlantState | None = None
+    hand: Sequence[float] = ()
 
 
 class TickRecord(NamedTuple):
@@ -159,6 +161,7 @@ class TickRecord(NamedTuple):
         xd: its derivative, m/s and rad/s.
         wrench: what tau_x amounts to there, N and N m.
         ch: what the site's law sends besides, see `LawChannel`.
+        hand: what a live hand does in this tick, see `live_hand`; empty if the site has none.
     """
 
     tick: int
@@ -179,6 +182,7 @@ class TickRecord(NamedTuple):
     xd: Sequence[float] = ()
     wrench: Sequence[float] = ()
     ch: Sequence[float] = ()
+    hand: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Returns the motion and the exogenous torque that peers get, in the coordinates that sites share."""

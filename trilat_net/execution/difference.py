@@ -56,7 +56,11 @@ def _equal_lists(a: Sequence[float], b: Sequence[float], equal: NumberEquality) 
 
 def _pack(a: State | TickRecord) -> bytes:
     return array(
-        "d", [*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat, *a.x, *a.xd, *a.wrench, *a.ch]
+        "d",
+        [
+            *(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat),
+            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand),
+        ],
     ).tobytes()
 
 

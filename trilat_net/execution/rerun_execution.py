@@ -22,7 +22,14 @@ from ..net.wire import encode_state
 from ..scenario import Scenario
 from .difference import RecordDifference, equal_bits, equal_record, find_first_difference
 from .rerun_request import RerunRequest
-from .resumption import ArrivalEntry, ReceivedMotion, RecordedInputs, make_arrival, read_output
+from .resumption import (
+    ArrivalEntry,
+    ReceivedMotion,
+    RecordedInputs,
+    find_recorded_hand,
+    make_arrival,
+    read_output,
+)
 from .verify import PROGRESS_EVERY
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
@@ -129,7 +136,9 @@ class RerunSite:
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)
         changes = [change for _, change in self._inputs.take_changes(self.k)]
-        output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes))
+        fits = self._site.layout.hand == self._part.layout.hand
+        hand = find_recorded_hand(self._part, self.t_ns) if fits else ()
+        output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes, hand=hand))
         stats = self._stats.take(output) if self._stats.due(self.k) else None
         same = False
         if n is not None:

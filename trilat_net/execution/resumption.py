@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from ..core.delay import MAX_DELAY_US
 from ..core.site_setup import LinkSetup
 from ..core.site_step import Site
@@ -51,6 +53,7 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
         state.xd,
         state.wrench,
         state.ch,
+        state.hand,
     )
 
 
@@ -67,6 +70,13 @@ def take_parts(arrivals: Sequence[Arrival], links: Sequence[LinkSetup]) -> list[
         one._replace(ch=links[one.peer].channel.part(one.ch, links[one.peer].place)) if one.ch else one
         for one in arrivals
     ]
+
+
+def find_recorded_hand(part: SiteLog, t_ns: int) -> list[float]:
+    """Returns what a live hand did at a time, by the latest record until then; [] without a live hand."""
+    place = int(np.searchsorted(part.t_ns, t_ns, side="right")) - 1 if part.layout.hand else -1
+    found: list[float] = part.hand[place].tolist() if place >= 0 else []
+    return found
 
 
 class RecordedInputs(Generic[Change]):

@@ -215,7 +215,7 @@ class SiteVerifier:
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
         plant = PlantState(state.q, state.qd, state.tau_x) if self._external else None
-        output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant))
+        output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant, state.hand))
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
         difference = invalid_change or invalid or difference

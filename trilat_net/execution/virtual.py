@@ -43,6 +43,8 @@ ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
 """Per site and tick the changes that take effect then."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
 """Per site with an external arm, and per tick, the measured state of that arm."""
+HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
+"""Per site with a live hand what that does at a tick of the site, which is about to make it."""
 
 
 def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
@@ -67,12 +69,13 @@ def execute_virtual(
     commands: ChangeSchedule = {},  # noqa: B006
     measured: PlantSchedule = {},  # noqa: B006
     ends: Mapping[str, int] = {},
+    hands: HandTracks = {},  # noqa: B006
 ) -> Iterator[SiteTick]:
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
     A site whose network is not ready lets the others go first; by default every sample arrives at the next
     tick. A run that diverges ends with the ticks of that instant. `ends` holds the last tick of sites that
-    make fewer than the scenario has.
+    make fewer than the scenario has. Live hands do what `hands` says; else nobody holds an arm.
 
     Raises:
         ScenarioError: an arm is external and `measured` lacks it.
@@ -94,7 +97,8 @@ def execute_virtual(
         site = sites[index]
         arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
         ordered, arm = commands.get(site.name, {}), measured.get(site.name, {})
-        output = site.step(TickInput(k, arrivals, ordered.get(k, ()), arm.get(k)))
+        hand = hands[site.name](site, k) if site.name in hands else ()
+        output = site.step(TickInput(k, arrivals, ordered.get(k, ()), arm.get(k), hand))
         joined.send(site.name, output)
         yield SiteTick(site, arrivals, output)
         if output.mode is Mode.DIVERGED:
@@ -134,12 +138,13 @@ def write_virtual_log(
     views_hz: float = 0.0,
     *,
     as_named: bool = True,
+    hands: HandTracks = {},  # noqa: B006
 ) -> bool:
     """Runs a scenario in virtual time and writes its log, which is finished however the run ends.
 
     The stream stays open. Once `stopped` is True the run ends, and the file is finished with what there is.
-    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network` is as for
-    `execute_virtual`, `as_named` as for `check_virtual`.
+    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network` and `hands`
+    are as for `execute_virtual`, `as_named` as for `check_virtual`.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.
@@ -156,7 +161,7 @@ def write_virtual_log(
     t_ns = 0
     try:
         with process.pause_gc():
-            for site, arrivals, output in execute_virtual(scenario, network):
+            for site, arrivals, output in execute_virtual(scenario, network, hands=hands):
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
                 members[site.name].tick(arrivals, output)
@@ -201,9 +206,14 @@ def record_virtual(
         return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz)
 
 
-def simulate_scenario(scenario: Scenario, *, as_named: bool = True) -> Log:
+def simulate_scenario(
+    scenario: Scenario,
+    *,
+    as_named: bool = True,
+    hands: HandTracks = {},  # noqa: B006
+) -> Log:
     """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
-    return open_in_memory(lambda stream: write_virtual_log(scenario, stream, as_named=as_named))
+    return open_in_memory(lambda stream: write_virtual_log(scenario, stream, as_named=as_named, hands=hands))
 
 
 def open_in_memory(write: Callable[[io.BytesIO], object]) -> Log:

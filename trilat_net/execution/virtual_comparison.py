@@ -6,6 +6,7 @@ time equals it until the first sample arrives after its due tick, or is lost on 
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -17,6 +18,7 @@ from ..core.ticks import NS_PER_S, PlantState, TickRecord
 from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
 from .difference import (
@@ -26,7 +28,7 @@ from .difference import (
     equal_record,
     find_first_difference,
 )
-from .resumption import ArrivalEntry
+from .resumption import ArrivalEntry, find_recorded_hand
 from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 
@@ -156,9 +158,10 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     }
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}
+        hands = {name: partial(_recorded_hand, log[name]) for name in scenario.names}
 
         def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
-            ticks = virtual.execute_virtual(scenario, network, ordered, arms, log.last_ticks)
+            ticks = virtual.execute_virtual(scenario, network, ordered, arms, log.last_ticks, hands)
             for n, (site, _, output) in enumerate(ticks):
                 if progress is not None and n % 256 == 0:
                     progress(before + n, total)
@@ -171,6 +174,10 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
         else:
             plain = compare_records(log, execute(None, total // 2), arrivals=False)
         return VirtualComparison(fed, plain, find_absent_samples(log))
+
+
+def _recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
+    return find_recorded_hand(part, k * NS_PER_S // site.rate_hz)
 
 
 def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:

@@ -126,7 +126,7 @@ def request_change(
         connection, clock, session, names, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
     ) as bus:
         assert bus is not None  # nothing stops it
-        info = _find_site(bus, clock, session, site, names)
+        info = find_site_info(bus, clock, session, site, names)
         if not info.running:
             raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
         replies = bus.ask(topics.key(session, site, topics.SET), encode(request))
@@ -141,7 +141,12 @@ def request_change(
     raise SessionError(f"{site} gave no answer; its records show whether it made the change")
 
 
-def _find_site(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
+def find_site_info(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
+    """Returns the identity of a site of a session.
+
+    Raises:
+        SessionError: the session has no such site, or it does not answer in time.
+    """
     for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
         if info.member == site:
             return info

@@ -68,6 +68,9 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         xd: their derivatives.
         wrench: exogenous torque in those coordinates.
         ch: what the site's law sends besides, see `core.law_channel`; left out if it sends nothing.
+        hand: what somebody who holds the arm does: grip from 0 to 1, number of the newest message (-1
+            without), who holds it (0: nobody), target, its velocity, see `core.live_hand`; left out without
+            a live hand.
     """
 
     v: int
@@ -96,6 +99,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     xd: list[float] = []
     wrench: list[float] = []
     ch: list[float] = []
+    hand: list[float] = []
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -186,7 +190,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         member: who says it: a site, or "recorder".
         boot: the sender's process start.
         kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
-            "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm".
+            "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
@@ -306,7 +310,7 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 TASK_VECTORS = ("x", "xd", "wrench")
-STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch")
+STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand")
 """The vectors of a record; their lengths are those of the site's `Layout`."""
 
 

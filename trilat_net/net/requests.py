@@ -1,14 +1,15 @@
-"""Messages between two parties: pings, change requests, backfill, and measurements of an external arm.
+"""Messages between two parties: pings, changes, backfill, measurements of an external arm, live hands.
 
 Invariant: none of these is logged. Their effects are: a change as an event, a backfilled message as
-itself, a measurement as q and qd of the record of the tick that used it. A site uses the newest
-measurement at each tick.
+itself, a measurement as q and qd of the record of the tick that used it, a hand as `hand` of the records of
+the ticks in which it acts. A site uses the newest measurement at each tick, and the newest goal of a hand.
 """
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta
 
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
@@ -110,3 +111,26 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
         """Refuses a torque that is not one finite number per joint."""
         if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
             raise ValueError(f"tau_x must be {len(self.q)} finite numbers, as q is")
+
+
+class HandMessage(Request, frozen=True, kw_only=True):
+    """What somebody who holds an arm wants: sent when it changes, and again before `SILENCE_NS` is over.
+
+    Attributes:
+        boot: the hand, random and above 0: an arm is held by one of them.
+        source: who it is, for people.
+        n: number of its goal, from 0; the same again says that nothing has changed.
+        grip: false: it lets go.
+        target: where the end effector is to go, m, or the joints, rad; empty for a hand that pushes.
+        force: the force ON the end effector, N; empty for any other hand.
+        sent_ns: time of sending, ns of the program's own monotonic clock.
+    """
+
+    site: str
+    boot: Annotated[int, Meta(ge=1, lt=2**32)]
+    source: Annotated[str, Meta(max_length=64)] = ""
+    n: TickNumber
+    grip: bool = True
+    target: list[float] = []
+    force: list[float] = []
+    sent_ns: Instant

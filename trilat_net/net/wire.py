@@ -29,7 +29,7 @@ from .messages import (
     RecorderStats,
     State,
 )
-from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, Request
+from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, HandMessage, Request
 
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
@@ -52,6 +52,8 @@ def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
         return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:
         return dict.fromkeys(("q", "qd", "tau_x"), layout.shared) | {"ch": layout.sent}
+    if kind is HandMessage:
+        return dict.fromkeys(("target", "force"), 0)  # its receiver knows which of them it takes
     return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
 
 
@@ -74,8 +76,8 @@ def encode_state(
         WireError: a number is not finite.
     """
     (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *task) = output
-    x, xd, wrench, ch = task
-    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench, *ch]
+    x, xd, wrench, ch, hand = task
+    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench, *ch, *hand]
     # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
     if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
         raise WireError("not finite", f"{site} at tick {tick}")
@@ -107,6 +109,8 @@ def encode_state(
         fields |= {"x": x, "xd": xd, "wrench": wrench}
     if ch:
         fields["ch"] = ch
+    if hand:
+        fields["hand"] = hand
     return _encode(fields)
 
 
@@ -218,7 +222,7 @@ def make_decoder(
             if not _isfinite(sum(map(sum, vectors))):
                 for name, vector in zip(names, vectors, strict=True):
                     if not all(map(_isfinite, vector)):
-                        number = message.n if kind is ArmMeasurement else message.tick
+                        number = message.n if kind in (ArmMeasurement, HandMessage) else message.tick
                         raise WireError("not finite", f"{name} of {message.site} at {number}")
         return message
 

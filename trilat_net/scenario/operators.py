@@ -7,8 +7,8 @@ own key.
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any, NamedTuple, get_args
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from ..core.chain import MAX_JOINTS
 from ..core.exogenous import TorqueKind, TorqueSource
+from ..core.live_hand import HandRules
 from ..errors import ScenarioError
 from .distributions import Draws
 from .fields import (
@@ -198,6 +199,64 @@ class Multisine(ActorBase, frozen=True, tag="multisine"):
         return TorqueSource(TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table)
 
 
+class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
+    """An operator who takes hold while a live session runs, with a mouse, a device or a program.
+
+    Nobody holds the arm before, and in virtual time nobody ever does, unless a log says so. Its force is
+    computed once a tick and held. One that pushes ("force") sets a force itself: its work is of first order
+    in the period, as nothing but the arm resists it.
+
+    Attributes:
+        mode: "tip": a spring at the end effector, "joint": a spring at every joint, both towards a target
+            that somebody moves; "force": a force at the end effector that somebody sets.
+        stiffness_n_m: of "tip", along each axis, N/m.
+        damping_n_s_m: of "tip", along each axis, N s/m.
+        force_limit_n: of "tip" and "force", the largest force, N.
+        speed_limit_m_s: of "tip", the largest speed of the target, m/s.
+        stiffness_nm_rad: of "joint", per joint, N m/rad.
+        damping_nm_s_rad: of "joint", per joint, N m s/rad.
+        torque_limit_nm: of "joint", the largest norm of its torques, N m.
+        speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
+    """
+
+    mode: Literal["tip", "joint", "force"] = "tip"
+    stiffness_n_m: NotNegativeAxes = (300.0,)
+    damping_n_s_m: NotNegativeAxes = (20.0,)
+    force_limit_n: Positive = 40.0
+    speed_limit_m_s: Positive = 1.5
+    stiffness_nm_rad: NotNegativeJoints = (40.0,)
+    damping_nm_s_rad: NotNegativeJoints = (3.0,)
+    torque_limit_nm: Positive = 20.0
+    speed_limit_rad_s: Positive = 4.0
+
+    def rules(self, rate_hz: int, counts: VectorCounts) -> HandRules:
+        """Returns what somebody who holds an arm of such vectors may do."""
+        if self.mode == "joint":
+            return HandRules(counts.joints, rate_hz, self.speed_limit_rad_s)
+        pushes = self.mode == "force"
+        return HandRules(counts.axes, rate_hz, math.inf if pushes else self.speed_limit_m_s, not pushes)
+
+    def _source(self) -> TorqueSource:
+        stiffness, damping, limit = self.stiffness_n_m, self.damping_n_s_m, self.force_limit_n
+        if self.mode == "joint":
+            stiffness, damping, limit = self.stiffness_nm_rad, self.damping_nm_s_rad, self.torque_limit_nm
+        kind = TorqueKind[f"LIVE_{self.mode.upper()}"]
+        return TorqueSource(kind, K=stiffness, B=damping, limit=limit, sampled=True)
+
+
+LIVE_KEYS = {
+    "tip": ("stiffness_n_m", "damping_n_s_m", "force_limit_n", "speed_limit_m_s"),
+    "joint": ("stiffness_nm_rad", "damping_nm_s_rad", "torque_limit_nm", "speed_limit_rad_s"),
+    "force": ("force_limit_n",),
+}
+"""The keys of a live hand by its mode."""
+
+
+def find_live_hand(operators: Iterable[ActorBase]) -> LiveHand | None:
+    """Returns the live hand among a site's operators, or None."""
+    return next((one for one in operators if isinstance(one, LiveHand)), None)
+
+
 class ViscousEnvironment(ActorBase, frozen=True, tag="viscous"):
     """An environment that resists motion of the joints.
 
@@ -254,7 +313,7 @@ def _sum_squares(vector: tuple[float, ...]) -> float:
     return x * x + y * y + z * z
 
 
-Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque | Chirp | Multisine
+Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque | Chirp | Multisine | LiveHand
 Environment = ViscousEnvironment | Wall
 OPERATORS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Operator)}
 ENVIRONMENTS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Environment)}
@@ -281,6 +340,13 @@ _WORDS = {
     "sampled": "true or false",
     "tip_spring.stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "tip_spring.damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
+    "mode": "'tip', 'joint' or 'force'",
+    "force_limit_n": "a force above 0 N",
+    "torque_limit_nm": "a torque above 0 N m",
+    "speed_limit_m_s": "a speed above 0 m/s",
+    "speed_limit_rad_s": "a speed above 0 rad/s",
+    "live.stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
+    "live.damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
     "wall.stiffness_n_m": "a number of at least 0, N/m",
     "wall.damping_n_s_m": "a number of at least 0, N s/m",
 }
@@ -334,6 +400,8 @@ def _resolve_actor(
     kind = _check_kind(entry, kinds, path)
     check_keys(entry, ("kind", *field_names(kinds[kind])), path)
     table = draws.draw_numbers(expand_vectors(entry, kinds[kind], holding.counts), path)
+    if kind == "live":
+        _keep_live_keys(table, entry, path)
     if kind == "spring":
         draws.follow_start(table, "from_rad", holding.q0_rad, path)
         draws.follow_start(table, "to_rad", table["from_rad"], path)
@@ -342,6 +410,21 @@ def _resolve_actor(
         draws.follow_start(table, "to_m", table["from_m"], path)
     _check_values(table, kinds[kind], entry, path, holding.counts)
     return table
+
+
+def _keep_live_keys(table: TomlTable, entry: TomlTable, path: str) -> None:
+    """Leaves out of a live hand what another mode has; refuses what the author wrote of that."""
+    mode = entry.get("mode", "tip")
+    check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
+    for key in [key for key in table if key not in ("kind", "mode", *LIVE_KEYS[mode])]:
+        if key in entry:
+            which = next(name for name, keys in LIVE_KEYS.items() if key in keys)
+            raise ScenarioError(
+                f"belongs to a live hand of mode {which!r}; this one is of mode {mode!r}, "
+                f"which has {', '.join(LIVE_KEYS[mode])}",
+                path=f"{path}.{key}",
+            )
+        del table[key]
 
 
 def _check_kind(entry: TomlTable, kinds: Mapping[str, StructType], path: str) -> str:

@@ -32,7 +32,7 @@ from .expect import Expect
 from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
 from .imported_law import PluggedLaw
 from .laws import ControlLaw
-from .operators import Environment, Operator
+from .operators import Environment, Operator, find_live_hand
 from .sent_vectors import SentVectorSpecs, build_channel
 
 
@@ -308,7 +308,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def layout(self, site: str) -> Layout:
         """Returns how many numbers the vectors of a site have."""
-        return Layout.of_arm(self.arms[site].chain, self.channel(site).floats)
+        live = find_live_hand(self.sites[site].hands)
+        actors = () if live is None else (live.actor,)
+        return Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
 
     def setup(self, site: str) -> SiteSetup:
         """Returns all that the core needs to build a site."""

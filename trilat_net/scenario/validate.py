@@ -27,6 +27,7 @@ from .operators import (
     EndEffectorSpring,
     Environment,
     JointSpring,
+    LiveHand,
     Multisine,
     Operator,
     RecordedTorque,
@@ -152,6 +153,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_law(name, site, len(scenario.sites))
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
+        _check_live_hands(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     _check_received(scenario)
     for name, link in scenario.links.items():
@@ -301,6 +303,8 @@ def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
     """Refuses actors that end before they begin, walls without a side, and recorded torque out of order."""
     for n, actor in enumerate(actors):
         key, problem = "", ""
+        if isinstance(actor, LiveHand):
+            continue
         if isinstance(actor, RecordedTorque):
             if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
                 key, problem = "points", "must be in the order of their times"
@@ -315,6 +319,21 @@ def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
             key, problem = "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
         if problem:
             raise ScenarioError(problem, path=f"{path}[{n}].{key}")
+
+
+def _check_live_hands(site: SiteSpec, path: str) -> None:
+    """Refuses a second live hand of an arm, and one of an arm that is outside of the program."""
+    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, LiveHand)]
+    if live and site.plant == "external":
+        raise ScenarioError(
+            "is a live hand, and the arm is outside of the program: who holds that arm is measured "
+            "there, as tau_x of its measurements",
+            path=f"{path}[{live[0]}].kind",
+        )
+    if len(live) > 1:
+        raise ScenarioError(
+            f"is a second live hand besides {path}[{live[0]}]; an arm has one", path=f"{path}[{live[1]}].kind"
+        )
 
 
 def _normalise_change(change: Change) -> Change:

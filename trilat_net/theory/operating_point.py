@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.delay import DelayKind
-from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import LIVE_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.philox import link_key
 from ..core.site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup, StaleAction
 from ..core.site_step import Site
@@ -263,7 +263,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
     constant = [actor._replace(a=_scripted_torque(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):
         notes.append(f"a scripted torque acts on {name} at the end: taken to stay as it is then")
-    others = (actor for actor in present if actor.acts not in SCRIPTED_KINDS)
+    others = (actor for actor in present if actor.acts not in (*SCRIPTED_KINDS, *LIVE_KINDS))
     return setup._replace(actors=(*others, *constant))
 
 

@@ -1,0 +1,117 @@
+"""The messages of whoever holds a site's arm, as the site receives them.
+
+Invariant: no message can raise out of the loop, and few are read in one tick. What somebody wants is limited
+here, whatever the sender says: `HandRules` and the operator's limits hold, and one of them holds the arm at a
+time. What is refused is counted by reason.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
+from trilat_net.core.ticks import tick_ns
+from trilat_net.errors import WireError
+from trilat_net.net.bus import Inbox
+from trilat_net.net.requests import HandMessage
+from trilat_net.net.wire import decode
+from trilat_net.scenario.arms import ArmModel
+from trilat_net.scenario.operators import LiveHand
+
+MESSAGES_KEPT = 32
+"""Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""
+FARTHEST = 100.0
+"""Largest coordinate of a target, m or rad; what is further is no arm's."""
+STRONGEST = 10.0
+"""Largest force that is taken, in parts of the hand's limit; up to that it is limited."""
+
+
+class HandNews(NamedTuple):
+    """Somebody took hold of the arm or let go: the tick, and the sentence."""
+
+    tick: int
+    t_ns: int
+    text: str
+
+
+class HandServer:
+    """The live hand of one site.
+
+    Args:
+        site: name of the site.
+        rate_hz: its tick rate.
+        hand: the operator.
+        arm: the site's arm.
+        inbox: the messages.
+        dropped: counts what is refused.
+        angles: returns the joint angles at the tick that is about to be made, rad.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        rate_hz: int,
+        hand: LiveHand,
+        arm: ArmModel,
+        inbox: Inbox,
+        dropped: Counter[str],
+        angles: Callable[[], Sequence[float]],
+    ) -> None:
+        self._site, self._hand, self._inbox, self._dropped = site, hand, inbox, dropped
+        self._rules = hand.rules(rate_hz, arm.counts)
+        self._place = angles if hand.mode == "joint" else lambda: arm.end_effector(angles())
+        self._farthest = STRONGEST * hand.force_limit_n if hand.mode == "force" else FARTHEST
+        self._memory = HandMemory()
+        self._free = free_hand(self._rules.size)
+        self._names: dict[int, str] = {}
+        self._news: list[HandNews] = []
+
+    def take(self, k: int) -> list[float]:
+        """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
+        commands = []
+        for _ in range(MESSAGES_KEPT):
+            if (message := self._inbox.poll()) is None:
+                break
+            if (command := self._read(message[1])) is not None:
+                commands.append(command)
+        if not commands and not self._memory.target:
+            return self._free
+        t_ns = tick_ns(k, self._rules.rate_hz)
+        step = advance_hand(self._rules, self._memory, t_ns, commands, self._place)
+        self._memory = step.memory
+        for reason in step.refused:
+            self._dropped[reason] += 1
+        for source, change in step.changes:
+            name = self._names.get(source, f"hand {source:08x}")
+            text = f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"
+            self._news.append(HandNews(k, t_ns, text))
+        return step.vector
+
+    def take_news(self) -> list[HandNews]:
+        """Returns who has taken hold and let go since the last call."""
+        news, self._news = self._news, []
+        return news
+
+    def _read(self, payload: bytes) -> HandCommand | None:
+        """Returns a message as the state machine takes it; None if it is refused, which is counted."""
+        try:
+            message = decode(payload, HandMessage)
+        except WireError as error:
+            self._dropped[f"hand: {error.reason}"] += 1
+            return None
+        pushes = self._hand.mode == "force"
+        target, other = (message.force, message.target)[:: 1 if pushes else -1]
+        if message.site != self._site:
+            self._dropped["hand: stranger"] += 1
+        elif message.grip and (other or len(target) != self._rules.size):
+            self._dropped[f"hand: no {'force' if pushes else 'target'} of {self._rules.size} numbers"] += 1
+        elif message.grip and math.hypot(*target) > self._farthest:
+            self._dropped["hand: out of range"] += 1
+        else:
+            if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:
+                kept = self._memory.source
+                self._names = {kept: self._names[kept]} if kept else {}
+            self._names[message.boot] = message.source or f"hand {message.boot:08x}"
+            return HandCommand(message.boot, message.n, message.grip, tuple(target), message.sent_ns)
+        return None

@@ -1,0 +1,229 @@
+"""A live hand: what somebody who takes hold of an arm does in each tick, by the messages that came in.
+
+Invariant: `advance_hand` is the whole state machine, a pure function of what it remembers and of the
+messages that came in before a tick. What is in force in a tick is an input of the tick and stands in its
+record, so a log repeats people without their messages.
+
+Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`. A
+target glides to its newest goal in a straight line, over the time between the last two messages. A hand that
+is silent for `SILENCE_NS` lets go: the target stays where it is and the grip fades within `GRIP_NS`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+SILENCE_NS = 200_000_000
+"""A longer silence of who holds an arm lets it go."""
+GRIP_NS = 100_000_000
+"""Time in which a grip becomes firm, and in which it fades."""
+GLIDE_NS = 50_000_000
+"""Longest time that a target takes to its goal, unless its speed is limited."""
+
+ANOTHER_HOLDS = "hand: another one holds the arm"
+OUT_OF_ORDER = "hand: out of order"
+TAKEN, RELEASED, SILENT = "takes hold", "lets go", "is silent: let go"
+"""What a tick changed in who holds an arm."""
+
+
+class HandRules(NamedTuple):
+    """What a live hand may do.
+
+    Attributes:
+        size: how many numbers its target has: one per axis, or per joint.
+        rate_hz: tick rate of the site.
+        speed_limit: largest speed of the target, m/s or rad/s.
+        from_arm: true: the target begins where the arm is; false: it is a force, which begins at 0.
+    """
+
+    size: int
+    rate_hz: int
+    speed_limit: float = math.inf
+    from_arm: bool = True
+
+
+class HandCommand(NamedTuple):
+    """One message of a hand.
+
+    Attributes:
+        source: who sends, a random number above 0.
+        number: which target of that source it is; the same again says that nothing has changed.
+        grip: false: it lets go.
+        target: its goal, m or rad, or its force, N.
+        sent_ns: when it was sent, on the sender's clock.
+    """
+
+    source: int
+    number: int
+    grip: bool
+    target: tuple[float, ...]
+    sent_ns: int
+
+
+class HandMemory(NamedTuple):
+    """What a live hand remembers from tick to tick.
+
+    Attributes:
+        source: who holds the arm; 0: nobody, though a grip may still fade.
+        number: of the newest message taken; -1: none.
+        grip: how firm it is, 0 to 1.
+        target, rate: where the target is, and its velocity.
+        goal: where it goes to.
+        arrives_ns: when it arrives there, ns since the epoch.
+        sent_ns: when the message of that goal was sent.
+        heard_ns: the tick that took in the newest message, ns since the epoch.
+        before: who let go last, and the number of that message.
+    """
+
+    source: int = 0
+    number: int = -1
+    grip: float = 0.0
+    target: tuple[float, ...] = ()
+    rate: tuple[float, ...] = ()
+    goal: tuple[float, ...] = ()
+    arrives_ns: int = 0
+    sent_ns: int = 0
+    heard_ns: int = 0
+    before: tuple[int, int] = (0, -1)
+
+
+class HandInForce(NamedTuple):
+    """What a hand does in a tick, as the field `hand` of its record has it, in this order.
+
+    Attributes:
+        grip: how firm it is, 0 to 1.
+        number: of the newest message that it follows; -1: nobody holds the arm.
+        source: who holds it; 0: nobody.
+        target: the target, or the force, in the tick.
+        rate: its velocity.
+    """
+
+    grip: float
+    number: int
+    source: int
+    target: tuple[float, ...]
+    rate: tuple[float, ...]
+
+    @classmethod
+    def read(cls, vector: Sequence[float]) -> "HandInForce":
+        """Returns the hand of a record's vector."""
+        size = (len(vector) - 3) // 2
+        grip, number, source, *rest = vector
+        return cls(grip, int(number), int(source), tuple(rest[:size]), tuple(rest[size:]))
+
+
+class HandStep(NamedTuple):
+    """What a tick made of the messages.
+
+    Attributes:
+        memory: for the next tick.
+        vector: what is in force, see `HandInForce`.
+        refused: reasons, one for each message that had no effect.
+        changes: who took hold or let go, in order: the source, and one of TAKEN, RELEASED, SILENT.
+    """
+
+    memory: HandMemory
+    vector: list[float]
+    refused: tuple[str, ...] = ()
+    changes: tuple[tuple[int, str], ...] = ()
+
+
+def hand_numbers(size: int) -> int:
+    """Returns how many numbers the field `hand` of a record has, for a target of so many."""
+    return 3 + 2 * size
+
+
+def free_hand(size: int) -> list[float]:
+    """Returns the field `hand` of a tick in which nobody holds the arm."""
+    return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
+
+
+def advance_hand(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    commands: Sequence[HandCommand],
+    place: Callable[[], Sequence[float]],
+) -> HandStep:
+    """Returns what a hand does in a tick.
+
+    Args:
+        rules: what it may do.
+        memory: what it remembers of the tick before.
+        t_ns: the nominal time of the tick, ns since the epoch.
+        commands: the messages that came in since the tick before, in order.
+        place: returns where the arm is now, in the coordinates of the target.
+    """
+    h_s, firmer = 1.0 / rules.rate_hz, 1e9 / (GRIP_NS * rules.rate_hz)
+    refused: list[str] = []
+    changes: list[tuple[int, str]] = []
+    now = memory
+    if now.target:
+        now = now._replace(target=tuple(x + v * h_s for x, v in zip(now.target, now.rate, strict=True)))
+        grip = min(now.grip + firmer, 1.0) if now.source else max(now.grip - firmer, 0.0)
+        now = now._replace(grip=grip) if now.source or grip > 0.0 else HandMemory(before=now.before)
+    for command in commands:
+        now, outcome = _take_command(rules, now, t_ns, command, place)
+        if outcome in (TAKEN, RELEASED):
+            changes.append((command.source, outcome))
+        elif outcome:
+            refused.append(outcome)
+    if now.source and t_ns - now.heard_ns > SILENCE_NS:
+        changes.append((now.source, SILENT))
+        now = _let_go(now, now.number - 1)
+    if not now.target:
+        return HandStep(now, free_hand(rules.size), tuple(refused), tuple(changes))
+    if now.source:
+        now = now._replace(rate=_find_rate(rules, now, t_ns))
+    vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
+    return HandStep(now, vector, tuple(refused), tuple(changes))
+
+
+def _take_command(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    command: HandCommand,
+    place: Callable[[], Sequence[float]],
+) -> tuple[HandMemory, str]:
+    """Returns the memory after a message, and why it has no effect, or what it changes, or ""."""
+    if memory.source not in (0, command.source):
+        return memory, ANOTHER_HOLDS
+    last = memory.number if memory.source else memory.before[1]
+    known = memory.source or memory.before[0] == command.source
+    if known and (command.number < last or (command.number == last and not memory.source)):
+        return memory, OUT_OF_ORDER
+    if not command.grip:
+        return (_let_go(memory, command.number), RELEASED) if memory.source else (memory, "")
+    if not memory.source:
+        start = tuple(map(float, place())) if rules.from_arm else (0.0,) * rules.size
+        held = HandMemory(command.source, command.number, 0.0, start, (0.0,) * rules.size)
+        held = held._replace(heard_ns=t_ns, before=memory.before)
+        return _aim(held, command, t_ns + GLIDE_NS), TAKEN
+    memory = memory._replace(heard_ns=t_ns)
+    if command.number == memory.number:
+        return memory, ""
+    period_ns = 1_000_000_000 // rules.rate_hz
+    between_ns = min(max(command.sent_ns - memory.sent_ns, period_ns), GLIDE_NS)
+    return _aim(memory, command, t_ns + between_ns), ""
+
+
+def _aim(memory: HandMemory, command: HandCommand, arrives_ns: int) -> HandMemory:
+    return memory._replace(
+        number=command.number, goal=command.target, arrives_ns=arrives_ns, sent_ns=command.sent_ns
+    )
+
+
+def _let_go(memory: HandMemory, number: int) -> HandMemory:
+    """Returns the memory of a grip that fades; messages of its source up to `number` are over."""
+    still = (0.0,) * len(memory.rate)
+    return HandMemory(grip=memory.grip, target=memory.target, rate=still, before=(memory.source, number))
+
+
+def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
+    """Returns the velocity at which a target goes to its goal, within its limit."""
+    left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
+    rate = [(goal - x) / left_s for goal, x in zip(memory.goal, memory.target, strict=True)]
+    speed = math.sqrt(sum(v * v for v in rate))
+    share = rules.speed_limit / speed if speed > rules.speed_limit else 1.0
+    return tuple(share * v for v in rate)
