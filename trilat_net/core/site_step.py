@@ -145,9 +145,7 @@ class Site:
             [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
             *(row[column] for column in task),
         )
-        if self._sends:
-            record = record._replace(ch=self._sent.tolist())
-        return record._replace(hand=hand) if hand else record
+        return record._replace(ch=self._sent.tolist(), hand=hand) if self._sends or hand else record
 
     @property
     def q(self) -> list[float]:

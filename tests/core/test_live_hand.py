@@ -1,0 +1,152 @@
+"""A live hand: who holds the arm, where its target is, and that nothing of it jumps."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilat_net.core.live_hand import (
+    ANOTHER_HOLDS,
+    GRIP_NS,
+    OUT_OF_ORDER,
+    RELEASED,
+    SILENCE_NS,
+    SILENT,
+    TAKEN,
+    HandCommand,
+    HandInForce,
+    HandMemory,
+    HandRules,
+    HandStep,
+    advance_hand,
+    free_hand,
+)
+
+RULES = HandRules(size=2, rate_hz=1000, speed_limit=1.5)
+ARM = (1.0, 0.5)
+
+
+def run(messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES) -> list[HandStep]:
+    """Returns what a hand does in each tick, with the messages that come in before some of them."""
+    memory, steps = HandMemory(), []
+    for k in range(ticks):
+        step = advance_hand(rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM)
+        memory = step.memory
+        steps.append(step)
+    return steps
+
+
+def hands(steps: list[HandStep]) -> list[HandInForce]:
+    """Returns what is in force in each tick."""
+    return [HandInForce.read(step.vector) for step in steps]
+
+
+def at(k: int, target: tuple[float, ...], n: int | None = None, **fields: Any) -> dict[int, Any]:
+    """Returns a message of hand 7 that comes at tick k."""
+    one = {"source": 7, "number": k if n is None else n, "grip": True, "target": target, "sent_ns": k * 10**6}
+    return {k: [HandCommand(**{**one, **fields})]}
+
+
+def test_it_begins_at_the_arm_without_force_and_its_grip_grows() -> None:
+    steps = run(at(10, (1.2, 0.5)), 150)
+    before, first, *rest = hands(steps)[9:]
+    assert before == HandInForce.read(free_hand(2))
+    assert first.target == ARM
+    assert first.grip == 0.0
+    assert steps[10].changes == ((7, TAKEN),)
+    grips = [hand.grip for hand in rest]
+    assert np.allclose(np.diff([0.0, *grips[:100]]), 1e6 / GRIP_NS)
+    assert grips[-1] == 1.0
+
+
+def test_between_two_messages_the_target_glides_in_a_straight_line() -> None:
+    """Sixty messages a second of a hand that moves at 0.6 m/s: the target moves at 0.6 m/s, and no step."""
+    messages: dict[int, Any] = {}
+    for n in range(60):
+        k = round(n * 1000 / 60)
+        messages |= at(k, (1.0 + 0.6 * k / 1000, 0.5))
+    moved = np.array([hand.target[0] for hand in hands(run(messages, 1000))])
+    speed = np.diff(moved)[200:] * 1000
+    assert speed == pytest.approx(0.6, abs=0.05)
+    assert moved[-1] == pytest.approx(1.0 + 0.6 * 0.99, abs=0.02)
+
+
+def test_the_speed_of_the_target_is_limited() -> None:
+    steps = hands(run(at(0, (50.0, 0.5)), 180))
+    rates = [math.hypot(*hand.rate) for hand in steps]
+    assert max(rates) == pytest.approx(1.5)
+    assert steps[-1].target[0] == pytest.approx(1.0 + 1.5 * 0.179)
+
+
+def test_a_silent_hand_lets_go_and_fades() -> None:
+    steps = run(at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0), 500)
+    held = hands(steps)
+    changes = {k: step.changes for k, step in enumerate(steps) if step.changes}
+    last_ns = SILENCE_NS + 150_000_000
+    assert changes == {0: ((7, TAKEN),), last_ns // 10**6 + 1: ((7, SILENT),)}
+    gone = next(k for k, hand in enumerate(held) if k > 200 and hand.grip == 0.0)
+    assert gone * 10**6 <= last_ns + GRIP_NS + 2 * 10**6
+    fading = held[last_ns // 10**6 + 1 : gone]
+    assert {hand.target for hand in fading} == {held[300].target}
+    assert {hand.rate for hand in fading} == {(0.0, 0.0)}
+
+
+def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
+    release = at(50, (), n=50, grip=False)
+    second = {40: [HandCommand(9, 0, True, (2.0, 2.0), 0)], 60: [HandCommand(9, 1, True, (1.0, 0.6), 0)]}
+    steps = run(at(0, (1.1, 0.5)) | release | second, 100)
+    assert steps[40].refused == (ANOTHER_HOLDS,)
+    assert steps[50].changes == ((7, RELEASED),)
+    assert steps[60].changes == ((9, TAKEN),)
+    again = hands(steps)[60]
+    assert again.target == ARM
+    assert again.grip == 0.0
+
+
+def test_a_message_that_was_overtaken_changes_nothing() -> None:
+    """Also one that comes after the same hand has let go: it does not take hold again."""
+    late = {30: [HandCommand(7, 5, True, (9.0, 9.0), 0)], 70: [HandCommand(7, 49, True, (9.0, 9.0), 0)]}
+    steps = run(at(10, (1.1, 0.5)) | at(50, (), n=50, grip=False) | late, 200)
+    assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
+    assert steps[-1].vector == free_hand(2)
+
+
+def test_a_hand_that_wakes_up_takes_hold_again_with_the_same_goal() -> None:
+    steps = run(at(0, (1.1, 0.5)) | at(400, (1.1, 0.5), n=0), 402)
+    assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
+
+
+def test_a_force_begins_at_zero() -> None:
+    rules = HandRules(size=2, rate_hz=1000, from_arm=False)
+    steps = hands(run(at(0, (8.0, 0.0)), 120, rules))
+    assert steps[0].target == (0.0, 0.0)
+    assert steps[-1].target == pytest.approx((8.0, 0.0))
+
+
+COMMANDS = st.builds(
+    HandCommand,
+    source=st.integers(1, 3),
+    number=st.integers(0, 20),
+    grip=st.booleans(),
+    target=st.tuples(*[st.floats(-100.0, 100.0)] * 2),
+    sent_ns=st.integers(-(2**58), 2**58),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
+def test_whatever_comes_in_the_grip_never_jumps_up_and_the_target_keeps_its_limit(messages: Any) -> None:
+    steps = hands(run(messages, 500))
+    most = 1e6 / GRIP_NS + 1e-12
+    for before, now in pairwise(steps):
+        assert now.grip <= before.grip + most
+        assert math.hypot(*now.rate) <= 1.5 + 1e-9
+        if before.source and now.source == before.source and now.grip > 0.0:
+            moved = math.dist(before.target, now.target)
+            assert moved <= 1.5e-3 + 1e-12
+    assert all(math.isfinite(x) for hand in steps for x in (*hand.target, *hand.rate, hand.grip))

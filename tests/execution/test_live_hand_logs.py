@@ -1,0 +1,109 @@
+"""A log repeats who held an arm: verified, in fed virtual time, and executed again."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
+from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand
+from trilat_net.core.site_step import Site
+from trilat_net.errors import ScenarioError
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.operators import find_live_hand
+
+SECONDS = 1.2
+
+
+class CirclingHand:
+    """Holds an arm from 0.2 s to 0.7 s and leads it, 60 messages a second; then it is silent."""
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._arm, spec = scenario.arms[site], scenario.sites[site]
+        live = find_live_hand(spec.hands)
+        assert live is not None
+        self._mode, self._rules = live.mode, live.rules(spec.rate_hz, self._arm.counts)
+        self._memory = HandMemory()
+
+    def __call__(self, site: Site, k: int) -> list[float]:
+        def place() -> list[float]:
+            return site.q if self._mode == "joint" else self._arm.end_effector(site.q)
+
+        commands = []
+        if 200 <= k <= 700 and k % 17 == 0:
+            goal = [0.4 * np.sin(0.01 * (k - 200)), 0.3] if self._mode != "force" else [5.0, 5.0]
+            start = (0.0, 0.0) if self._mode == "force" else place()
+            target = tuple(float(a + b) for a, b in zip(start, goal, strict=True))
+            commands = [HandCommand(7, k, True, target, k * 1_000_000)]
+        step = advance_hand(self._rules, self._memory, k * 1_000_000, commands, place)
+        self._memory = step.memory
+        return step.vector
+
+
+@pytest.fixture(scope="module", params=["tip", "joint", "force"])
+def held(request: pytest.FixtureRequest) -> Log:
+    """A run in which somebody held m1 in each way."""
+    live = [{"kind": "live", "mode": request.param}]
+    scenario = load_scenario("paper", {"duration_s": SECONDS, "sites.m1.hands": live})
+    return simulate_scenario(scenario, hands={"m1": CirclingHand(scenario, "m1")})
+
+
+def test_a_log_of_people_is_verified_and_repeated(held: Log) -> None:
+    found = verify(held)
+    assert found.passed
+    assert found.identical == found.records == 3 * round(SECONDS * 1000)
+    compared = compare_with_virtual(held)
+    assert compared.fed.identical == compared.plain.identical == found.records
+    again = rerun(held, replace=["m1"])
+    assert again.sites["m1"].identical == round(SECONDS * 1000)
+    assert np.abs(held["m1"].tau_x).max() > 1.0
+
+
+def test_the_force_begins_and_ends_at_zero_and_its_work_is_the_operators(held: Log) -> None:
+    """The torque by the definition, from the log's own numbers, is the record's, to rounding."""
+    part = held["m1"]
+    grip = part.hand[:, 0]
+    torque = np.abs(part.tau_x).max(axis=1)
+    assert not torque[grip == 0.0].any()
+    assert part.t_s[grip > 0.0].max() == pytest.approx(0.7 + 0.2 + 0.1, abs=0.03)
+    own = align_records(held)["m1"]
+    split = split_torque(own, held.scenario)
+    source = held.scenario.sites["m1"].hands[0].actor
+    expected = compute_live_torque(source, own.hand, own.q, own.qd, split.end_effector)
+    assert expected == pytest.approx(-own.tau_x, abs=1e-9)
+    assert split.operator == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_changed_hand_is_found(held: Log) -> None:
+    """A nanometre of a target in a record, or a nanonewton of a force, is another run."""
+    states = held["m1"].states
+    hand = [*states[400].hand]
+    hand[3] += 1e-9
+    changed = [*states]
+    changed[400] = msgspec.structs.replace(states[400], hand=hand)
+    held["m1"].__dict__["states"] = changed
+    try:
+        found = verify(held)
+    finally:
+        held["m1"].__dict__["states"] = states
+    assert found.first is not None
+    assert (found.first.site, found.first.tick) == ("m1", 400)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"sites.m1.hands": [{"kind": "live"}, {"kind": "live"}]}, "an arm has one"),
+        ({"sites.m1.hands": [{"kind": "live"}], "sites.m1.plant": "external"}, "outside of the program"),
+        ({"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]}, "of mode 'joint'"),
+        ({"sites.m1.hands": [{"kind": "live", "mode": "foot"}]}, "must be one of"),
+    ],
+)
+def test_a_live_hand_that_cannot_be_is_refused(changes: dict[str, object], problem: str) -> None:
+    with pytest.raises(ScenarioError, match=problem):
+        load_scenario("paper", changes)

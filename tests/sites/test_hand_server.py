@@ -1,0 +1,181 @@
+"""Hands of a live session: as their users have them, as the site takes them in, and what hostile ones get."""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sites.hand_server import MESSAGES_KEPT, HandServer
+from sites.hand_session import open_hand
+from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, free_hand
+from trilat_net.errors import UsageError
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.clock import ManualClock
+from trilat_net.net.hand_port import Hand
+from trilat_net.net.requests import HandMessage
+from trilat_net.net.wire import encode
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.operators import find_live_hand
+
+from .relay import RelayClock
+from .sessions import SESSION, Session
+
+LIVE = {f"sites.{name}.hands": [{"kind": "live"}] for name in ("m1", "m2")}
+SCENARIO = load_scenario("paper", {"duration_s": 1.5, **LIVE})
+PERIOD_NS = 16_666_667
+Say = Callable[[Hand, int], object]
+
+
+class Felt:
+    """What the program of a hand noted: of each record its tick, and the force and the pose that it told."""
+
+    def __init__(self) -> None:
+        self.ticks: list[int] = []
+        self.forces: list[tuple[float, ...]] = []
+        self.poses: list[tuple[float, ...]] = []
+
+
+def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) -> Any:
+    """A program that holds an arm, sixty times a second; it lets go at the end of its context."""
+
+    def act(bus: Bus, clock: RelayClock) -> None:
+        with open_hand(bus, clock, SESSION, site, SCENARIO, f"hand at {site}") as hand:
+            while hand.record is None:
+                clock.sleep_until(clock.monotonic_ns() + 1_000_000)
+            for n in range(last):
+                if n >= first:
+                    say(hand, n)
+                clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
+                if hand.record is not None:
+                    felt.ticks.append(hand.record.tick)
+                    felt.forces.append(hand.force)
+                    felt.poses.append(hand.pose)
+
+    return act
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
+    """A session in which two programs hold the masters, and a third one wants one of them as well."""
+    made, felt = Session.whole(SCENARIO, tmp_path_factory.mktemp("held")), Felt()
+    made.stranger(holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt))
+    made.stranger(holding("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt()))
+    made.stranger(holding("m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50))
+    return made.run(), felt
+
+
+def test_a_session_with_people_is_verified_and_fed_virtual_time_repeats_it(
+    session: tuple[Log, Felt],
+) -> None:
+    log, _ = session
+    found = verify(log)
+    assert found.passed
+    assert found.identical == found.records == 3 * 1500
+    assert compare_with_virtual(log).fed.identical == found.records
+
+
+def test_its_events_say_who_held_which_arm_and_its_counts_who_was_refused(session: tuple[Log, Felt]) -> None:
+    log, _ = session
+    said = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
+    assert sorted(said) == sorted(
+        f"m{n}: hand at m{n} {what}" for n in (1, 2) for what in ("takes hold", "lets go")
+    )
+    assert log.link_stats("m1")[-1].dropped[ANOTHER_HOLDS] >= 20
+    assert not any("hand" in reason for reason in log.link_stats("m2")[-1].dropped)
+
+
+def test_what_a_hand_feels_is_what_acts_on_the_arm(session: tuple[Log, Felt]) -> None:
+    """J' of the force that the program was told is the torque of that tick's record; its pose the tip's."""
+    log, felt = session
+    part = log["m1"]
+    (l1, l2), seen = SCENARIO.arms["m1"].lengths_m, 0
+    for tick, force, pose in zip(felt.ticks, felt.forces, felt.poses, strict=True):
+        q1, q12 = part.q[tick, 0], part.q[tick].sum()
+        x, y = l1 * math.cos(q1) + l2 * math.cos(q12), l1 * math.sin(q1) + l2 * math.sin(q12)
+        assert pose == pytest.approx((x, y))
+        J = np.array([[-y, -l2 * math.sin(q12)], [x, l2 * math.cos(q12)]])
+        assert J.T @ force == pytest.approx(-part.tau_x[tick], abs=1e-6)
+        seen += math.hypot(*force) > 1.0
+    assert seen > 30
+
+
+def test_a_hand_does_what_its_mode_says_and_only_where_there_is_one() -> None:
+    bus, clock = LocalNetwork().join(), ManualClock()
+    with open_hand(bus, clock, "t", "m1", SCENARIO) as hand:
+        with pytest.raises(UsageError, match="can move, not push"):
+            hand.push(1.0, 2.0)
+        with pytest.raises(UsageError, match="finite"):
+            hand.move(math.nan, 0.0)
+    with pytest.raises(UsageError, match="they can at m1, m2"):
+        open_hand(bus, clock, "t", "s", SCENARIO)
+
+
+class Served:
+    """A server of hands without its site, whose arm stays where it is."""
+
+    def __init__(self) -> None:
+        network = LocalNetwork()
+        self.dropped: Counter[str] = Counter()
+        live, arm = find_live_hand(SCENARIO.sites["m1"].hands), SCENARIO.arms["m1"]
+        assert live is not None
+        key = topics.key("t", "m1", topics.HAND)
+        inbox = network.join().inbox(key, MESSAGES_KEPT)
+        self.server = HandServer("m1", 1000, live, arm, inbox, self.dropped, lambda: [0.3, 0.4])
+        self.publish = network.join().publisher(key)
+        self.k = -1
+
+    def take(self, *messages: bytes) -> HandInForce:
+        """Returns what is in force in the next tick, before which these messages come."""
+        for message in messages:
+            self.publish(message)
+        self.k += 1
+        return HandInForce.read(self.server.take(self.k))
+
+
+def message(**fields: Any) -> bytes:
+    """A message of a hand at m1."""
+    return encode(
+        HandMessage(**{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields})
+    )
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"\xc1", "hand: malformed"),
+        (message(target=[math.nan, 0.0]), "hand: not finite"),
+        (message(target=[math.inf, 0.0]), "hand: not finite"),
+        (message(target=[1000.0, 0.0]), "hand: out of range"),
+        (message(target=[1e308, 1e308]), "hand: out of range"),
+        (message(target=[1.0, 0.0, 0.0]), "hand: no target of 2 numbers"),
+        (message(target=[], force=[1e9, 0.0]), "hand: no target of 2 numbers"),
+        (message(site="m2"), "hand: stranger"),
+        (bytes(70_000), "hand: oversized"),
+    ],
+)
+def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -> None:
+    served = Served()
+    assert served.take(payload) == HandInForce.read(free_hand(2))
+    assert served.dropped == {reason: 1}
+
+
+def test_a_flood_is_read_a_little_at_a_time_and_moves_nobody() -> None:
+    """A hundred messages a tick of others: the holder's arm stays as it was, and few are looked at."""
+    served = Served()
+    served.take(message())
+    for k in range(1, 100):
+        flood = [message(boot=100 + n, n=k, target=[9.0, 9.0]) for n in range(100)]
+        hand = served.take(*flood, message(n=k, target=[1.5, 0.5]))
+    assert hand.source == 5
+    assert hand.number == 99
+    assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}
+    assert [news.text for news in served.server.take_news()] == [
+        "m1: hand 00000005 takes hold at t = 0.000 s"
+    ]
