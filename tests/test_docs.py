@@ -19,7 +19,7 @@ from trilat_net.analysis import arm_rows, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
-from trilat_net.core import delay, link, ticks, user_law
+from trilat_net.core import delay, link, live_hand, ticks, user_law
 from trilat_net.execution import difference
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
@@ -62,6 +62,9 @@ STATED: list[tuple[str, str, float, float]] = [
     ("external-arm.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
     ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
     ("external-arm.md", "older than 0.1 s", 0.1, site_port.FRESH_NS / 1e9),
+    ("live-hands.md", "silent for 200 ms lets go", 200.0, live_hand.SILENCE_NS / 1e6),
+    ("live-hands.md", "from 0 to 1 within 100 ms", 100.0, live_hand.GRIP_NS / 1e6),
+    ("live-hands.md", "two, at most 50 ms", 50.0, live_hand.GLIDE_NS / 1e6),
     ("fair-comparison.md", "`--budget`, 64 per law", 64, tuning_plan.DEFAULT_BUDGET),
     ("fair-comparison.md", "steps of 12, 8, 5, 3 %", 3, 100 * pareto_search.REFINEMENT_STEPS[-1]),
     ("fair-comparison.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),
