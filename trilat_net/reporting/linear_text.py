@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..core.vectors import Array
 from ..theory.linear_analysis import LinearAnalysis
 from .text_table import TextTable
 
@@ -16,11 +17,20 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields the equilibrium and the way it was found."""
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
-    if float(np.ptp(rest.q, axis=0).max()) < 5e-5:
-        yield f"  all sites at ({', '.join(f'{angle:.4f}' for angle in rest.q[0])}) rad"
+    sites = analysis.conditions.sites
+    angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
+    if not sites[0].layout.task and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
+        yield f"  all sites at ({_list_numbers(angles[0])}) rad"
         return
-    for name, q in zip(analysis.scenario.names, rest.q, strict=True):
-        yield f"  {name} at ({', '.join(f'{angle:.4f}' for angle in q)}) rad"
+    for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
+        at = f", its end effector at ({_list_numbers(pose)}) m{' and rad' * (len(pose) > 3)}" * bool(
+            len(pose)
+        )
+        yield f"  {site.name} at ({_list_numbers(q)}) rad{at}"
+
+
+def _list_numbers(values: Array) -> str:
+    return ", ".join(f"{value:.4f}" for value in values)
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
@@ -62,7 +72,8 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     if not count:
         return "no root at zero"
     are = "root is" if count == 1 else "roots are"
-    return f"{count} {are} zero by structure: shared poses, and estimates without excitation"
+    free = ", joints that the task leaves free" * analysis.conditions.sites[0].layout.task
+    return f"{count} {are} zero by structure: shared poses{free}, and estimates without excitation"
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:

@@ -33,22 +33,27 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     if ports.pole.order:
         kind = "as of free masses" if ports.pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
-    lines.append(f"  operators passive in qd, coupled or not: {_describe_passivity(ports.velocity)}")
-    lines += [f"    joint {joint} alone: {_describe_passivity(one)}" for joint, one in ports.joints.items()]
+    unit, kind = ports.impedance_unit(), ports.kind
+    whole = _describe_passivity(ports.velocity, unit, kind)
+    lines.append(f"  operators passive in {ports.speed}, coupled or not: {whole}")
+    for joint, one in ports.joints.items():
+        alone = _describe_passivity(one, ports.impedance_unit(joint), kind)
+        lines.append(f"    {ports.name_port(joint)} alone: {alone}")
     if ports.proof is not None:
         proof = _describe_proof(ports, ports.proof)
-        lines.append(f"  operators passive in r = qd + Lambda e, the proof's premise: {proof}")
-    lines.append(f"  a passive operator in qd per site, best weights: {_describe_absolute_stability(ports)}")
+        lines.append(f"  operators passive in r = {ports.speed} + Lambda e, the proof's premise: {proof}")
+    absolute = _describe_absolute_stability(ports)
+    lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].of
         return [*lines, f"  with {clamped} clamped the loop is unstable: it has no steady impedance"]
-    return [*lines, *(f"  {_describe_transparency(one)}" for one in ports.transparency)]
+    return [*lines, *(f"  {_describe_transparency(ports, one)}" for one in ports.transparency)]
 
 
 def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
-    text = f"{_describe_passivity(proof, damping=False)}; sites weighted {beta}"
+    text = f"{_describe_passivity(proof)}; sites weighted {beta}"
     if np.ptp(ports.beta) > WEIGHTS_ALIKE:
         text += ", which is nothing for operators coupled to one another"
     if proof.passive or ports.estimates_true:
@@ -56,17 +61,18 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     return f"{text}; estimates here are not true, and the proof counts the energy that they store"
 
 
-def _describe_passivity(one: Passivity, *, damping: bool = True) -> str:
+def _describe_passivity(one: Passivity, unit: str = "", kind: str = "") -> str:
+    """Returns a passivity in words; with a unit, also the damping that each joint or axis lacks."""
     if one.passive:
         return "passive"
     minima = one.minima
     least = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
     text = f"not passive {_list_bands(minima.below)}; {least}"
-    if not damping:
+    if not unit:
         return text
     if math.isinf(one.lacking_nm_s_rad):
-        return f"{text}; no damping at the joints would make it so"
-    return f"{text}; {one.lacking_nm_s_rad:.3g} N m s/rad more at each joint would make it so"
+        return f"{text}; no damping at the {'axes' if kind == 'axis' else 'joints'} would make it so"
+    return f"{text}; {one.lacking_nm_s_rad:.3g} {unit} more at each {kind} would make it so"
 
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
@@ -89,7 +95,7 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     failing = [one for one in ports.two_ports if one.minima.below]
     holding = len(ports.two_ports) - len(failing)
     third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""
-    every = f"every pair and joint{third}" if not failing else "the others"
+    every = f"every pair and {ports.kind}{third}" if not failing else "the others"
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
     for one in failing:  # of arms of many joints those of one pair share a line
         joint = one.joint if len(ports.joints) <= _JOINTS_BY_LINE else ""
@@ -99,21 +105,22 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
         worst = min(group, key=lambda one: one.minima.least)
         sites, _, clamped, minima = worst
         joints, bands = (
-            ", ".join(str(one.joint) for one in group),
+            ", ".join(str(ports.axes.get(one.joint, one.joint)) for one in group),
             [b for one in group for b in one.minima.below],
         )
         within = f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
-        which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, joint {joints}"
+        which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, {ports.kind} {joints}"
         least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
         lines.append(f"{which}: fails {_list_bands(minima.below) if len(group) == 1 else within}; {least}")
     return [*lines, *([f"{every}: holds ({holding} two-ports)"] if holding else [])]
 
 
-def _describe_transparency(one: Transparency) -> str:
+def _describe_transparency(ports: PortAnalysis, one: Transparency) -> str:
+    unit = ports.impedance_unit(one.joint)
     free, clamped = one.size_at(QUOTED_AT_HZ)
     low, high = one.band_hz
     return (
-        f"{one.at} feels of {one.of}, joint {one.joint}: {free:.4g} N m s/rad free and {clamped:.4g} "
+        f"{one.at} feels of {one.of}, {ports.name_port(one.joint)}: {free:.4g} {unit} free and {clamped:.4g} "
         f"clamped at {QUOTED_AT_HZ:g} Hz; over {low:g}-{high:g} Hz the ratio is {one.ratio_db:.3g} dB, the "
-        f"difference {one.difference_nm_s_rad:.3g} N m s/rad"
+        f"difference {one.difference_nm_s_rad:.3g} {unit}"
     )

@@ -46,11 +46,11 @@ ROOT_RESIDUAL_TOLERANCE = 1e-12
 _MAX_NEWTON_STEPS = 30
 _STEP_TOLERANCE = 1e-9
 """A step this small, relative to 1 + abs(s), leaves an error of about its square."""
-_SAME_VALUE = 1e-9
+_SAME_VALUE = 1e-11
 """Singular values this small, relative to Delta's terms, belong to one root."""
 _MAX_DISTANCE_PER_S = 1e6
 """Newton's method has failed if it is this far from its guess, 1/s."""
-_ZERO = 1e-9
+_ZERO = 1e-12
 """A singular value this small, relative to the largest, is zero."""
 _LONGEST_CHAIN = 4
 _NAMED_SHARE = 0.3

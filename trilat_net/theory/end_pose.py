@@ -20,7 +20,7 @@ from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from ..scenario.delay_models import ConstantDelay
-from .equilibrium import follow_equilibrium
+from .equilibrium import follow_equilibrium, pad_rows
 from .linear_edge import find_deepest_contact
 from .operating_point import Equilibrium, derive_operating_conditions, is_constant_link
 from .tick_map import compute_decisive_spectrum
@@ -101,12 +101,15 @@ def _choose_state(scenario: Scenario, parts: Sequence[SiteLog]) -> tuple[Array, 
     rows = slice(3 * count // 4, count)
     together = all(np.array_equal(part.t_s[rows], parts[0].t_s[rows]) for part in parts)
     if together and not all(map(_rests, parts)):
-        q = np.stack([part.q[rows] for part in parts], axis=1)
+        joints = max(part.q.shape[1] for part in parts)
+        q = np.stack(
+            [np.pad(part.q[rows], ((0, 0), (0, joints - part.q.shape[1]))) for part in parts], axis=1
+        )
         deepest = find_deepest_contact(scenario, q)
         if deepest is not None:
-            return q[deepest], np.array([part.theta_hat[rows][deepest] for part in parts])
+            return q[deepest], pad_rows([part.theta_hat[rows][deepest] for part in parts])
     ends = [(_end_of(part, part.q), _end_of(part, part.theta_hat)) for part in parts]
-    return np.array([q for q, _ in ends]), np.array([theta_hat for _, theta_hat in ends])
+    return pad_rows([q for q, _ in ends]), pad_rows([theta_hat for _, theta_hat in ends])
 
 
 def _rests(part: SiteLog) -> bool:

@@ -5,14 +5,14 @@ isolated (any pose that the sites agree on may be one), so each is the nearest t
 simulation supplies starting values only.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S
-from ..core.site_setup import Law
+from ..core.site_setup import Law, SiteSetup
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
@@ -20,9 +20,22 @@ from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.operators import Chirp, Multisine
 from .characteristic_roots import limit_blas_threads
-from .linear_loop import LinearLoop, find_loop_states, gather_site_arguments, linearise_loop
+from .linear_loop import (
+    LinearLoop,
+    find_loop_states,
+    find_references,
+    gather_site_arguments,
+    linearise_loop,
+)
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import describe_switching_points, has_estimate, lay_out_arguments
+from .site_dynamics import (
+    describe_switching_points,
+    follow_peers,
+    has_estimate,
+    lay_out_arguments,
+    place_arm,
+)
+from .textbook_task import SINGULAR
 
 MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""
@@ -46,8 +59,8 @@ class EquilibriumRun(NamedTuple):
     Attributes:
         at_rest: True if it ended at an equilibrium; otherwise the pose is the mean over its last quarter.
         diverged: True if a site left its limits.
-        q: joint angles, shape (N, n), rad.
-        theta_hat: estimates, shape (N, P).
+        q: joint angles, shape (N, n), rad; of shorter arms followed by zeros.
+        theta_hat: estimates, shape (N, P), so as well.
     """
 
     t_s: float
@@ -110,15 +123,24 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     The derivatives of the angles are zero.
     """
     x = gather_site_arguments(conditions, rest)
-    states = np.array(
-        [np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate]) for one in conditions.rates(x)]
-    )
-    return states[find_loop_states(conditions)]
+    states = [np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate]) for one in conditions.rates(x)]
+    return _select_loop_states(conditions, states)
+
+
+def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
+    """Returns what is in the loop of all states of every site, one site after the other."""
+    masks = find_loop_states(conditions)
+    return np.concatenate([own[mask] for own, mask in zip(states, masks, strict=True)])
 
 
 @limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium nearest to a pose: Gauss-Newton steps of least norm from there."""
+    """Returns the equilibrium nearest to a pose: Gauss-Newton steps of least norm from there.
+
+    Raises:
+        ScenarioError: a site in task space is in a singular pose.
+    """
+    _refuse_singular_poses(conditions, rest)
     residual = compute_equilibrium_residual(conditions, rest)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
@@ -144,10 +166,34 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
-    at, mask = lay_out_arguments(conditions.sites[0]), find_loop_states(conditions)
-    states = np.zeros(mask.shape)
-    states[mask] = step
-    return rest._replace(q=rest.q + states[:, at.q], theta_hat=rest.theta_hat + states[:, at.estimate])
+    masks = find_loop_states(conditions)
+    parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
+    q, theta_hat = np.array(rest.q), np.array(rest.theta_hat)
+    for n, (site, mask, part) in enumerate(zip(conditions.sites, masks, parts, strict=True)):
+        at, states = lay_out_arguments(site), np.zeros(len(mask))
+        states[mask] = part
+        q[n, : at.joints] += states[at.q]
+        theta_hat[n, : at.parameters] += states[at.estimate]
+    return rest._replace(q=q, theta_hat=theta_hat)
+
+
+def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
+    """Returns vectors of several lengths as the rows of one array, the shorter ones followed by zeros."""
+    padded = np.zeros((len(rows), max(map(len, rows))))
+    for own, row in zip(padded, rows, strict=True):
+        own[: len(row)] = row
+    return padded
+
+
+def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
+    for site, x in zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True):
+        arm = place_arm(site, x[lay_out_arguments(site).q])
+        if not follow_peers(site, arm, x).least > SINGULAR:
+            raise ScenarioError(
+                "rests in a singular pose, where the inverse of its Jacobian, and so the loop, has no "
+                "derivative: end it elsewhere, or follow fewer axes",
+                path=f"sites.{site.name}.task.axes",
+            )
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
@@ -157,15 +203,21 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x). Hale
     and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993), chapter 7.
     """
-    q = np.array([spec.q0_rad for spec in scenario.sites.values()])
+    q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
     # ten estimates a link lead steps from afar astray; about a shared pose they are true
-    chains = conditions.sites[0].chain is not None
-    about = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1))) if chains else start
+    layout = conditions.sites[0].layout
+    alike = layout.chain and not layout.task
+    about = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1))) if alike else start
     rest = find_nearest_equilibrium(conditions, about)
     for _ in range(3):
-        moved = np.hstack([start.q - rest.q, np.zeros_like(rest.q), start.theta_hat - rest.theta_hat])
-        deviation = moved[find_loop_states(conditions)]
+        moved = []
+        for site, dq, d_theta in zip(
+            conditions.sites, start.q - rest.q, start.theta_hat - rest.theta_hat, strict=True
+        ):
+            at = lay_out_arguments(site)
+            moved.append(np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]]))
+        deviation = _select_loop_states(conditions, moved)
         kept = _project_on_zero_roots(linearise_loop(conditions, rest, every_estimate=True), deviation)
         if kept is None:
             break
@@ -242,22 +294,65 @@ def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None
     """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters."""
     truth = [site.theta for site in conditions.sites]
     rows = [
-        own if has_estimate(site) else np.broadcast_to(site.gains.known, site.theta.shape)
+        own[: len(site.theta)] if has_estimate(site) else np.broadcast_to(site.gains.known, site.theta.shape)
         for site, own in zip(conditions.sites, truth if theta_hat is None else theta_hat, strict=True)
     ]
-    return np.array(rows, dtype=np.float64)
+    return pad_rows(rows)
 
 
 def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
-    joints = lay_out_arguments(conditions.sites[0]).joints
-    if len(pose) != joints or not np.isfinite(pose).all():
-        angles = "two angles in rad" if joints == 2 else f"{joints} angles in rad, one per joint"
-        raise UsageError(f"--pose is {angles}, as in --pose 0.1,0.3{',...' * (joints > 2)}, not {pose}")
-    q = np.tile(np.array(pose, dtype=np.float64), (len(conditions.sites), 1))
+    at, task = lay_out_arguments(conditions.sites[0]), conditions.sites[0].layout.task
+    if len(pose) != at.coordinates or not np.isfinite(pose).all():
+        count = "two" if at.coordinates == 2 else str(at.coordinates)
+        numbers = f"{count} angles in rad" + (", one per joint" if at.coordinates != 2 else "")
+        if task:
+            numbers = (
+                f"a place in m{' and a rotation vector in rad' * (at.coordinates > 3)} of the end effectors"
+            )
+        raise UsageError(
+            f"--pose is {numbers}, as in --pose 0.1,0.3{',...' * (at.coordinates > 2)}, not {pose}"
+        )
+    target = np.array(pose, dtype=np.float64)
+    q = [reach_pose(site, target) if task else target for site in conditions.sites]
     rest = Equilibrium(
-        q, _complete_estimates(conditions), "the pose that was asked for, with theta_hat = theta", 0.0
+        pad_rows(q),
+        _complete_estimates(conditions),
+        "the pose that was asked for, with theta_hat = theta",
+        0.0,
     )
+    _refuse_singular_poses(conditions, rest)
     return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
+
+
+def reach_pose(site: SiteSetup, pose: Array) -> Array:
+    """Returns the angles, nearest to the start pose, at which a site's end effector is at a shared pose.
+
+    Raises:
+        ScenarioError: it cannot be there along the axes that the site follows.
+    """
+    at, q = lay_out_arguments(site), np.array(site.q0, dtype=np.float64)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        x = np.zeros(at.arguments)
+        x[at.q], x[at.q_des] = q, pose
+        following = follow_peers(site, place_arm(site, q), x)
+        if np.abs(following.e).max() <= _NEWTON_RESIDUAL:
+            return q
+        assert following.J is not None
+        step = np.linalg.lstsq(following.J, -following.e, rcond=_FLAT)[0]
+        q = q + step * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
+    raise ScenarioError(
+        f"its end effector does not reach the pose: {np.abs(following.e).max():.2g} m or rad are left",
+        path=f"sites.{site.name}.q0_rad",
+    )
+
+
+def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
+    """Returns the mean of what sites share of their start poses: angles, or their end effectors' poses."""
+    conditions = derive_operating_conditions(scenario)
+    count = len(conditions.sites)
+    q = pad_rows([site.q0 for site in conditions.sites])
+    alike = conditions._replace(alpha=np.full((count, count), 1.0 / count))
+    return tuple(find_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
@@ -293,6 +388,14 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
             "roots are those of equations frozen at it"
         )
     x = gather_site_arguments(conditions, rest)
+    for site, own in zip(conditions.sites, x, strict=True):
+        least = follow_peers(site, place_arm(site, own[lay_out_arguments(site).q]), own).least ** 0.5
+        task = None if site.chain is None else site.chain.task
+        if task is not None and least < task.singular_value:
+            yield (
+                f"{site.name} rests near a singular pose (bound of its least singular value {least:.3g}, "
+                f"damped below {task.singular_value:g}): the damping is part of the loop, and J J+ is not 1"
+            )
     for site, own, rates in zip(conditions.sites, x, conditions.rates(x), strict=True):
         torques_nm, limits_nm = np.abs(rates.tau), np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
         if (torques_nm >= limits_nm).any():

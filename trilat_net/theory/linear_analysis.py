@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.vectors import Array
 from ..errors import UsageError
 from ..scenario import Scenario, load_scenario
 from ..scenario.describe import IRREVERSIBLE_SHARES, describe_law_conditions, lacks_detailed_balance
@@ -19,6 +20,7 @@ from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
 from .linear_loop import LinearLoop, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .site_dynamics import share_own_pose
 from .tick_map import compute_sampled_spectrum, find_common_rate_hz
 
 DEFAULT_ROOTS = 6
@@ -48,6 +50,16 @@ class LinearAnalysis:
     continuous: Spectrum
     sampled: Spectrum | None
     margin: DelayMargin
+
+    @property
+    def end_effectors(self) -> tuple[Array, ...]:
+        """What each site shares of its pose at the equilibrium in task space; nothing in joint space."""
+        sites, q = self.conditions.sites, self.rest.q
+        if not sites[0].layout.task:
+            return (np.zeros(0),) * len(sites)
+        return tuple(
+            share_own_pose(site, own[: site.layout.joints]) for site, own in zip(sites, q, strict=True)
+        )
 
     @property
     def decisive(self) -> Spectrum:
@@ -117,6 +129,12 @@ def analyse_linear_loop(
 def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
     """Returns an analysis as plain values."""
     names, conditions, rest = analysis.scenario.names, analysis.conditions, analysis.rest
+    layouts = [site.layout for site in conditions.sites]
+    q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
+    theta_hat = [
+        own[: layout.parameters].tolist() for own, layout in zip(rest.theta_hat, layouts, strict=True)
+    ]
+    poses = dict(zip(names, (pose.tolist() for pose in analysis.end_effectors), strict=True))
     return {
         "scenario": analysis.scenario.name,
         "scenario_sha256": analysis.scenario.sha256,
@@ -124,8 +142,9 @@ def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
         "rest": {
             "how": rest.how,
             "residual": rest.residual,
-            "q_rad": dict(zip(names, rest.q.tolist(), strict=True)),
-            "theta_hat": dict(zip(names, rest.theta_hat.tolist(), strict=True)),
+            "q_rad": dict(zip(names, q, strict=True)),
+            "theta_hat": dict(zip(names, theta_hat, strict=True)),
+            **({"x": poses} if layouts[0].task else {}),
         },
         "delay_in_use_ms": {
             f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])

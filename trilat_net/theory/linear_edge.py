@@ -16,7 +16,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
-from .equilibrium import choose_equilibrium, find_equilibrium, follow_equilibrium
+from .equilibrium import choose_equilibrium, find_equilibrium, find_mean_pose, follow_equilibrium
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import has_estimate, place_arm
@@ -57,7 +57,7 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
         site = scenario.setup(name)
         for wall in site.actors:
             if wall.acts is TorqueKind.WALL and wall.sampled:
-                at = place_arm(site, q[:, n].T).end_effector_position()
+                at = place_arm(site, q[:, n, : site.layout.joints].T).end_effector_position()
                 depth_m = np.maximum(depth_m, (np.array(wall.a) - at.T) @ np.array(wall.b))
     deepest = int(depth_m.argmax())
     return deepest if depth_m[deepest] > 0.0 else None
@@ -77,7 +77,7 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 def find_growth_at(scenario: Scenario, q: Array, theta_hat: Array) -> float:
     """Returns the real part of the sampled loop's rightmost root at the rest next to a state, 1/s.
 
-    NaN without such a rest. Angles have shape (N, 2), rad, estimates (N, 5).
+    NaN without such a rest. Angles have shape (N, n), rad, estimates (N, P).
     """
     try:
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "", 0.0))
@@ -227,6 +227,5 @@ def _assume_equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple
     """Returns an equilibrium without a run if possible: at the mean start pose, or near that before."""
     sites = derive_operating_conditions(scenario).sites
     if any(map(has_estimate, sites)) and not any(site.actors for site in sites):
-        mean: Array = np.mean([spec.q0_rad for spec in scenario.sites.values()], axis=0)
-        return find_equilibrium(scenario, tuple(mean.tolist())), ASSUMED_EQUILIBRIUM_REMARK
+        return find_equilibrium(scenario, find_mean_pose(scenario)), ASSUMED_EQUILIBRIUM_REMARK
     return choose_equilibrium(scenario) if before is None else follow_equilibrium(scenario, before), ""

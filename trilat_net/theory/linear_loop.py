@@ -3,7 +3,8 @@
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
 Invariant: x are deviations from the equilibrium, in the order of the scenario's sites; u is the torque ON
-the joints that an operator adds; y are the joint velocities.
+the joints that an operator adds; y are the joint velocities. Sites that follow with their end effectors are
+coupled through what they share of their poses, `SiteRates.x`, and through its velocity.
 
 A chain has ten estimates a link, of which a small motion moves, and the torque shows, no more than one
 combination a joint: the gravity that was learnt. With the regressor Y_G at rest it is z = Y_G theta_hat, N m,
@@ -16,18 +17,21 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
+from scipy.linalg import block_diag, qr
 
 from ..core.vectors import Array
 from ..scenario import Scenario
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
+    COMPLEX_STEP,
     ArgumentLayout,
     SiteRates,
     differentiate_site_rates,
     has_estimate,
     lay_out_arguments,
+    share_own_pose,
 )
+from .textbook_task import PLACE_COORDINATES, evaluate_reference
 
 _DEPENDENT = 1e-9
 """Rows of a regressor that are dependent to this, relative to the largest, are."""
@@ -47,6 +51,13 @@ class SiteJacobian(NamedTuple):
     rates: SiteRates
     states: tuple[str, ...]
     left_out: int = 0
+
+    @property
+    def sent(self) -> Array:
+        """What peers get by the site's own states, shape (3 m, states): x, its velocity, the torque."""
+        rates = self.rates
+        whole: Array = np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
+        return whole
 
 
 class DelayedTerm(NamedTuple):
@@ -104,23 +115,84 @@ def linearise_scenario(scenario: Scenario, rest: Equilibrium) -> LinearLoop:
     return linearise_loop(derive_operating_conditions(scenario), rest)
 
 
-def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns the arguments of every site's rates at an equilibrium, shape (N, arguments)."""
-    at = lay_out_arguments(conditions.sites[0])
-    x = np.zeros((len(conditions.sites), at.arguments))
-    x[:, at.q], x[:, at.estimate] = rest.q, rest.theta_hat
-    x[:, at.q_des] = conditions.alpha @ rest.q
-    acting = np.array([one.external + one.held for one in conditions.rates(x)])
-    x[:, at.peer_torque] = conditions.alpha @ acting
-    return x
+def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns the arguments of every site's rates at an equilibrium, shape (arguments,) each."""
+    arguments = []
+    for site, q, theta_hat in zip(conditions.sites, rest.q, rest.theta_hat, strict=True):
+        at = lay_out_arguments(site)
+        x = np.zeros(at.arguments)
+        x[at.q], x[at.estimate] = q[: at.joints], theta_hat[: at.parameters]
+        arguments.append(x)
+    for x, site, x_des in zip(arguments, conditions.sites, find_references(conditions, rest), strict=True):
+        x[lay_out_arguments(site).q_des] = x_des
+    reflected = [one.reflected for one in conditions.rates(arguments)]
+    for x, site, felt in zip(arguments, conditions.sites, conditions.alpha @ reflected, strict=True):
+        x[lay_out_arguments(site).peer_torque] = felt
+    return arguments
 
 
-def find_loop_states(conditions: OperatingConditions) -> NDArray[np.bool_]:
-    """Returns which states of every site are in the loop, shape (N, states): estimates if it learns."""
-    at = lay_out_arguments(conditions.sites[0])
-    mask = np.ones((len(conditions.sites), at.states), dtype=bool)
-    mask[[not has_estimate(site) for site in conditions.sites], at.estimate] = False
-    return mask
+def _share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns what each site shares of its pose at an equilibrium."""
+    return [
+        share_own_pose(site, q[: site.layout.joints])
+        for site, q in zip(conditions.sites, rest.q, strict=True)
+    ]
+
+
+def find_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns what each site follows at an equilibrium, shape (m,) each."""
+    shared = _share_poses(conditions, rest)
+    if not conditions.sites[0].layout.task:
+        return list(conditions.alpha @ np.array(shared))
+    return [evaluate_reference(row, own, shared) for row, own in zip(conditions.alpha, shared, strict=True)]
+
+
+def differentiate_references(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> dict[tuple[int, int], Array]:
+    """Returns the derivative of what site i follows by what site j shares, shape (m, m), by (i, j).
+
+    It is alpha_ij but for orientations that do not agree, which have one by the site's own pose as well.
+    """
+    found, shared = {}, _share_poses(conditions, rest)
+    for i, row in enumerate(conditions.alpha):
+        for j in np.flatnonzero(row):
+            found[i, int(j)] = row[j] * np.eye(len(shared[i]))
+        if len(shared[i]) > PLACE_COORDINATES and conditions.sites[i].layout.task:
+            for peer in {i, *np.flatnonzero(row).tolist()}:
+                found[i, peer] = _differentiate_reference(row, i, peer, shared)
+    return found
+
+
+def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) -> Array:
+    """Returns the derivative of what site i follows by what j shares, by a complex step."""
+    poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
+    poses[j] = poses[j] + 1j * COMPLEX_STEP * np.eye(len(shared[j]))
+    derivative: Array = evaluate_reference(row, poses[i], poses).imag / COMPLEX_STEP
+    return derivative
+
+
+def couple_sites(
+    conditions: OperatingConditions, rest: Equilibrium, sites: list[SiteJacobian]
+) -> dict[tuple[int, int], Array]:
+    """Returns the effect of what j sent on what comes to i, shape (3 m, 3 m), by (i, j)."""
+    references = differentiate_references(conditions, rest)
+    coupling = {}
+    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
+        share = conditions.alpha[i, j] * np.eye(sites[i].at.coordinates)
+        coupling[int(i), int(j)] = block_diag(references[int(i), int(j)], share, share)
+    return coupling
+
+
+def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
+    """Returns which states of every site are in the loop, shape (states,) each: estimates if it learns."""
+    masks = []
+    for site in conditions.sites:
+        at = lay_out_arguments(site)
+        mask = np.ones(at.states, dtype=bool)
+        mask[at.estimate] = has_estimate(site)
+        masks.append(mask)
+    return masks
 
 
 def differentiate_rates(
@@ -130,10 +202,14 @@ def differentiate_rates(
 
     `every_estimate`: of chains too each estimate is a state, and not only what they say of gravity.
     """
-    x = gather_site_arguments(conditions, rest)
+    x, references = gather_site_arguments(conditions, rest), differentiate_references(conditions, rest)
     jacobians = []
-    for site, own in zip(conditions.sites, x, strict=True):
+    for i, (site, own) in enumerate(zip(conditions.sites, x, strict=True)):
         at, rates = lay_out_arguments(site), differentiate_site_rates(site, own)
+        if (i, i) in references:  # what it follows depends on its own orientation
+            of_own = references[i, i] @ rates.x[:, : at.states]
+            for by in rates:
+                by[:, : at.states] += by[:, at.q_des] @ of_own
         learnt = tuple(f"theta{p + 1}" for p in range(at.parameters))
         if not has_estimate(site):
             jacobian = _replace_estimate(at, rates, np.zeros((0, at.parameters)), ())
@@ -173,7 +249,7 @@ def _replace_estimate(at: ArgumentLayout, rates: SiteRates, T: Array, names: tup
 
     converted = SiteRates(*map(convert, rates))
     return SiteJacobian(
-        ArgumentLayout(at.joints, len(T)),
+        at._replace(parameters=len(T)),
         converted._replace(estimate=T @ converted.estimate),
         (*_name_motion(at.joints), *names),
     )
@@ -184,32 +260,34 @@ def linearise_loop(
 ) -> LinearLoop:
     """Returns the loop under given conditions, linearised at an equilibrium; see `differentiate_rates`."""
     sites = differentiate_rates(conditions, rest, every_estimate=every_estimate)
-    n = sites[0].at.joints
-    first = np.cumsum([0, *(one.at.states for one in sites)])
-    size, count = int(first[-1]), n * len(sites)
-    own = [slice(a, b) for a, b in pairwise(first.tolist())]
-    ports = [slice(n * i, n * (i + 1)) for i in range(len(sites))]
+    own, ports = (
+        [slice(a, b) for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
+        for lengths in ([one.at.states for one in sites], [one.at.joints for one in sites])
+    )
+    size, count = own[-1].stop, ports[-1].stop
     A, B, C = np.zeros((size, size)), np.zeros((size, count)), np.zeros((count, size))
     terms: dict[float, tuple[Array, Array]] = {}
+    effects = []
     for i, (at, rates, _, _) in enumerate(sites):
-        by = np.vstack([np.eye(n, at.arguments, at.qd.start), rates.qdd, rates.estimate])
+        by = np.vstack([np.eye(at.joints, at.arguments, at.qd.start), rates.qdd, rates.estimate])
         A[own[i], own[i]], B[own[i], ports[i]] = by[:, : at.states], by[:, at.external_torque]
-        C[ports[i], own[i]] = np.eye(n, at.states, at.qd.start)
-        for j in np.flatnonzero(conditions.alpha[i]):
-            delay_s, share = float(conditions.age_s[i, j]), conditions.alpha[i, j]
-            late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
-            peer, of_peer = sites[j].at, late_A[own[i], own[j]]
-            of_peer[:, peer.q] += share * by[:, at.q_des]
-            of_peer[:, peer.qd] += share * by[:, at.qd_des]
-            reflected = share * by[:, at.peer_torque]
-            on_arm = sites[j].rates.external + sites[j].rates.held
-            of_peer += reflected @ on_arm[:, : peer.states]
-            late_B[own[i], ports[j]] += reflected @ on_arm[:, peer.external_torque]
+        C[ports[i], own[i]] = np.eye(at.joints, at.states, at.qd.start)
+        effects.append(by[:, at.inputs])
+    for (i, j), coupling in couple_sites(conditions, rest, sites).items():
+        delay_s, effect = float(conditions.age_s[i, j]), effects[i] @ coupling
+        late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
+        peer, m = sites[j], sites[j].at.coordinates
+        late_A[own[i], own[j]] += effect @ peer.sent
+        late_B[own[i], ports[j]] += effect[:, 2 * m :] @ peer.rates.reflected[:, peer.at.external_torque]
     names = [
         f"{name}.{state}" for name, one in zip(conditions.names, sites, strict=True) for state in one.states
     ]
     inputs, outputs = (
-        tuple(f"{name}.{kind}{j + 1}" for name in conditions.names for j in range(n))
+        tuple(
+            f"{name}.{kind}{j + 1}"
+            for name, one in zip(conditions.names, sites, strict=True)
+            for j in range(one.at.joints)
+        )
         for kind in ("tau", "qd")
     )
     delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))

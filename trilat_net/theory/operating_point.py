@@ -9,6 +9,7 @@ as a run makes.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -29,15 +30,14 @@ from ..scenario.imported_law import ImportedLaw, PluggedLaw
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .site_dynamics import SiteRates, evaluate_site_rates
-from .textbook_arm import Numbers
 
 
 class Equilibrium(NamedTuple):
     """The pose about which a loop is linearised, all sites at rest.
 
     Attributes:
-        q: joint angles, shape (N, n), rad.
-        theta_hat: estimates, shape (N, P); of a law that knows gravity the parameters that it assumes.
+        q: joint angles, shape (N, n), rad; of arms with fewer joints followed by zeros.
+        theta_hat: estimates, shape (N, P), so as well; of a law that knows gravity what it assumes.
         how: the way it was found, in words.
         residual: the largest remaining acceleration, rad/s^2, or rate of an estimate.
         notes: remarks on it.
@@ -90,7 +90,7 @@ class OperatingConditions(NamedTuple):
         """True if the sampled loop alone tells what the tick does: digital controllers, sampled actors."""
         return self.digital or any(actor.sampled for site in self.sites for actor in site.actors)
 
-    def rates(self, x: Numbers) -> list[SiteRates]:
+    def rates(self, x: Sequence[Array]) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
         return [evaluate_site_rates(site, own) for site, own in zip(self.sites, x, strict=True)]
 
@@ -134,13 +134,6 @@ def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
     """Returns the gains of every site, of a plugged law those of its small motions."""
     found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
-        if spec.task.space != "joints":
-            raise ScenarioError(
-                f"is {spec.task.space!r}: loops are linearised joint by joint, and not in task space, where "
-                "sites are coupled through J(q) and its inverse",
-                path=f"sites.{name}.task.space",
-                source=scenario.name,
-            )
         law, theta = spec.control, scenario.arms[name].theta
         gains = law.linear_gains(theta) if isinstance(law, PluggedLaw) else law.gains(theta)
         if gains is None:

@@ -5,10 +5,13 @@ that a held pose can be analysed too. An unstable loop has no steady oscillation
 instability counts. Every result holds for the analysed band.
 """
 
+from collections.abc import Mapping
 from itertools import combinations
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..analysis.json_values import finite_or_none
 from ..analysis.lyapunov_weights import compute_lyapunov_weights
@@ -56,6 +59,8 @@ from .port_response import (
     to_imaginary_axis,
 )
 from .port_transparency import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
+from .task_ports import list_followed_axes, name_ports, use_end_effector_ports
+from .textbook_task import PLACE_COORDINATES
 
 
 def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) -> OperatingConditions:
@@ -71,33 +76,42 @@ def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
     """Returns the loop at whose ports operators and environments act, without them."""
-    return linearise_loop(freeze_external_torques(conditions, rest), rest)
+    frozen = freeze_external_torques(conditions, rest)
+    return use_end_effector_ports(frozen, rest, linearise_loop(frozen, rest))
 
 
 def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> LoopOutput | None:
     """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
 
-    None if a site has another law than the paper's, which has no r.
+    In task space it is J r, with places in q's stead. None if a site has another law than the paper's, which
+    has no r, and where orientations are followed, or axes that a peer leaves free: there is no proof.
     """
     if any(site.gains.law is not Law.ADAPTIVE for site in conditions.sites):
+        return None
+    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE_COORDINATES:
         return None
     C = loop.C.copy()
     delays_s = conditions.age_s[conditions.alpha != 0.0]
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
     for i, site in enumerate(conditions.sites):
-        for joint in range(len(ports := find_site_ports(loop, site.name))):
-            row = ports[joint]
-            C[row, loop.names.index(f"{site.name}.q{joint + 1}")] += site.gains.Lambda[joint]
+        Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
+        for row, joint in zip(find_site_ports(loop, site.name), list_followed_axes(site), strict=True):
+            C[row, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
             for j in np.flatnonzero(conditions.alpha[i]):
-                angle = loop.names.index(f"{conditions.sites[j].name}.q{joint + 1}")
-                factor = site.gains.Lambda[joint] * conditions.alpha[i, j]
+                if joint not in list_followed_axes(conditions.sites[j]):
+                    continue
+                angle = loop.names.index(f"{conditions.sites[j].name}.q{joint}")
+                factor = Lambda[joint - 1] * conditions.alpha[i, j]
                 delayed[float(conditions.age_s[i, j])][row, angle] -= factor
     return LoopOutput(C, tuple(sorted(delayed.items())))
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """Returns beta_i = pi_i / c_i of the corrected proof (docs/errata.md), sum N, shape (N,)."""
-    Kd = np.array([site.gains.Kd for site in conditions.sites])
+    Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
+    for own, site in zip(Kd, conditions.sites, strict=True):
+        followed = [n - 1 for n in list_followed_axes(site)]
+        own[followed] = np.broadcast_to(site.gains.Kd, own.shape)[followed]
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
@@ -106,7 +120,7 @@ class TwoPort(NamedTuple):
 
     Attributes:
         sites: the two.
-        joint: the joint, from 1 on; no operator is at the other joints.
+        joint: the joint, or coordinate of the task, from 1 on; no operator is at the others.
         clamped: the third site if it is clamped; "" if it is free, or there is none.
         minima: the parameter over frequency, and the bands where it is below 1.
     """
@@ -137,6 +151,7 @@ class PortAnalysis(NamedTuple):
         two_ports: Llewellyn's criterion for every pair of sites.
         transparency: at each site, with one other site free and clamped.
         clamped_verdict: of the roots with that other site clamped.
+        axes: names of the ports' numbers in task space, whose ports are forces along them; {}: joints.
     """
 
     sites: tuple[str, ...]
@@ -153,6 +168,29 @@ class PortAnalysis(NamedTuple):
     two_ports: tuple[TwoPort, ...]
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
+    axes: Mapping[int, str] = MappingProxyType({})
+
+    @property
+    def kind(self) -> str:
+        """What a port belongs to: a joint, or an axis of the task."""
+        return "axis" if self.axes else "joint"
+
+    @property
+    def speed(self) -> str:
+        """Symbol of the velocities at the ports."""
+        return "xd" if self.axes else "qd"
+
+    def name_port(self, number: int) -> str:
+        """Returns the name of the ports of a number: "joint 2", or "axis y" of a task."""
+        return f"{self.kind} {self.axes.get(number, number)}"
+
+    def impedance_unit(self, number: int = 0) -> str:
+        """Returns the unit of an impedance at the ports of a number; 0: at all of them."""
+        turns = not self.axes or max(self.axes) > PLACE_COORDINATES
+        units = {
+            "N s/m" if self.axes and port <= PLACE_COORDINATES else "N m s/rad" for port in [number] if port
+        }
+        return " and ".join(units or (["N s/m"] if self.axes else []) + ["N m s/rad"] * turns)
 
 
 def analyse_ports(
@@ -178,7 +216,6 @@ def analyse_ports(
     Y = build_admittance(loop)
     w_rad_s = refine_frequencies(Y, build_frequency_grid(*band_hz, delay_s))
     Y = cache_response(Y, w_rad_s)
-    owner = np.array([sites.index(parse_port_site(port)) for port in loop.inputs])
     return PortAnalysis(
         sites=sites,
         band_hz=band_hz,
@@ -193,10 +230,11 @@ def analyse_ports(
         proof=_check_proof(conditions, loop, w_rad_s),
         beta=compute_proof_weights(conditions),
         estimates_true=all(
-            np.allclose(own, site.theta) for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
+            np.allclose(own[: len(site.theta)], site.theta)
+            for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
         ),
         absolute=find_minima(
-            lambda w: find_best_weights(Y(w), owner).margin,
+            lambda w: find_best_weights(Y(w), _find_owners(loop)).margin,
             w_rad_s,
             tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
         ),
@@ -205,12 +243,19 @@ def analyse_ports(
             one for site in sites if site != of for one in measure_transparency(loop, site, of)
         ),
         clamped_verdict=compute_delay_spectrum(apply_loads(loop, {of: CLAMPED}), 1).verdict,
+        axes=name_ports(conditions),
     )
+
+
+def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
+    """Returns the place of the site of each port among the sites of the ports."""
+    sites = list_port_sites(loop)
+    return np.array([sites.index(parse_port_site(port)) for port in loop.inputs], dtype=np.int64)
 
 
 def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
     output = build_proof_output(conditions, loop)
-    beta = np.repeat(compute_proof_weights(conditions), len(loop.inputs) // len(conditions.sites))
+    beta = compute_proof_weights(conditions)[_find_owners(loop)]
     if output is None or not (beta > 0.0).all():
         return None
     return check_passivity(lambda w: evaluate_transfer(loop, to_imaginary_axis(w), output), w_rad_s, beta)
@@ -224,7 +269,8 @@ def _check_two_ports(loop: LinearLoop, Y: PortResponse, w_rad_s: Array) -> tuple
             fixed = find_site_ports(loop, clamped) if clamped else []
             for joint, places in group_ports_by_joint(loop).items():
                 keep = [port for port in places if parse_port_site(loop.inputs[port]) in pair]
-                two_ports.append(TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s)))
+                if len(keep) == len(pair):
+                    two_ports.append(TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s)))
     return tuple(two_ports)
 
 
@@ -246,18 +292,23 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
         "roots": ports.verdict,
         "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
         "passive_qd": _passivity_to_json(ports.velocity),
-        "passive_qd_of_joint": {str(joint): _passivity_to_json(one) for joint, one in ports.joints.items()},
+        "passive_qd_of_joint": {
+            ports.axes.get(joint, str(joint)): _passivity_to_json(one) for joint, one in ports.joints.items()
+        },
         "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
         "beta": ports.beta.tolist(),
         "estimates_true": ports.estimates_true,
         "absolute": _minima_to_json(ports.absolute),
         "llewellyn": [
-            {"sites": list(one.sites), "joint": one.joint, "clamped": one.clamped}
+            {"sites": list(one.sites), "joint": ports.axes.get(one.joint, one.joint), "clamped": one.clamped}
             | _minima_to_json(one.minima)
             for one in ports.two_ports
         ],
         "roots_clamped": ports.clamped_verdict,
-        "felt": [_transparency_to_json(one) for one in ports.transparency],
+        "felt": [
+            _transparency_to_json(one) | {"joint": ports.axes.get(one.joint, one.joint)}
+            for one in ports.transparency
+        ],
     }
 
 

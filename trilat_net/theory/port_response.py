@@ -135,7 +135,7 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     places: dict[int, list[int]] = {}
     for place, name in enumerate(loop.inputs):
         places.setdefault(int(name.rpartition("tau")[2]), []).append(place)
-    return places
+    return dict(sorted(places.items()))
 
 
 def select_ports(response: PortResponse, places: list[int]) -> PortResponse:

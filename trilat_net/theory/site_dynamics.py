@@ -17,8 +17,9 @@ from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .textbook_arm import Numbers, PlacedArm, PlacedChain, multiply_columns
+from .textbook_task import Following, follow_in_task, follow_joints, share_pose
 
-_STEP = 1e-30
+COMPLEX_STEP = 1e-30
 SWITCHING_TOLERANCE = 1e-9
 """A wall this near, m, or an estimate this near to an end of its box, is at its switching point."""
 
@@ -27,12 +28,14 @@ class ArgumentLayout(NamedTuple):
     """Where the parts of a site's argument stand, in their order: state, reference, torques.
 
     Attributes:
-        joints: length of each part but the estimate.
+        joints: length of each part but the estimate and what comes from peers.
         parameters: length of the estimate.
+        shared: length of what comes from peers, of each of its three parts; 0: as many as there are joints.
     """
 
     joints: int
     parameters: int
+    shared: int = 0
 
     @property
     def q(self) -> slice:
@@ -54,12 +57,23 @@ class ArgumentLayout(NamedTuple):
         """Length of a site's state: q, qd and theta_hat."""
         return 2 * self.joints + self.parameters
 
+    @property
+    def coordinates(self) -> int:
+        """Length of each part that comes from peers."""
+        return self.shared or self.joints
+
+    @property
+    def inputs(self) -> slice:
+        """What comes from peers: the reference, its derivative, and their torque."""
+        return slice(self.states, self.states + 3 * self.coordinates)
+
     def _input(self, place: int) -> slice:
-        return slice(self.states + place * self.joints, self.states + (place + 1) * self.joints)
+        first = self.states + place * self.coordinates
+        return slice(first, first + self.coordinates)
 
     @property
     def q_des(self) -> slice:
-        """The reference, q_id."""
+        """The reference, q_id; in task space a pose, see `textbook_task`."""
         return self._input(0)
 
     @property
@@ -69,23 +83,23 @@ class ArgumentLayout(NamedTuple):
 
     @property
     def peer_torque(self) -> slice:
-        """The exogenous torque of the peers."""
+        """The exogenous torque of the peers; in task space their force."""
         return self._input(2)
 
     @property
     def external_torque(self) -> slice:
         """Torque that an operator adds ON the joints."""
-        return self._input(3)
+        return slice(self.inputs.stop, self.arguments)
 
     @property
     def arguments(self) -> int:
         """Length of the whole argument."""
-        return self.states + 4 * self.joints
+        return self.states + 3 * self.coordinates + self.joints
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
     """Returns the layout of the arguments of a site's rates."""
-    return ArgumentLayout(site.layout.joints, site.layout.parameters)
+    return ArgumentLayout(site.layout.joints, site.layout.parameters, site.layout.shared)
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
@@ -102,6 +116,10 @@ class SiteRates(NamedTuple):
         tau: the torque of the control law, unclamped, shape (n, ...), N m.
         external: the torque of operators and environments that act continuously, shape (n, ...), N m.
         held: the torque of those that are sampled and held, shape (n, ...), N m.
+        x: what peers get of the pose, shape (m, ...): the angles, or place and orientation, see
+            `textbook_task.Following`.
+        xd: its velocity.
+        reflected: the external and held torque as peers get it, a force in task space.
     """
 
     qdd: Numbers
@@ -109,6 +127,26 @@ class SiteRates(NamedTuple):
     tau: Numbers
     external: Numbers
     held: Numbers
+    x: Numbers
+    xd: Numbers
+    reflected: Numbers
+
+
+def follow_peers(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
+    """Returns how a site follows what came from its peers, in its space."""
+    at, Lambda = lay_out_arguments(site), _as_columns(site.gains.Lambda, x)
+    motion = (Lambda, x[at.q], x[at.qd], x[at.q_des], x[at.qd_des])
+    if site.layout.task and isinstance(arm, PlacedChain):
+        return follow_in_task(site, arm, *motion)
+    return follow_joints(*motion)
+
+
+def share_own_pose(site: SiteSetup, q: Numbers) -> Numbers:
+    """Returns what a site shares of its poses q, shape (n, ...): them, or its end effector's."""
+    arm = place_arm(site, q)
+    if isinstance(arm, PlacedChain) and site.chain is not None and site.chain.task is not None:
+        return share_pose(site.chain.task, arm)
+    return q
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
@@ -118,17 +156,19 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     """
     at = lay_out_arguments(site)
     arm, qd = place_arm(site, x[at.q]), x[at.qd]
-    tau, estimate = _evaluate_law(site, arm, x)
+    following = follow_peers(site, arm, x)
+    tau, estimate = _evaluate_law(site, arm, following, x)
     external = x[at.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
     qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, tau + external + held)
-    return SiteRates(qdd, estimate, tau, external, held)
+    reflected = following.from_joints(external + held)
+    return SiteRates(qdd, estimate, tau, external, held, following.x, following.xd, reflected)
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
     """Returns the derivatives of the rates at x by a complex step, a column per entry of x each."""
-    stepped = x[:, np.newaxis] + 1j * _STEP * np.eye(len(x))
-    return SiteRates(*(rate.imag / _STEP for rate in evaluate_site_rates(site, stepped)))
+    stepped = x[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(len(x))
+    return SiteRates(*(rate.imag / COMPLEX_STEP for rate in evaluate_site_rates(site, stepped)))
 
 
 def has_estimate(site: SiteSetup) -> bool:
@@ -142,19 +182,21 @@ def _as_columns(values: object, like: Numbers) -> Numbers:
     return column.reshape(column.shape + (1,) * (like.ndim - 1)) + np.zeros(like.shape[1:])
 
 
-def _evaluate_law(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> tuple[Numbers, Numbers]:
+def _evaluate_law(
+    site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
+) -> tuple[Numbers, Numbers]:
     """Returns the torque of the law, unclamped, and the rate of its estimate."""
     at, gains = lay_out_arguments(site), site.gains
     q, qd, estimate = x[at.q], x[at.qd], x[at.estimate]
-    e, ed = q - x[at.q_des], qd - x[at.qd_des]
-    Kd = _as_columns(gains.Kd, q)
+    _, _, e, ed, v, a, *_ = following
+    pull = _as_columns(gains.Kd, q) * ed
     if not has_estimate(site):
         K, d, k_f = (_as_columns(gain, q) for gain in (gains.K, gains.d, gains.k_f))
         G = arm.gravity_torque(_as_columns(np.broadcast_to(gains.known, site.theta.shape), q))
-        return G - K * e - d * qd - Kd * ed + k_f * x[at.peer_torque], 0.0 * estimate
-    Lambda, Kp = _as_columns(gains.Lambda, q), _as_columns(gains.Kp, q)
-    v, a, r = -Lambda * e, -Lambda * ed, qd + Lambda * e
-    tau = arm.required_torque(estimate, qd, v, a) - Kp * r - Kd * ed
+        pull = pull + K * e - k_f * x[at.peer_torque]
+        return G - d * qd - following.to_joints(pull), 0.0 * estimate
+    r = qd - v
+    tau = arm.required_torque(estimate, qd, v, a) - _as_columns(gains.Kp, q) * r - following.to_joints(pull)
     rho, width, known = (_as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction))
     tau = tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)
     Y = arm.regressor_matrix(qd, v, a)

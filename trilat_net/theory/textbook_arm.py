@@ -206,7 +206,7 @@ class PlacedChain:
         R_base, place_m = np.multiply.outer(np.eye(3), np.ones(columns)), np.zeros((3, *columns))
         for i, joint in enumerate(chain.joints):
             R, p = _place_joint(joint, q[i])
-            X = np.zeros((6, 6, *columns), R.dtype)
+            X = np.zeros((6, 6, *columns), np.result_type(R, p))
             X[:3, :3] = X[3:, 3:] = R.swapaxes(0, 1)
             X[:3, 3:] = -_multiply(R.swapaxes(0, 1), build_cross_matrix(p))
             S = np.zeros(6)
@@ -296,11 +296,42 @@ class PlacedChain:
         position: Numbers = last.place_m + multiply_columns(last.R_base, tip)
         return position
 
+    def end_effector_orientation(self) -> Numbers:
+        """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""
+        turned: Numbers = np.einsum("ab...,bc->ac...", self._links[-1].R_base, self._chain.tip_rotation)
+        return turned
+
     def position_jacobian(self) -> Numbers:
         """Returns the Jacobian of the end effector's position, shape (3, n, ...), m/rad or 1."""
-        last = self._links[-1]
-        across = np.einsum("ab,bn...->an...", build_cross_matrix(np.array(self._chain.tip_m)), last.J[3:])
-        return _multiply(last.R_base, last.J[:3] - across)
+        return self.pose_jacobian()[:3]
+
+    def pose_jacobian(self) -> Numbers:
+        """Returns the Jacobian of the end effector's velocity and turning, base axes, shape (6, n, ...)."""
+        return self._carry_to_tip(self._links[-1].J)
+
+    def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
+        """Returns the derivative of that Jacobian along qd, shape (6, n, ...).
+
+        Of column k in the frame of the last link it is X (V_k x S_k) - V x (X S_k); the frame turns with it.
+        """
+        V_last = multiply_columns(self._links[-1].J, qd)
+        rate = np.zeros(self._links[-1].J.shape, np.result_type(self._links[-1].J, qd))
+        for k, (X, S, J, _, _) in enumerate(self._links):
+            rate = _multiply(X, rate)
+            rate[:, k] += multiply_columns(
+                _cross_motion(multiply_columns(J, qd)), np.multiply.outer(S, np.ones(qd.shape[1:]))
+            )
+        rate = self._carry_to_tip(rate - _multiply(_cross_motion(V_last), self._links[-1].J))
+        turning = build_cross_matrix(multiply_columns(self._links[-1].R_base, V_last[3:]))
+        J = self.pose_jacobian()
+        turned: Numbers = np.concatenate([_multiply(turning, J[:3]), _multiply(turning, J[3:])])
+        return rate + turned
+
+    def _carry_to_tip(self, columns: Numbers) -> Numbers:
+        """Returns spatial motions of the last link as those of the end effector in base axes."""
+        R, tip = self._links[-1].R_base, build_cross_matrix(np.array(self._chain.tip_m))
+        linear = columns[:3] - np.einsum("ab,bn...->an...", tip, columns[3:])
+        return np.concatenate([_multiply(R, linear), _multiply(R, columns[3:])])
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:

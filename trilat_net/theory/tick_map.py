@@ -32,7 +32,7 @@ from .characteristic_roots import (
     refine_roots,
     sort_root_guesses,
 )
-from .linear_loop import SiteJacobian, differentiate_rates, linearise_loop
+from .linear_loop import SiteJacobian, couple_sites, differentiate_rates, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
 
 MAX_COMPANION_SIZE = 600
@@ -57,8 +57,8 @@ class SiteTickMap(NamedTuple):
 
     Attributes:
         P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque before.
-        Q: shape (n, 3 joints).
-        sent: its output to peers, shape (3 joints, n): q, qd, and the torque on its arm.
+        Q: shape (n, 3 m).
+        sent: its output to peers, shape (3 m, n), see `SiteJacobian.sent`.
         names: of its states.
     """
 
@@ -73,9 +73,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> 
     at, rates = jacobian.at, jacobian.rates
     second = site.scheme is Scheme.SECOND_ORDER
     arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
-    inputs = slice(at.q_des.start, at.peer_torque.stop)
     n = at.states + (at.joints if second else 0)
-    own, peers = np.eye(at.arguments, n), np.eye(at.arguments, 3 * at.joints, -inputs.start)
+    own, peers = np.eye(at.arguments, n), np.eye(at.arguments, 3 * at.coordinates, -at.inputs.start)
     own[at.states :] = 0.0
     inverse_inertia = rates.qdd[:, at.external_torque]
     zero = np.zeros((at.joints, at.joints))
@@ -96,9 +95,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> 
     P[memory, memory] += np.eye(at.parameters)
     if second:
         P[arm, memory.stop :] -= 0.5 * Gamma
-    sent = np.zeros((3 * at.joints, n))
-    sent[arm, arm] = np.eye(arm.stop)
-    sent[arm.stop :, arm] = (rates.external + rates.held)[:, arm]
+    sent = np.zeros((3 * at.coordinates, n))
+    sent[:, : at.states] = jacobian.sent
     states = (*jacobian.states, *(f"tau{joint + 1}" for joint in range(at.joints) if second))
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
 
@@ -177,10 +175,10 @@ def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> Mov
     at = [slice(a, b) for a, b in itertools.pairwise(ends)]
     S = block_diag(*(one.P for one in maps))
     Sd: dict[int, Array] = {}
-    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
+    for (i, j), coupling in couple_sites(conditions, rest, sites).items():
         d = max(1, round(float(conditions.age_s[i, j]) / h_s))
         S_d = Sd.setdefault(d, np.zeros_like(S))
-        S_d[at[i], at[j]] += conditions.alpha[i, j] * maps[i].Q @ maps[j].sent
+        S_d[at[i], at[j]] += maps[i].Q @ coupling @ maps[j].sent
     ticks = np.array(sorted(Sd), dtype=np.int64)
     delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
     moving = extract_moving_part(Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names])

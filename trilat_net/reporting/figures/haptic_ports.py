@@ -46,14 +46,14 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
             of_joint = [one for one in ports.transparency if one.joint == joint]
             magnitude, phase = grid[top : top + 2, column]
             _plot_impedance(ports, of_joint, magnitude, phase)
-            magnitude.set_title(f"joint {joint}" + ("" if crowded else _describe_ratios(of_joint)))
+            magnitude.set_title(ports.name_port(joint) + ("" if crowded else _describe_ratios(of_joint)))
             if place + columns >= len(joints):
                 phase.set_xlabel("frequency (Hz)")
                 phase.xaxis.set_tick_params(labelbottom=True)
             if crowded:
                 phase.set_xticks((0.1, 1.0, 10.0))  # those at the ends meet the next panel's
             if not column:
-                magnitude.set_ylabel("|Z| (N m s/rad)")
+                magnitude.set_ylabel(f"|Z| ({ports.impedance_unit(joint)})")
                 phase.set_ylabel("phase (degrees)")
                 phase.yaxis.set_major_locator(MultipleLocator(45.0))
         for column in range(len(joints) - columns * (blocks - 1), columns):
@@ -108,10 +108,11 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         (_plot_parameters if len(ports.sites) == 2 else _plot_margin)(ports, below)
         below.set(xlim=ports.band_hz, xlabel="frequency (Hz)")
         figure.align_ylabels()
-        proof = [] if ports.proof is None else [("all joints, in r (weighted)", _PROOF)]
-        joints = [(f"joint {joint} alone", _joint_line(joint)) for joint in ports.joints]
+        every = "axes" if ports.axes else "joints"
+        proof = [] if ports.proof is None else [(f"all {every}, in r (weighted)", _PROOF)]
+        joints = [(f"{ports.name_port(joint)} alone", _joint_line(joint)) for joint in ports.joints]
         fails = ("fails", {**_FAILS, "linewidth": 6.0})
-        style.add_legend(figure, [("all joints", _ALL), *joints, *proof, fails])
+        style.add_legend(figure, [(f"all {every}", _ALL), *joints, *proof, fails])
     return figure
 
 

@@ -1,0 +1,243 @@
+"""The linear loop of sites in task space: against joint space where they are one, and against runs."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.core.chain_references import ARMS
+from tests.task_arms import planar_task, posed_arms
+from tests.theory.loops import Array
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.execution.fused import FusedRun
+from trilat_net.reporting.port_text import describe_ports
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium, find_linear_edge
+from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part
+from trilat_net.theory.delay_margin import set_common_delay
+from trilat_net.theory.equilibrium import find_mean_pose
+from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
+from trilat_net.theory.port_response import build_admittance
+from trilat_net.theory.tick_map import build_companion_matrix, build_tick_pencil, compute_sampled_spectrum
+
+SLIDERS = """<robot name="sliders"><link name="base"/>
+{links}
+</robot>"""
+SLIDER = """<link name="l{n}"><inertial><origin xyz="0.1 0.2 0.3"/><mass value="{mass}"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+<joint name="j{n}" type="prismatic"><parent link="{parent}"/><child link="l{n}"/>
+<axis xyz="{axis}"/><limit lower="-9" upper="9" effort="900" velocity="9"/></joint>"""
+CARTESIAN = """
+name = "cartesian"
+[arm]
+urdf = "sliders.urdf"
+[link]
+delay_ms = 60
+[sites.m]
+q0_rad = [0.3, 0.1, 0.2]
+[sites.s]
+role = "slave"
+[dominance]
+m = { s = 1.0 }
+s = { m = 1.0 }
+"""
+ROWS = ["1 0 0", "0 1 0", "0 0 1"]
+LAWS: dict[str, dict[str, Any]] = {
+    "adaptive": {
+        "law": "adaptive",
+        "Lambda": [1.5, 2.0, 1.0],
+        "Kp": [9, 7, 5],
+        "Kd": [4, 3, 6],
+        "Gamma": 2.0,
+    },
+    "pd_d": {"law": "pd_d", "K": [60.0, 40.0, 50.0], "Kd": [3.0, 5.0, 4.0], "d": [9.0, 8.0, 7.0]},
+    "p_f": {"law": "p_f", "K": [60.0, 40.0, 50.0], "d": [9.0, 8.0, 7.0], "k_f": [0.2, 0.3, 0.1]},
+}
+HAND = {"kind": "spring", "stiffness_nm_rad": [20.0, 30.0, 10.0], "damping_nm_s_rad": 2.0, "to_rad": 0.0}
+
+
+def cartesian(law: str, space: str) -> Scenario:
+    """Two arms of three sliders, heavier from slider to slider, with an operator who is felt."""
+    links = "\n".join(
+        SLIDER.format(n=n, mass=3 - 0.5 * n, parent=f"l{n - 1}" if n else "base", axis=axis)
+        for n, axis in enumerate(ROWS)
+    )
+    changes: dict[str, Any] = {
+        "control": LAWS[law],
+        "sites.s.hands": [HAND],
+        "urdf": {"sliders.urdf": SLIDERS.format(links=links)},
+    }
+    return parse_scenario(CARTESIAN, "cartesian", changes | {"task.space": space})
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
+    """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
+    found = []
+    for space in ("joints", "position"):
+        scenario = cartesian(law, space)
+        rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
+        conditions = derive_operating_conditions(scenario)
+        loop = linearise_loop(conditions, rest)
+        spectrum = compute_delay_spectrum(loop, 12)
+        near = np.array([root.s for root in spectrum.roots])
+        sampled = compute_sampled_spectrum(conditions, rest, near, 12)
+        Y = build_admittance(linearise_teleoperator(conditions, rest))(np.array([0.1, 3.0, 40.0]))
+        found.append((rest.q, loop, spectrum, sampled, Y))
+    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = found
+    assert q_task == pytest.approx(q, abs=1e-12)
+    assert loop_task.names == loop.names
+    assert (other.zeros, other.drifting) == (one.zeros, one.drifting)
+    assert sampled is not None
+    assert sampled_task is not None
+    for a, b in ((one, other), (sampled, sampled_task)):
+        assert len(a.roots) == len(b.roots)
+        for first, second in zip(a.roots, b.roots, strict=True):
+            assert abs(first.s - second.s) <= 1e-9 * (1.0 + abs(first.s))
+    assert np.abs(Y - Y_task).max() <= 1e-9 * np.abs(Y).max()
+
+
+def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> Scenario:
+    """The scenario with its sites at a rest but for deviations of its states, by their names."""
+    changes: dict[str, Any] = {}
+    for name, q, theta_hat in zip(scenario.names, rest.q, rest.theta_hat, strict=True):
+        counts = scenario.arms[name].counts
+
+        def put(kind: str, values: Array, name: str = name) -> list[float]:
+            return [value + off.get(f"{name}.{kind}{n}", 0.0) for n, value in enumerate(values.tolist(), 1)]
+
+        changes[f"sites.{name}.q0_rad"] = put("q", q[: counts.joints])
+        changes[f"sites.{name}.qd0_rad_s"] = put("qd", 0.0 * q[: counts.joints])
+        changes[f"sites.{name}.control.theta_hat0"] = put("theta", theta_hat[: counts.parameters])
+        if scenario.sites[name].task.posture_rate_1_s:
+            changes[f"sites.{name}.task.posture_rad"] = q[: counts.joints].tolist()
+    return load_scenario(scenario, changes)
+
+
+def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
+    """Deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
+    run, rows = FusedRun(scenario), []
+    for k in range(1, steps + 1):
+        run.advance(k * step_s)
+        rows.append((run.q - rest.q).ravel())
+    made = np.array(rows)
+    return made[:, made.any(axis=0)]
+
+
+def realise(made: Array, step_s: float, order: int) -> Array:
+    """The exponents in a free motion of many signals: Juang and Pappa's eigensystem realisation (1985)."""
+    half = len(made) // 2
+    hankel = np.stack([np.concatenate(made[k : k + half]) for k in range(half)], axis=1)
+    U, sizes, V = np.linalg.svd(hankel[:, :-1], full_matrices=False)
+    U, sizes, V = U[:, :order], np.sqrt(sizes[:order]), V[:order]
+    step = (U / sizes).T @ hankel[:, 1:] @ (V / sizes[:, np.newaxis]).T
+    return np.log(np.linalg.eigvals(step).astype(complex)) / step_s
+
+
+def settled(name: str) -> tuple[Scenario, Equilibrium]:
+    """A scenario at the mean of its start poses, with estimates that are true."""
+    texts = {"planar": planar_task(), "posed": posed_arms()}
+    light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
+    scenario = parse_scenario(texts[name], name, light, ARMS) if name in texts else load_scenario(name)
+    rest = find_equilibrium(scenario, find_mean_pose(scenario))
+    return start_near(scenario, rest, {}), rest
+
+
+cases = pytest.mark.parametrize(
+    "name", ["planar", *(pytest.param(name, marks=pytest.mark.long) for name in ("unlike_arms", "posed"))]
+)
+
+
+@cases
+def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(name: str) -> None:
+    """The companion matrix carries it on; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
+    (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
+    counts = [scenario.arms[site].counts.joints for site in scenario.names]
+    angles = [f"{site}.q{n + 1}" for site, n in zip(scenario.names, counts, strict=True) for n in range(n)]
+    off = {angle: size * rng.normal() for angle in angles}
+    pencil, names, _ = build_tick_pencil(derive_operating_conditions(scenario), rest)
+    whole, late = build_companion_matrix(pencil), pencil.delayed_states
+    start = np.array([off.get(name, 0.0) for name in names])
+    X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
+    learnt, torques = ([n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau"))
+    X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
+    X[torques] = (whole @ X)[torques]
+    made = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
+    places = [names.index(angle) for angle in angles]
+    for row in made:
+        X = whole @ X
+        assert np.abs(X[places] - row).max() <= 2e-5 * size
+
+
+@cases
+def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
+    """Started along the vector of each of the three rightmost roots that swing."""
+    scenario, rest = settled(name)
+    conditions = derive_operating_conditions(scenario)
+    near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
+    found = compute_sampled_spectrum(conditions, rest, np.array([r.s for r in near.roots]), 14)
+    assert found is not None
+    assert found.verdict == near.verdict == "stable"
+    swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]
+    assert swings
+    loop = linearise_loop(conditions, rest, every_estimate=True)
+    pencil = find_moving_part(loop)
+    for s in swings:
+        vector = np.linalg.svd(pencil.pencil.at(s)[0])[2][-1].conj()
+        vector *= 1e-5 / vector[np.abs(vector).argmax()]
+        off = dict(zip(pencil.names, vector.real.tolist(), strict=True))
+        step_s = 0.3 / abs(s)
+        measured = realise(follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16)
+        assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)
+
+
+@cases
+def test_the_law_is_passive_in_r_at_the_end_effectors_as_its_theorem_says(name: str) -> None:
+    """Of places, also with axes left open and with joints to spare; of poses there is no proof."""
+    scenario, rest = settled(name)
+    ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
+    assert ports.estimates_true
+    assert (ports.proof is None) == (name == "posed")
+    assert ports.proof is None or ports.proof.passive
+    followed = {"planar": 2, "unlike_arms": 3, "posed": 6}[name]
+    assert len(ports.axes) == len(ports.joints) == followed
+    text = "\n".join(describe_ports(ports))
+    assert "axis x alone" in text
+    assert ("N s/m", "N m s/rad" in text) == ("N s/m", name == "posed")
+
+
+def test_edges_margins_and_verdict_are_those_of_one_loop() -> None:
+    """P+d in task space: the margin's frequency is a root, and the edge of d is where the verdict changes."""
+    law = {"law": "p_d", "K": 120.0, "d": 12.0}
+    scenario = parse_scenario(planar_task(), "planar", {"control": law})
+    pose = find_mean_pose(scenario)
+    found = analyse_linear_loop(scenario, pose=pose)
+    end = found.margin.intervals[0].high
+    assert end is not None
+    there = compute_delay_spectrum(set_common_delay(found.loop, end.delay_s), 1).rightmost
+    assert there is not None
+    assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
+    edge = find_linear_edge(scenario, "control.d", 2.0, 20.0, found.rest, points=5)
+    assert edge is not None
+    for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
+        beside = load_scenario(scenario, {"control.d": d})
+        assert analyse_linear_loop(beside, pose=pose, roots=1).continuous.verdict == verdict
+
+
+def test_poses_that_have_no_loop_are_refused_by_name() -> None:
+    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 1e-6})
+    with pytest.raises(ScenarioError, match="rests in a singular pose") as refused:
+        find_equilibrium(scenario, (2.0, 0.0, 0.0))
+    assert refused.value.path == "sites.m.task.axes"
+    with pytest.raises(ScenarioError, match=r"sites\.m\.q0_rad: its end effector does not reach the pose"):
+        find_equilibrium(scenario, (2.5, 0.0, 0.0))
+    with pytest.raises(UsageError, match="--pose is a place in m of the end effectors"):
+        find_equilibrium(scenario, (2.5, 0.0))
+
+
+def test_a_rest_near_a_singular_pose_has_its_damping_in_the_loop() -> None:
+    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
+    found = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
+    assert any("rests near a singular pose" in note for note in found.notes)

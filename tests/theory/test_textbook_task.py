@@ -1,0 +1,165 @@
+"""Task space in plain NumPy: rotations against SciPy, sites and their derivatives against compiled ticks."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tests.core.chain_references import ARMS
+from tests.task_arms import planar_task, posed_arms
+from trilat_net.core.kernel import site_tick
+from trilat_net.core.site_arrays import build_site_arrays, build_tick_buffers
+from trilat_net.core.site_setup import SiteSetup
+from trilat_net.core.vectors import Array
+from trilat_net.scenario import parse_scenario
+from trilat_net.theory.site_dynamics import (
+    COMPLEX_STEP,
+    SiteRates,
+    differentiate_site_rates,
+    evaluate_site_rates,
+    lay_out_arguments,
+    place_arm,
+)
+from trilat_net.theory.textbook_arm import PlacedChain
+from trilat_net.theory.textbook_task import evaluate_reference, rotation_from_vector, vector_from_rotation
+
+angles = st.one_of(st.floats(0.0, np.pi), st.floats(0.0, 1e-3), st.floats(np.pi - 1e-3, np.pi - 1e-9))
+
+
+@given(direction=st.tuples(*[st.floats(-1.0, 1.0)] * 3), angle=angles)
+def test_rotations_and_their_derivatives_are_those_of_scipy(
+    direction: tuple[float, float, float], angle: float
+) -> None:
+    size = np.linalg.norm(direction)
+    vector = angle * (np.array(direction) / size if size > 1e-3 else np.array([0.0, 0.6, 0.8]))
+    R = rotation_from_vector(vector)
+    assert np.abs(R - Rotation.from_rotvec(vector).as_matrix()).max() <= 1e-15
+    assert np.abs(vector_from_rotation(R) - vector).max() <= 1e-8
+    stepped = rotation_from_vector(vector[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(3))
+    assert np.abs(vector_from_rotation(stepped).imag / COMPLEX_STEP - np.eye(3)).max() <= 1e-6
+
+
+LAWS: dict[str, dict[str, Any]] = {
+    "adaptive": {"law": "adaptive", "Lambda": 1.5, "Kp": 8.0, "Kd": 5.0, "Gamma": 0.7},
+    "pd_d": {"law": "pd_d", "K": 40.0, "Kd": 6.0, "d": 3.0},
+}
+SITES = [
+    ("planar", "m", "adaptive"),
+    ("planar", "s", "p_f"),
+    *(pytest.param("posed", site, law, marks=pytest.mark.long) for site in ("m1", "s") for law in LAWS),
+]
+
+
+def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
+    """A site whose torques have no limit, under a plain digital scheme."""
+    control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
+    given_changes = {"control": control, "scheme": "digital", **overrides}
+    written = planar_task() if text == "planar" else posed_arms()
+    scenario = parse_scenario(written, text, given_changes, ARMS)
+    return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
+
+
+def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
+    """The state of a site, and of each peer its pose, velocity and torque, with poses about `apart` away."""
+    rng, at = np.random.default_rng(seed), lay_out_arguments(site)
+    state = np.zeros(at.states)
+    state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
+    state[at.qd], state[at.estimate] = rng.normal(0.0, 0.3, at.joints), rng.normal(0.0, 1.0, at.parameters)
+    own = evaluate_site_rates(site, np.concatenate([state, np.zeros(at.arguments - at.states)])).x
+    peers = []
+    for _ in site.links:
+        pose = own + np.concatenate([rng.normal(0.0, apart, 3), np.zeros(len(own) - 3)])
+        if len(own) > 3:
+            turned = Rotation.from_rotvec(rng.normal(0.0, apart, 3)) * Rotation.from_rotvec(own[3:])
+            pose[3:] = turned.as_rotvec()
+        peers.append(np.concatenate([pose, rng.normal(0.0, 0.2, len(own)), rng.normal(0.0, 2.0, len(own))]))
+    return state, peers
+
+
+def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
+    at, alpha = lay_out_arguments(site), np.array([0.0, *(link.alpha for link in site.links)])
+    m, x = at.coordinates, np.concatenate([state, np.zeros(at.arguments - at.states)])
+    own = evaluate_site_rates(site, x).x
+    x[at.q_des] = evaluate_reference(alpha, own, [own, *(peer[:m] for peer in peers)])
+    x[at.qd_des] = sum(a * peer[m : 2 * m] for a, peer in zip(alpha[1:], peers, strict=True))
+    x[at.peer_torque] = sum(-a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True))
+    return evaluate_site_rates(site, x)
+
+
+def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Array]:
+    """Torque, estimates and accelerations as one compiled tick has them, the accelerations as h goes to 0."""
+    at, accelerations, records = lay_out_arguments(site), [], []
+    for rate_hz in (10_000, 20_000):
+        one = site._replace(rate_hz=rate_hz)
+        arrays, buffers = build_site_arrays(one, 0, pages=8), build_tick_buffers(one)
+        s = arrays.site[0]
+        s.q, s.qd, s.theta_hat = state[at.q], state[at.qd], state[at.estimate]
+        for link, peer in zip(arrays.links, peers, strict=True):
+            link.q, link.qd, link.tau_x = np.split(peer, 3)
+        site_tick(0, 0, 0, *arrays, *buffers)
+        accelerations.append((s.qd - state[at.qd]) * rate_hz)
+        rates = (s.theta_hat - state[at.estimate]) * rate_hz
+        columns = {name: buffers.record[place].copy() for name, place in one.layout.columns().items()}
+        records.append({**columns, "estimate": rates})
+    return {**records[1], "qdd": 2.0 * accelerations[1] - accelerations[0]}
+
+
+@pytest.mark.parametrize(("text", "name", "law"), SITES)
+@pytest.mark.parametrize("apart", [0.3, 0.0])
+def test_a_site_is_that_of_a_compiled_tick(text: str, name: str, law: str, apart: float) -> None:
+    """Its torque, what it sends, and how it moves and learns, where peers are apart and where they agree."""
+    site = build(text, name, law)
+    for seed in range(3):
+        state, peers = draw(site, seed, apart)
+        found, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
+        names = {"tau": found.tau, "x": found.x, "xd": found.xd, "wrench": -found.reflected}
+        for key, value in names.items():
+            assert np.abs(value - wanted[key]).max() <= 1e-9 * (1.0 + np.abs(wanted[key]).max()), key
+        if law == "adaptive":
+            size = 1.0 + np.abs(found.estimate).max()
+            assert np.abs(found.estimate - wanted["estimate"]).max() <= 1e-7 * size
+        size = 1.0 + np.abs(found.qdd).max()
+        assert np.abs(found.qdd - wanted["qdd"]).max() <= 2e-5 * size
+
+
+@pytest.mark.parametrize(("text", "name", "law"), SITES)
+def test_its_jacobian_is_the_difference_of_compiled_ticks(text: str, name: str, law: str) -> None:
+    site, step = build(text, name, law), 1e-6
+    at = lay_out_arguments(site)
+    state, peers = draw(site, 4, 0.0)
+    x = np.concatenate([state, np.zeros(at.arguments - at.states)])
+    own = evaluate_site_rates(site, x).x
+    x[at.q_des], x[at.qd_des], x[at.peer_torque] = own + 0.05, 0.1, 0.3
+    exact = differentiate_site_rates(site, x)
+    places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
+
+    def tau(place: int, by: float) -> Array:
+        """The torque of a tick with one of its arguments off; all peers send what the first does."""
+        moved = x.copy()
+        moved[place] += by
+        sent = np.concatenate([moved[at.q_des], moved[at.qd_des], -moved[at.peer_torque]])
+        return by_tick(site, moved[: at.states], [sent] * len(peers))["tau"]
+
+    for place in places:
+        difference = (tau(place, step) - tau(place, -step)) / (2.0 * step)
+        size = 1.0 + np.abs(exact.tau).max()
+        assert np.abs(difference - exact.tau[:, place]).max() <= 1e-6 * size, place
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_rate_of_the_jacobian_is_its_derivative_along_the_motion(seed: int) -> None:
+    site = build("posed", "s", "pd_d")
+    rng = np.random.default_rng(seed)
+    q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))
+    moved, here = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
+    assert isinstance(moved, PlacedChain)
+    assert isinstance(here, PlacedChain)
+    wanted = moved.pose_jacobian().imag / COMPLEX_STEP
+    assert np.abs(here.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (1.0 + np.abs(wanted).max())
+    R, turned = here.end_effector_orientation(), moved.end_effector_orientation().imag / COMPLEX_STEP
+    across = turned @ R.T
+    w = here.pose_jacobian()[3:] @ qd
+    assert np.array([across[2, 1], across[0, 2], across[1, 0]]) == pytest.approx(w, abs=1e-12)
