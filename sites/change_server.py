@@ -2,12 +2,14 @@
 
 Invariant: every request gets a reply: refused with a reason, or accepted by the very next tick, whose record
 names it. An accepted change holds for samples and ticks from AHEAD_MS later on, so it alters no decision
-already made.
+already made. Dominance is ramped over `MIN_RAMP_S` at least, whatever is asked for, so that no reference
+jumps; the record has the ramp that holds.
 """
 
+from collections import Counter, deque
 from collections.abc import Sequence
 
-from trilat_net.core.site_step import MAX_CHANGES
+from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.ticks import CoreChange, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net.bus import QueryInbox
@@ -23,6 +25,8 @@ from trilat_net.scenario import (
 )
 
 AHEAD_MS = 100
+MIN_RAMP_S = 0.5
+"""Shortest change of dominance."""
 
 
 class ChangeServer:
@@ -34,7 +38,8 @@ class ChangeServer:
         self._ticks = scenario.ticks(site)
         self._links = initial_link_tables(scenario)
         self._planned = scheduled_link_tables(scenario)
-        self._accepted = 0
+        self._accepted: Counter[str] = Counter()
+        self._waiting: deque[int] = deque()
 
     def take(self, k: int) -> Sequence[CoreChange]:
         """Replies to every request; returns the accepted changes, for the next tick, k."""
@@ -62,13 +67,23 @@ class ChangeServer:
                 self._planned.remove((planned_ns, name, table))
         if first >= self._ticks:
             raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
-        if self._accepted >= MAX_CHANGES:
-            raise ScenarioError(f"a run takes at most {MAX_CHANGES} changes")
+        if self._accepted[request.link] >= MAX_CHANGES:
+            raise ScenarioError(f"a run takes at most {MAX_CHANGES} changes of a link")
+        while self._waiting and self._waiting[0] <= from_ns - AHEAD_MS * 1_000_000:
+            self._waiting.popleft()
+        if request.dominance and len(self._waiting) >= MAX_RAMPS:
+            raise ScenarioError(
+                f"at most {MAX_RAMPS} changes of shares wait to begin; ask again in {AHEAD_MS} ms"
+            )
         written = {key: value for key in ("link", "dominance", "ramp_s") if (value := getattr(request, key))}
+        if request.dominance and request.ramp_s >= 0.0:
+            written["ramp_s"] = max(request.ramp_s, MIN_RAMP_S)
         change = resolve_change(self._scenario, self._links, {**written, "to": request.to}, from_ns)
         if find_owner(change) != self._site:
             raise ScenarioError(f"{self._site} cannot do that; ask {find_owner(change)}")
-        self._accepted += 1
         if change.link:
+            self._accepted[change.link] += 1
             self._links[change.link] = change.to
+        else:
+            self._waiting.append(from_ns)
         return to_core_change(self._scenario, change)

@@ -37,7 +37,7 @@ from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
-WORDS = {"Twenty-one": "21", "eleven": "11", "−": "-"}
+WORDS = {"Twenty-two": "22", "eleven": "11", "−": "-"}
 G = 9.81
 WALL = "sites.s.environment.0"
 DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
@@ -382,7 +382,7 @@ PAGES: dict[str, dict[str, Make]] = {
             test_energy.booked("paper", "digital").residual,
             *[test_energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
-        "{} runs of the twenty-one": lambda: [len(shipped_trials())],
+        "{} runs of the twenty-two": lambda: [len(shipped_trials())],
         "run once): {} s simulated": lambda: [sum(one.scenario.duration_s for one in shipped_trials())],
     },
     "README.md": {

@@ -9,10 +9,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
-from trilat_net.core.dominance import apply_ramps
+from trilat_net.core.dominance import apply_ramps, fold_ramps
 from trilat_net.core.link import link_dtype
 from trilat_net.core.site_setup import LinkSetup
-from trilat_net.core.site_step import MAX_CHANGES, Site
+from trilat_net.core.site_step import MAX_RAMPS, Site
 from trilat_net.core.ticks import Arrival, CoreChange, DominanceRamp, TickInput, TickRecord
 
 S = 10**9
@@ -143,7 +143,28 @@ def test_a_command_before_what_is_planned_comes_first() -> None:
 
 def test_more_commands_than_a_run_takes_are_refused() -> None:
     made = site()
-    for n in range(MAX_CHANGES):
-        made.order(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))))
+    for n in range(MAX_RAMPS):
+        made.order(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
     with pytest.raises(ValueError, match="256"):
-        made.order(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))))
+        made.order(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
+
+
+def test_a_run_takes_any_number_of_ramps_and_each_begins_where_the_one_before_was() -> None:
+    """Those that are over are folded into one row: the same bits as of a site that was given all of them."""
+    ramps = []
+    for n in range(MAX_RAMPS + 50):
+        start_ns, share = (7 * n + 100) * 1_000_000, 0.5 + 0.4 * math.sin(0.1 * n)
+        ramps.append(DominanceRamp(start_ns, start_ns + 500_000_000, (share, 1.0 - share)))
+    orders = {7 * n: [CoreChange("", ramp=ramp)] for n, ramp in enumerate(ramps)}
+    commanded = ran(site(), orders)
+    assert [o._replace(cmd=[]) for o in commanded] == ran(site(tuple(ramps)), {})
+    assert 7 * len(orders) < 3000
+
+
+@given(rows(), ramp_lists(), st.integers(0, 12 * S), st.integers(0, 12 * S))
+def test_folded_ramps_write_the_same_bits_from_then_on(first: Row, ramps: Ramps, t: int, later: int) -> None:
+    folded = table(first, ramps)
+    count = fold_ramps(min(t, later), 1 + len(ramps), folded)
+    links = np.zeros(PEERS, link_dtype(2))
+    apply_ramps(max(t, later), count, folded, links)
+    assert (links["alpha"].tolist(), links["alpha_rate"].tolist()) == shares(max(t, later), first, ramps)

@@ -1,5 +1,6 @@
 """Changes that a running site is asked for."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -7,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.change_server import AHEAD_MS, ChangeServer
-from trilat_net.core.site_step import MAX_CHANGES, Site
+from sites.change_server import AHEAD_MS, MIN_RAMP_S, ChangeServer
+from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS, Site
 from trilat_net.core.ticks import CoreChange, TickInput
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
@@ -71,6 +72,25 @@ def test_shares_are_ramped_from_the_first_tick_on() -> None:
     (taken,), reply = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=2.0)
     first_ns = reply.tick * 1_000_000
     assert taken.ramp == (first_ns, first_ns + 2_000_000_000, (0.9, 0.1))
+
+
+def test_dominance_is_ramped_whatever_the_sender_asks_and_the_record_says_so() -> None:
+    (taken,), _ = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=0.0)
+    assert taken.ramp is not None
+    assert taken.ramp.end_ns - taken.ramp.start_ns == round(MIN_RAMP_S * 1e9)
+    assert json.loads(taken.text)["ramp_s"] == MIN_RAMP_S
+    assert not Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=-1.0)[1].accepted
+
+
+def test_a_triangle_dragged_for_a_minute_is_obeyed_to_its_end() -> None:
+    """Thirty orders a second, as a page sends them; a flood within the time before they hold is refused."""
+    asked = Asked()
+    site = Site(asked.scenario.setup("s"))
+    for n in range(1800):
+        (taken,), _ = asked.ask(10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000})
+        site.order(taken, 10 * n * 1_000_000)
+    replies = [asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1] for _ in range(MAX_RAMPS + 1)]
+    assert [reply.accepted for reply in replies] == [True] * MAX_RAMPS + [False]
 
 
 @pytest.mark.parametrize(

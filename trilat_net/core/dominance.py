@@ -131,6 +131,26 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
         link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
 
 
+def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
+    """Folds the ramps that are over at time t into the first row, and returns how many rows are left.
+
+    A ramp begins where the one before it is at that time. Row 0 then holds that of the last one that has
+    begun: from there on `apply_ramps` writes the same bits.
+    """
+    last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
+    if last < 2:
+        return count
+    before, current = ramps[0, RAMP_COLUMNS:].copy(), 0
+    for n in range(1, last + 1):
+        start_ns, end_ns = ramps[current, :RAMP_COLUMNS]
+        for j, after in enumerate(ramps[current, RAMP_COLUMNS:]):
+            before[j] = _interpolate(ramps[n, 0], start_ns, end_ns, before[j], after)
+        current = n
+    ramps[0, RAMP_COLUMNS:] = before
+    ramps[1 : count - last + 1] = ramps[last:count].copy()
+    return count - last + 1
+
+
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
 _HOLD, _BRAKE, _RETURN = int(Mode.HOLD), int(Mode.BRAKE), int(Mode.RETURN)
 _USE, _ACT_BRAKE = int(StaleAction.USE), int(StaleAction.BRAKE)

@@ -143,13 +143,18 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
 
 
 def build_site_arrays(
-    setup: SiteSetup, spare: int = 0, pages: int = 0, layout: Layout | None = None, *, plugged: bool = False
+    setup: SiteSetup,
+    spare: tuple[int, int] = (0, 0),
+    pages: int = 0,
+    layout: Layout | None = None,
+    *,
+    plugged: bool = False,
 ) -> SiteArrays:
     """Returns the arrays of a site at its first tick.
 
     Args:
         setup: all that the site is built from.
-        spare: room for so many more changes of a link, and of the dominance factors.
+        spare: room for so many more changes of a link, and for so many of the dominance factors.
         pages: pages of a link; 0: as many as any delay may ever need.
         layout: of the arrays, if they are to be larger than the site needs.
         plugged: with the arrays of a plugged law, also if the site's is none.
@@ -159,9 +164,9 @@ def build_site_arrays(
     pages = pages or max(calendar_pages(max(link.rate_hz, setup.rate_hz)) for link in links)
     samples = np.zeros((peers, pages), sample_dtype(layout.shared))
     samples["tick"] = -1
-    rows, models, points = _build_links(links, spare, layout.shared)
+    rows, models, points = _build_links(links, spare[0], layout.shared)
     actors, table = torque_source_rows(setup.actors, layout.joints, 3 if layout.chain else 2)
-    ramps = np.zeros((1 + len(setup.ramps) + spare, RAMP_COLUMNS + peers))
+    ramps = np.zeros((1 + len(setup.ramps) + spare[1], RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
     calendars = np.full((peers, pages), -1, dtype=np.int64)
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)

@@ -16,6 +16,7 @@ import numpy as np
 from .channel import LOST
 from .compiled_law import plug_law
 from .delay import DelayKind
+from .dominance import fold_ramps
 from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
@@ -28,8 +29,10 @@ from .vectors import Row
 _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
 
-MAX_CHANGES = 256
-"""Most changes of one link, or of the dominance factors, that a site takes besides its scenario's."""
+MAX_CHANGES = 4096
+"""Most changes of one link that a site takes besides its scenario's."""
+MAX_RAMPS = 256
+"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number in a run."""
 
 
 class Site:
@@ -51,7 +54,7 @@ class Site:
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
         self._external = setup.external
-        self._arrays = build_site_arrays(setup, MAX_CHANGES)
+        self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
         self.layout = setup.layout
         columns = self.layout.columns()
         columns.pop("ch", None)
@@ -81,19 +84,25 @@ class Site:
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
-    def order(self, command: CoreChange) -> None:
+    def order(self, command: CoreChange, t_ns: int) -> None:
         """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
 
+        Args:
+            command: the change.
+            t_ns: a time before which the site makes no more ticks, ns since the epoch.
+
         Raises:
-            ValueError: the site has taken `MAX_CHANGES` of them.
+            ValueError: the site has taken `MAX_CHANGES` of a link, or `MAX_RAMPS` wait to begin.
         """
         if command.model is not None:
             if self._links[command.peer].models >= self._arrays.models.shape[1]:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
             add_model(self._arrays, command.peer, command.model)
         if command.ramp is not None:
-            if self._site[0].ramps >= len(self._arrays.ramps):
-                raise ValueError(f"a run takes at most {MAX_CHANGES} changes of its shares")
+            s: Row = self._site[0]
+            s.ramps = fold_ramps(t_ns, int(s.ramps), self._arrays.ramps)
+            if s.ramps >= len(self._arrays.ramps):
+                raise ValueError(f"at most {MAX_RAMPS} changes of the shares of a site wait to begin")
             add_ramp(self._arrays, command.ramp)
 
     def step(self, tick: TickInput) -> TickRecord:
@@ -103,18 +112,18 @@ class Site:
             tick: its number, one more than the last one's, and the input since then.
 
         Raises:
-            ValueError: more than MAX_ARRIVALS arrivals, or MAX_CHANGES changes.
+            ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
             LawFailed: a user's law did.
         """
         packed, count = self._pack(tick.arrivals), len(tick.arrivals)
+        t_ns = tick.k * NS_PER_S // self.rate_hz
         for command in tick.commands:
-            self.order(command)
+            self.order(command, t_ns)
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
             s.q, s.qd = tick.measured.q, tick.measured.qd
             s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
         hand = self._take_hand(tick.hand)
-        t_ns = tick.k * NS_PER_S // self.rate_hz
         memory: list[float] = []
         if self._law is None:
             if self._tick is None:

@@ -116,7 +116,7 @@ class RerunSite:
         try:
             if n is not None and not self._certain and self._inputs.can_resume(n):
                 for _, change in self._inputs.take_changes(self.k - 1):
-                    self._site.order(change)
+                    self._site.order(change, self.t_ns)
                 self._inputs.resume(self._site, n)
                 self._certain = True
             made = self._execute(n) if self._certain or n is None else self._keep(n)

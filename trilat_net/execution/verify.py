@@ -18,7 +18,7 @@ import msgspec
 
 from .. import process
 from ..core.fingerprint import compute_fingerprint
-from ..core.site_step import MAX_CHANGES, Site
+from ..core.site_step import MAX_RAMPS, Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
 from ..log.accounting import Coverage
@@ -178,7 +178,7 @@ class SiteVerifier:
             try:
                 if not self._certain and not self._law_failed and self._inputs.can_resume(n):
                     for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
-                        self._site.order(change)
+                        self._site.order(change, state.t_ns)
                     self._inputs.resume(self._site, n)
                     self._certain = True
                 if self._certain and not self._law_failed:
@@ -239,7 +239,7 @@ class SiteVerifier:
             except ScenarioError:
                 valid = "a change of one of its links or of its shares"
                 return changes, RecordDifference(self._log.name, named, "cmd", text, valid)
-        return changes[:MAX_CHANGES], None
+        return changes[:MAX_RAMPS], None
 
     def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
         """Returns the arrivals of a record up to the first that no peer can have sent, which differs."""

@@ -100,7 +100,7 @@ def find_absent_samples(log: Log) -> list[LateSample]:
         asked = [0] * len(part.peers)
         for state in part.states:
             for command in ordered.get(state.tick, ()):
-                site.order(command)
+                site.order(command, state.t_ns)
             for peer, tick, _ in state.rx:
                 due = site.release_tick(peer, tick)
                 if due is not None and due < state.tick and not site.measures(peer):
