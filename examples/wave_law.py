@@ -4,8 +4,9 @@ In this folder:  trilat sim two_sites --set control.law=wave_law:Wave --set site
                  --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap
 
 Sites are joined by lines of impedance b, c = sqrt(2 b). A site without a spring of its own is pushed by -F,
-F = b qd - c v, where v is the wave that comes out of the line, and sends u = c qd - v into it. One with a
-spring K and a damper B follows q_sd, whose velocity solves c v = b qd_sd + F. See docs/laws.md.
+F = b qd - c v, where v is the wave that comes out of the line, and sends u = c qd - v into it, a tick later,
+when the arm's step is known. One with a spring K and a damper B follows q_sd, whose velocity solves
+c v = b qd_sd + F, and sends v - (c / b) F. See docs/laws.md.
 """
 
 import math
@@ -18,12 +19,13 @@ class Wave:
     """One end of a line to each peer."""
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
-    remembers = ("q_sd",)
+    remembers = ("q_sd", "played")
 
     def __init__(self, facts: LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0) -> None:
         self.b, self.K, self.B = b, K, B
         self.c = math.sqrt(2.0 * b)
         self.q_sd = [[0.0] * facts.joints for _ in facts.peers]
+        self.played = [[0.0] * facts.joints for _ in facts.peers]
 
     def torque(self, now: LawInput) -> list[float]:
         """Returns the torque of each joint, and sends the waves."""
@@ -34,7 +36,9 @@ class Wave:
             for i in range(now.joints):
                 v = now.received[j].u[i] if peer.new else 0.0  # a wave that does not come is none
                 if self.K == 0.0:  # the line pushes the arm
-                    force, wave = self.c * v - self.b * now.qd[i], self.c * now.qd[i] - v
+                    step = now.q[i] - now.q_before[i]
+                    force, wave = self.c * v - self.b * now.qd[i], self.c * step / now.h_s - self.played[j][i]
+                    self.played[j][i] = v
                 else:
                     force, wave = self.follow(now, j, i, v)
                 now.sent[j].u[i] = wave

@@ -29,6 +29,7 @@ def test_the_layer_alone_diverges() -> None:
         [0.0, 0.0],
         {"level_J": 0.1, "fill_nm_s_rad_J": 50.0, "packet_1_s": 10.0, "by_shares": False},
     )
+    gains["acceleration_rad_s2"] = 100.0
     layer = {"K": [100.0, 100.0], "Kd": [2.0, 2.0], "d": none, "gravity": 1.0, "guarded": False}
     law = {"law": "trilat_net.core.laws.tanks:Tanks", **gains, **layer}
     scenario = unit_scenario({"m": {"hands": [H50]}, "s": {}}, law, duration_s=11.5)

@@ -79,6 +79,10 @@ def example(name):
     """A log that has something to show in a figure: changes and marks where it may."""
     if name in ("operation", "operator_torques", "hands_moved"):
         return logs.simulated("paper")
+    if name == "observed_energy":
+        return trilat_net.simulate(
+            "two_sites", {"control.law": "tanks", "scheme": "digital", "duration_s": 0.3}
+        )
     return walled() if name == "contact" else logs.timed(logs.busy().log)
 
 

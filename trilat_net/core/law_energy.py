@@ -7,6 +7,8 @@ below zero, and what it has taken for good never falls. Then the arms get no mor
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from .vectors import Array, IntArray
 
 
@@ -48,14 +50,19 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law at K ticks, J, shape (K,) each; those that flow are sums since the beginning.
+    """Energies of a law at K ticks, J, shape (K,) each, or (K, parts); flows are sums since the beginning.
+
+    Each part, a joint's for instance, must not be below zero by itself.
 
     Attributes:
         gave: per peer, what was sent to it.
-        took: per peer, what was taken of what it sent.
+        took: per peer, what was taken of what it sent, part by part.
         port: what the arm gave to the law by the law's own books; None: what it gave indeed.
         store: what the law stores.
         taken: what it has taken for good, by its own formula; None: what is left of the others.
+        observed: per peer, what the site knows to be left of what the peer sent; (): nothing of that kind.
+        weight: by which its arm's energy counts in the sum over all sites.
+        gravity: share of gravity that the law carries, whose work is not its own.
     """
 
     gave: Sequence[Array]
@@ -63,3 +70,12 @@ class LawEnergies(NamedTuple):
     port: Array | None = None
     store: Array | None = None
     taken: Array | None = None
+    observed: Sequence[Array] = ()
+    weight: float = 1.0
+    gravity: float = 1.0
+
+
+def sum_work(tau: Array, q: Array) -> Array:
+    """Returns the work of torques that are held from tick to tick, up to each tick, shape (K,), J."""
+    steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -22,7 +22,7 @@ from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from . import charts, page_tables, style
 from .figures.arm_poses import render_arms_svg
-from .figures.certificate_energy import draw_functional
+from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.loop_timing import explain_missing_loop_times
 from .figures.registry import explain_absent_operator, write_report_figures
 
@@ -81,14 +81,19 @@ def write_report(
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
         section = page_tables.render_certificate(certificate)
+        pictures = {}
         if certificate.balance is not None:
-            drawn = draw_functional(log, certificate)
-            figures.append(folder / "certificate.png")
+            pictures["certificate"] = "V and energies", draw_functional(log, certificate)
+        if certificate.observed is not None and certificate.observed.curves:
+            drawn = draw_observed_energy(log, certificate.observed)
+            pictures["observed_energy"] = "energies that the laws declare", drawn
+        for name, (words, drawn) in pictures.items():
+            figures.append(folder / f"{name}.png")
             style.write_figure(drawn, figures[-1], style.REPORT_DPI)
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
             data = base64.b64encode(stream.getvalue()).decode()
-            section += f'<img src="data:image/png;base64,{data}" alt="V and energies" style="max-width:100%">'
+            section += f'<img src="data:image/png;base64,{data}" alt="{words}" style="max-width:100%">'
         section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
     facts["checks"] = [line._asdict() for line in lines]

@@ -17,7 +17,7 @@ from .fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, Positi
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition
 
-_PASSIVE = "operators and environments are passive; *sufficient*, and of the loop in continuous time"
+_PASSIVE = "operators and environments are passive (*sufficient*)"
 
 
 class EnergyLaw(PluggedLaw, frozen=True):
@@ -50,6 +50,7 @@ class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
         reception: how waves are played if samples are late or lost. "replay": what was missed is made up for,
             as far as its energy allows; "zero": it is dropped, and positions drift; "scaled": the last wave
             goes on, times sqrt(1 - T'), for delays that vary continuously.
+        reserve_J: energy per joint with which an end begins; waves are cut where it has less than half of it.
     """
 
     core_class = Wave
@@ -60,6 +61,7 @@ class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
     lines: dict[str, NotNegative] = field(default_factory=dict)
     beta: Positive = 1.0
     reception: Literal["replay", "zero", "scaled"] = "replay"
+    reserve_J: NotNegative = 1e-2
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
         """Returns a line that joins no two sites, or rates that differ: a wave lasts for a tick."""
@@ -83,8 +85,7 @@ class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
             f"{peer} {line / (sum(weights) or 1.0):.4g}" for peer, line in zip(peers, weights, strict=True)
         )
         text = (
-            f"lines are passive whatever delays, jitter and loss are, where {_PASSIVE} (held over a tick, "
-            f"arms and hands damp more than (sum b)^2 h / 2M, or echoes grow); the shares of {here}"
+            f"lines are passive whatever delays, jitter and loss are, where {_PASSIVE}; the shares of {here}"
         )
         return StabilityCondition(True, f"{text} are b_ij / sum b_ik, {shares}, and no others")
 
@@ -103,6 +104,8 @@ class EnergyTanks(EnergyLaw, frozen=True, tag_field="law", tag="tanks"):
         fill_nm_s_rad_J: damping of the arm per energy that is missing from it, N m s/rad/J.
         packet_1_s: rate at which a tank is emptied towards the peers, 1/s.
         by_shares: true: peers get parts by this site's dominance factors; false: equal ones.
+        acceleration_rad_s2: most by which a joint accelerates, as far as tanks cover it: in the period to
+            come it moves by qd h and half of this times h^2 more.
     """
 
     core_class = Tanks
@@ -114,10 +117,12 @@ class EnergyTanks(EnergyLaw, frozen=True, tag_field="law", tag="tanks"):
     fill_nm_s_rad_J: NotNegative = 50.0
     packet_1_s: NotNegative = 10.0
     by_shares: bool = False
+    acceleration_rad_s2: NotNegative = 100.0
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns that tanks are passive, if no more than all of a tank is sent in a tick."""
-        text = f"tanks are passive for any shares, delays and loss, where {_PASSIVE}"
+        most = f"joints accelerate by {self.acceleration_rad_s2:g} rad/s^2 at most"
+        text = f"tanks are passive for any shares, delays and loss, where {_PASSIVE}, and {most}"
         share = self.packet_1_s / situation.rate_hz
         if share > 1.0:
             return StabilityCondition(
@@ -138,19 +143,21 @@ class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
         acceleration_rad_s2: most by which a joint accelerates, as far as leaders' controllers cover it: in
             the period to come it moves by qd h and half of this times h^2 more.
         drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
-        reserve_J: energy per joint and peer with which a leader's end begins.
+        reserve_J: energy per joint and peer with which an end begins.
         energy: "step": what the arm gets, torque times the step in q; "velocity": torque times velocity times
             period, as it is published.
+        beta: the site's torque is divided by it, dimensionless: who feels whom.
     """
 
     core_class = Tdpa
 
     K: NotNegativeJoints = (0.0,)
     B: NotNegativeJoints = (0.0,)
-    acceleration_rad_s2: NotNegative = 20.0
+    acceleration_rad_s2: NotNegative = 100.0
     drift_rad_s: NotNegative = 0.5
     reserve_J: NotNegative = 1e-3
     energy: Literal["step", "velocity"] = "step"
+    beta: Positive = 1.0
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Returns that the couplings are passive as far as their leaders' joints do not accelerate more."""

@@ -28,7 +28,7 @@ MIDDLE = {
 }
 
 
-HELD = ("tdpa", "tanks")
+HELD = ("tdpa", "tanks", "wave")
 """Laws for torque that is held over a tick."""
 
 

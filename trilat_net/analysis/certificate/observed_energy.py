@@ -5,13 +5,13 @@ peer took; the arm's port is the torque that was held times the step of the join
 never below zero, and what a law has taken for good never falls, or the certificate says where.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.law_energy import LawEnergies, LawRecords, PeerRecords
+from ...core.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
 from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
@@ -37,8 +37,38 @@ class ObservedFinding(StrEnum):
     NOT_JUDGED = "observed energy cannot be judged"
 
 
+class EnergyCurve(NamedTuple):
+    """An energy over time.
+
+    Attributes:
+        kind: "line" from a peer to a site, "known" there of a peer, "store" of, "taken" by or "given" by it.
+        site: whose it is.
+        peer: the other end; "" of what has none.
+        t_s: of the site's ticks, s.
+        energy_j: the sum of its parts, shape (K,).
+        least_j: that of them which is least, shape (K,).
+    """
+
+    kind: str
+    site: str
+    peer: str
+    t_s: Array
+    energy_j: Array
+    least_j: Array
+
+    @property
+    def name(self) -> str:
+        """Its name: "line m->s", "known at s of m", "store of s", "taken by s" or "given by s"."""
+        site, peer = self.site, self.peer
+        if self.kind == "line":
+            return f"line {peer}->{site}"
+        if self.kind == "known":
+            return f"known at {site} of {peer}"
+        return f"{self.kind} {'of' if self.kind == 'store' else 'by'} {site}"
+
+
 class LeastEnergy(NamedTuple):
-    """An energy that must not be below zero, where it is least: "line m->s", "store of s", "taken by s"."""
+    """An energy that must not be below zero, where it is least; named like its curve."""
 
     name: str
     amount_j: float
@@ -56,6 +86,7 @@ class ObservedEnergy(NamedTuple):
         largest_j: the largest of them.
         residual_j: by how much the books of a law do not add up at most.
         sampling_j: the most that the arms got beyond what the laws book.
+        curves: of every energy, and of what the arms gave to their laws.
     """
 
     finding: ObservedFinding
@@ -65,6 +96,7 @@ class ObservedEnergy(NamedTuple):
     largest_j: float = 0.0
     residual_j: float = 0.0
     sampling_j: float = 0.0
+    curves: Sequence[EnergyCurve] = ()
 
     @property
     def refuted(self) -> bool:
@@ -74,7 +106,8 @@ class ObservedEnergy(NamedTuple):
     def to_json(self) -> JsonObject:
         """Returns it ready for JSON."""
         premises, least = ([one._asdict() for one in rows] for rows in (self.premises, self.least))
-        return {**self._asdict(), "finding": self.finding.name.lower(), "premises": premises, "least": least}
+        plain = {key: value for key, value in self._asdict().items() if key != "curves"}
+        return {**plain, "finding": self.finding.name.lower(), "premises": premises, "least": least}
 
 
 class _SiteBooks(NamedTuple):
@@ -138,17 +171,25 @@ def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
     if not digital:
         limit = np.array(setup.tau_limit_nm)
         held[1:] = np.clip(1.5 * held[1:] - 0.5 * held[:-1], -limit, limit)
-    potential = np.zeros(count)
+    given = -sum_work(held, records.q)
     if setup.theta_known:  # holding the arm is no work of the law
         potential = build_arm_rows(log.scenario, name).potential_energy(records.q)
-    step = np.einsum("kj,kj->k", held[:-1], np.diff(records.q, axis=0))
-    given = potential - potential[0] - np.concatenate([[0.0], np.cumsum(step)])
+        given += booked.gravity * (potential - potential[0])
+    given *= booked.weight
     port = given if booked.port is None else booked.port
-    store = np.zeros(count) if booked.store is None else booked.store
-    left = port + np.sum(booked.took, axis=0) - np.sum(booked.gave, axis=0) - (store - store[0])
-    taken = left if booked.taken is None else booked.taken
+    store = np.zeros(count) if booked.store is None else _add_parts(booked.store)
+    flows = sum(map(_add_parts, booked.took)) - sum(map(_add_parts, booked.gave))
+    left = port + flows - store
+    left -= left[0]
+    taken = left if booked.taken is None else booked.taken - booked.taken[0]
     t_s = part.t_s[:count]
     return _SiteBooks(t_s, booked, port, taken, left - taken, port - given)
+
+
+def _add_parts(energy: Array) -> Array:
+    """Returns the sum of an energy's parts, shape (K,)."""
+    whole: Array = energy.reshape(len(energy), -1).sum(axis=1)
+    return whole
 
 
 def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
@@ -177,22 +218,35 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     return LawRecords(1.0 / part.rate_hz, *motion, to_all, memory, peers)
 
 
-def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Returns the verdict on the books of all sites."""
-    least, largest = [], 0.0
+def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCurve]:
+    """Yields the energies that must not be below zero."""
     for site, own in books.items():
-        energies = {f"taken by {site}": own.taken - np.maximum.accumulate(own.taken)}
-        if own.booked.store is not None:
-            energies[f"store of {site}"] = own.booked.store
+        booked, energies = own.booked, []
+        if booked.store is not None:
+            energies.append(("store", "", booked.store))
         for j, peer in enumerate(log[site].peers):  # what the peer had given by each tick of this site
             other = books[peer]
             gave = other.booked.gave[log[peer].peers.index(site)]
             row = np.searchsorted(other.t_s, own.t_s + 1e-9, side="right") - 1
-            energies[f"line {peer}->{site}"] = gave[row] - own.booked.took[j]
-        for name, energy in energies.items():
-            low = int(energy.argmin())
-            least.append(LeastEnergy(name, float(energy[low]), float(own.t_s[low])))
-            largest = max(largest, float(energy.max()))
+            energies.append(("line", peer, gave[row] - booked.took[j]))
+            if booked.observed:
+                energies.append(("known", peer, booked.observed[j]))
+        for kind, peer, energy in energies:
+            least = energy.reshape(len(energy), -1).min(axis=1)
+            yield EnergyCurve(kind, site, peer, own.t_s, _add_parts(energy), least)
+        falls = own.taken - np.maximum.accumulate(own.taken)
+        yield EnergyCurve("taken", site, "", own.t_s, own.taken, falls)
+
+
+def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
+    """Returns the verdict on the books of all sites."""
+    curves = list(_find_curves(log, books))
+    least = []
+    for one in curves:
+        low = int(one.least_j.argmin())
+        least.append(LeastEnergy(one.name, float(one.least_j[low]), float(one.t_s[low])))
+    largest = max(float(one.energy_j.max()) for one in curves)
+    curves += [EnergyCurve("given", site, "", one.t_s, one.port, one.port) for site, one in books.items()]
     scale = max(largest, *(float(np.abs(own.port).max()) for own in books.values()))
     residual = max(float(np.abs(own.residual).max()) for own in books.values())
     sampling = max(float(own.leak.max()) for own in books.values())
@@ -207,7 +261,8 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     else:
         finding, text = ObservedFinding.PASSIVE, f"{len(least)} energies, the largest {largest:.4g} J"
         text += f"; but a premise fails: {', '.join(failed)}" * bool(failed)
-    return ObservedEnergy(finding, f"{finding}: {text}", premises, least, largest, residual, sampling)
+    numbers = (least, largest, residual, sampling, curves)
+    return ObservedEnergy(finding, f"{finding}: {text}", premises, *numbers)
 
 
 def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> list[Premise]:
@@ -216,17 +271,15 @@ def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> 
     site = max(residual, key=residual.__getitem__)
     text = f"the law of {site} adds up to {residual[site]:.1e} J of {scale:.4g} J, the others closer"
     premises = [Premise("books", residual[site] <= -LEAST_ENERGY_J + 1e-9 * scale, text)]
-    cut = [
-        name
-        for name in books
-        if (np.abs(log[name].tau) >= np.array(log.scenario.setup(name).tau_limit_nm)).any()
-    ]
-    text = (
-        f"cut off at {', '.join(cut)}: the arm got another one than the law books" if cut else "never cut off"
-    )
-    premises.append(Premise("torque", not cut, text))
+    limits = {name: np.array(log.scenario.setup(name).tau_limit_nm) for name in books}
+    cut = [name for name in books if (np.abs(log[name].tau) >= limits[name]).any()]
     leak = {name: float(own.leak.max()) for name, own in books.items()}
+    most = SAMPLING_SHARE * scale + 1e-9
+    missed = [name for name in cut if leak[name] > most]
+    text = f"cut off at {', '.join(missed or cut)}" if cut else "never cut off"
+    text += ": the arm got another one than the law books" if missed else ", and booked so" * bool(cut)
+    premises.append(Premise("torque", not missed, text))
     site = max(leak, key=leak.__getitem__)
     text = f"the arm of {site} got up to {leak[site]:.3g} J more than its law books, between ticks"
-    premises.append(Premise("sampling", leak[site] <= SAMPLING_SHARE * scale + 1e-9, text))
+    premises.append(Premise("sampling", leak[site] <= most, text))
     return premises

@@ -1,20 +1,27 @@
 """Wave variables: every pair of sites is joined by a line of some impedance, in which waves travel.
 
 Invariant: an end takes no more energy out of a line than the other end is known to have put in, whatever
-becomes of samples; so the energy that a line stores is never negative (but for the reception `hold`).
+becomes of samples (but for the reception `hold`), and puts in no more than it has, H: what it took, less the
+work that its torque did on the arm, tau times the step in q.
 
 Of one line and joint, with c = sqrt(2 b) and v the wave that an end plays:
 
-    without a spring of its own (K = 0)    F = b qd - c v, pushed by -F, sends c qd - v
+    without a spring of its own (K = 0)    F = b qd - c v, pushed by -F, sends c step / h - v a tick later
     with K and B                           qd_sd = (c v - K (q_sd - q) + B qd) / (b + B), q_sd follows,
                                            F = K (q_sd - q) + B (qd_sd - qd), pushed by F, sends v - (c / b) F
+
+As it sends what its arm did in the period that is over, its waves add up to the steps of its arm, and to
+b h qd^2 / 4 more than their work, which H lends until the arm slows down.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+
 from ..compiled_law import compiled
+from ..law_energy import LawEnergies, LawRecords, sum_work
 from ..user_law import LawContext, LawInput
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
@@ -68,7 +75,61 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
     elif law.reception == _HOLD:
         played = law.wave[at]
     sent.W[i] += own - 0.5 * played * played * h
+    now.to_all.H[i] += 0.5 * played * played * h
     return played
+
+
+@compiled
+def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
+    """Moves what an end with a spring follows by a wave v, and answers it; returns the torque ON the arm."""
+    at, h = j * now.joints + i, now.h_s
+    b, stretch = law.b[at], law.q_sd[at] - now.q[i]
+    c = math.sqrt(2.0 * b)
+    qd_sd = (c * v - law.K[i] * stretch + law.B[i] * now.qd[i]) / (b + law.B[i])
+    force: float = law.K[i] * stretch + law.B[i] * (qd_sd - now.qd[i])
+    law.ahead[i] += (law.K[i] * stretch * (qd_sd - now.qd[i])) * h  # what the spring will get
+    law.q_sd[at] += h * qd_sd
+    now.sent[j].u[i] = v - c / b * force
+    return force
+
+
+@compiled
+def close_wave_period(law: Any, now: LawInput, i: int) -> None:
+    """Books in H what the arm, and the springs of an end that has any, got in the period before."""
+    H, spring = now.to_all.H, 0.0
+    for j in range(len(now.peers)):
+        at = j * now.joints + i
+        if now.k == 0:
+            law.q_sd[at] = now.peers[j].q[i]
+        if law.b[at] > 0.0:
+            stretch = law.q_sd[at] - now.q[i]
+            spring += 0.5 * law.K[i] * stretch * stretch
+    if now.k == 0:
+        H[i], law.spring[i] = law.reserve, spring
+    H[i] -= law.beta * (now.tau_before[i] - law.carried[i]) * (now.q[i] - now.q_before[i])
+    H[i] -= spring - law.spring[i]
+    law.spring[i] = spring
+    if law.K[i] > 0.0 and H[i] > law.reserve:  # what is left its damper has taken
+        law.damped[i] += H[i] - law.reserve
+        H[i] = law.reserve
+
+
+@compiled
+def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
+    """Shrinks the waves of a joint to what H pays for beside what lies ahead, and books them."""
+    h, asked = now.h_s, 0.0
+    for j in range(len(now.peers)):
+        asked += 0.5 * now.sent[j].u[i] * now.sent[j].u[i] * h
+    most = now.to_all.H[i] - ahead - 0.5 * law.reserve
+    share = 1.0
+    if asked > most:
+        share = math.sqrt(max(most, 0.0) / asked)
+    for j in range(len(now.peers)):
+        sent = now.sent[j]
+        sent.u[i] *= share
+        sent.U[i] += sent.u[i] * h
+        sent.E[i] += 0.5 * sent.u[i] * sent.u[i] * h
+        now.to_all.H[i] -= 0.5 * sent.u[i] * sent.u[i] * h
 
 
 def find_line(lines: Mapping[str, float], site: str, peer: str) -> float | None:
@@ -89,6 +150,7 @@ class Wave:
         beta: the torque is divided by it.
         reception: one of `RECEPTIONS`.
         gravity: share of gravity that it knows.
+        reserve_J: energy per joint with which it begins.
     """
 
     sends: ClassVar[Any] = {
@@ -96,8 +158,13 @@ class Wave:
         "U": {"unit": "sqrt(W) s", "length": "joints", "per_peer": True},
         "E": {"unit": "J", "length": "joints", "per_peer": True},
         "W": {"unit": "J", "length": "joints", "per_peer": True},  # known and not played: for logs
+        "H": {"unit": "J", "length": "joints"},  # what this end has, for logs too
     }
-    remembers = ("q_sd", "wave", "U_seen", "E_seen", "owed_U", "owed_s", "stamp", "rate")
+    remembers = (
+        *("q_sd", "wave", "U_seen", "E_seen", "owed_U", "owed_s", "stamp", "rate"),
+        *("played", "carried", "spring", "damped"),
+    )
+    schemes = ("digital",)
 
     def __init__(
         self,
@@ -109,6 +176,7 @@ class Wave:
         beta: float,
         reception: str,
         gravity: float,
+        reserve_J: float,
     ) -> None:
         n, peers = facts.joints, len(facts.peers)
         self.K, self.B, self.beta, self.gravity = list(K), list(B), float(beta), float(gravity)
@@ -121,38 +189,51 @@ class Wave:
         self.U_seen, self.E_seen = [0.0] * (n * peers), [0.0] * (n * peers)
         self.owed_U, self.owed_s = [0.0] * (n * peers), [0.0] * (n * peers)
         self.stamp, self.rate = [-1.0] * peers, [1.0] * peers
+        self.reserve, self.tau_limit = float(reserve_J), (np.zeros(n) + facts.tau_limit_nm).tolist()
+        self.played, self.carried, self.ahead = [0.0] * (n * peers), [0.0] * n, [0.0] * n
+        self.spring, self.damped = [0.0] * n, [0.0] * n
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, and sends the waves."""
-        for i in range(now.joints):
-            now.tau[i] = self.gravity * now.gravity[i]
+        n = now.joints
+        for i in range(n):
+            close_wave_period(self, now, i)
+            if self.K[i] == 0.0:
+                for j in range(len(now.peers)):
+                    c, at = math.sqrt(2.0 * self.b[j * n + i]), j * n + i
+                    now.sent[j].u[i] = c * (now.q[i] - now.q_before[i]) / now.h_s - self.played[at]
+                send_waves(self, now, i, 0.0)
+            self.carried[i] = self.gravity * now.gravity[i]
+            now.tau[i], self.ahead[i] = self.carried[i], 0.0
         for j in range(len(now.peers)):
-            peer, sent = now.peers[j], now.sent[j]
+            peer = now.peers[j]
             missed = -1.0
             if peer.new:
                 missed = peer.tick - self.stamp[j] - 1.0
                 self.stamp[j] = peer.tick
             if self.stamp[j] >= 0.0:
                 self.rate[j] += (missed + 1.0 - self.rate[j]) / STAMP_FILTER_TICKS
-            for i in range(now.joints):
-                at = j * now.joints + i
-                b = self.b[at]
+            for i in range(n):
+                b, at = self.b[j * n + i], j * n + i
                 if b == 0.0:
                     continue
-                c = math.sqrt(2.0 * b)
-                played = take_wave(self, now, j, i, missed)
+                self.played[at] = take_wave(self, now, j, i, missed)
                 if self.K[i] == 0.0:
-                    force = c * played - b * now.qd[i]
-                    u = c * now.qd[i] - played
+                    force = math.sqrt(2.0 * b) * self.played[at] - b * now.qd[i]
                 else:
-                    if now.k == 0:
-                        self.q_sd[at] = peer.q[i]
-                    stretch = self.q_sd[at] - now.q[i]
-                    qd_sd = (c * played - self.K[i] * stretch + self.B[i] * now.qd[i]) / (b + self.B[i])
-                    force = self.K[i] * stretch + self.B[i] * (qd_sd - now.qd[i])
-                    u = played - c / b * force
-                    self.q_sd[at] += now.h_s * qd_sd
+                    force = follow_wave(self, now, j, i, self.played[at])
                 now.tau[i] += force / self.beta
-                sent.u[i] = u
-                sent.U[i] += u * now.h_s
-                sent.E[i] += 0.5 * u * u * now.h_s
+        for i in range(n):
+            if self.K[i] > 0.0:
+                applied = max(-self.tau_limit[i], min(self.tau_limit[i], now.tau[i])) - self.carried[i]
+                send_waves(self, now, i, self.beta * applied * now.qd[i] * now.h_s + self.ahead[i])
+
+    def energies(self, seen: LawRecords) -> LawEnergies:
+        """Returns the energy of the waves, what the end stores, and what its dampers took."""
+        gave = [peer.sent["E"] for peer in seen.peers]
+        observed = [peer.sent["W"] for peer in seen.peers]
+        took = [peer.received["E"] - peer.sent["W"] for peer in seen.peers]
+        port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
+        store = seen.to_all["H"] + seen.memory["spring"]
+        taken = seen.memory["damped"].sum(axis=1)
+        return LawEnergies(gave, took, port, store, taken, observed, self.beta, self.gravity)

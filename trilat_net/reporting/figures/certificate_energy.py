@@ -1,6 +1,6 @@
-"""Figure of the certificate's energies.
+"""Figures of the certificate's energies.
 
-V and its parts, dissipation and work, and the residual of the balance.
+V and its parts, dissipation and work, and the residual of the balance; the energies that laws declare.
 
 Invariant: energies in J over the time of the whole run; spans without complete records are shaded, the
 largest rise is marked.
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis.certificate.energy_balance import EnergyBalance
+from ...analysis.certificate.observed_energy import ObservedEnergy
 from ...analysis.certificate.premises import find_unjudged_spans
 from ...analysis.certificate.stability_certificate import Certificate
 from ...core.vectors import Array
@@ -34,6 +35,12 @@ _ONES: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 0.9, "linestyle"
 _RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
 _UNJUDGED: dict[str, Any] = {"color": style.FAINT, "alpha": 0.3, "linewidth": 0.0, "zorder": 0.3}
 _HEIGHTS = (1.5, 1.2, 1.3, 1.0)
+_OBSERVED_PANELS = {
+    "line": "in the lines (J)",
+    "known": "known of them (J)",
+    "store": "stored (J)",
+    "given": "given, taken (J)",
+}
 
 
 def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE) -> Figure:
@@ -60,6 +67,31 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
             rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
         ones = [] if certificate.ones is None else [("V with the paper's ones", _ONES)]
         plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *ones])
+    return plot.figure
+
+
+def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the energies that the laws declare: lines and what is known of them, stores, arms' work, J.
+
+    A line has the color of the site that it comes to. Energies that cannot be judged give the reason.
+    """
+    kinds = {one.kind for one in observed.curves}
+    panels = [kind for kind in _OBSERVED_PANELS if kind in kinds]
+    if not panels:
+        return style.empty_figure(observed.text, form)
+    with time_figure(log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8) as plot:
+        rows = style.add_panels(plot.figure, len(panels), 1, sharex=True)[:, 0]
+        at = dict(zip(panels, rows, strict=True))
+        for one in observed.curves:
+            taken = {"linestyle": style.DASHES[1]} if one.kind == "taken" else {}
+            axes = at["given" if taken else one.kind]
+            line = {**style.site_line(log, one.site), **taken}
+            style.plot_decimated(axes, np.arange(len(one.t_s)), one.t_s, one.energy_j, **line)
+        for kind, axes in at.items():
+            axes.set_ylabel(_OBSERVED_PANELS[kind])
+            plot.mark(axes, log.sites, numbered=axes is rows[0])
+        dashed = ("taken by the law", {"color": style.REFERENCE, "linestyle": style.DASHES[1]})
+        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), dashed])
     return plot.figure
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
 from ...analysis.certificate.premises import check_scenario_premises
 from ...analysis.certificate.stability_certificate import certify
 from ...analysis.site_signals import sites_with_operator
@@ -26,7 +27,7 @@ from ..style import FIGURE_FORMATS, write_figure
 from . import joint_motion
 from .arm_poses import draw_arms
 from .authority import draw_authority, sites_with_changing_dominance
-from .certificate_energy import draw_functional
+from .certificate_energy import draw_functional, draw_observed_energy
 from .contact_force import draw_contact, sites_with_walls
 from .loop_timing import draw_loop_timing, explain_missing_loop_times
 from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_delay
@@ -61,6 +62,17 @@ def _has_script(log: Log) -> bool:
 def _no_functional(log: Log) -> str:
     law = check_scenario_premises(log.scenario)[0]
     return "" if law.holds else law.text
+
+
+def _observed_energy(log: Log) -> ObservedEnergy | None:
+    found = observe_energies(log)
+    return found if found is not None and found.curves else None
+
+
+def _draw_observed(log: Log, form: FigureSize) -> Figure:
+    found = observe_energies(log)
+    assert found is not None
+    return draw_observed_energy(log, found, form)
 
 
 def _learns(log: Log) -> bool:
@@ -108,6 +120,11 @@ FIGURES = {
         "V, its parts, who changed it, the energy balance",
         lambda log, form: draw_functional(log, certify(log), form),
         _no_functional,
+    ),
+    "observed_energy": FigureEntry(
+        "energies that the control laws declare: lines, observers, tanks",
+        _draw_observed,
+        _unless(_observed_energy, "the laws of this run declare no energies"),
     ),
     "arms": _ReportEntry("the arms at a few instants", draw_arms),
     "paths": _ReportEntry(
