@@ -7,6 +7,7 @@ it is changed, and one question to a site is open at a time.
 
 import math
 from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -16,16 +17,14 @@ from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock
-from trilat_net.net.requests import ChangeReply, ChangeRequest
+from trilat_net.net.membership import new_boot
+from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 
 MAX_MESSAGE_BYTES = 4_096
 REPLY_TIMEOUT_NS = 3_000_000_000
 LEAST_RAMP_S = 0.25
 """The time in which shares change that somebody drags, s."""
-FARTHEST_M = 100.0
-"""A hand further from the base is a mistake, m; so is a force of more than ten thousand N."""
-MOST_FORCE_N = 1e4
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
@@ -61,12 +60,24 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
     to: Annotated[dict[Name, float], Meta(max_length=16)]
 
 
+class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
+    """The page takes hold of an arm, moves what it holds, or lets go.
+
+    Attributes:
+        to: the target of the end effector, m, or of the joints, rad; for an arm that is pushed the force, N.
+    """
+
+    site: Name
+    grip: bool
+    to: Numbers = []
+
+
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
     """The session is to end, in order."""
 
 
 Order = SetLink | SetShares
-_DECODER = msgspec.json.Decoder(Seen | TakePart | SetLink | SetShares | EndSession)
+_DECODER = msgspec.json.Decoder(Seen | TakePart | SetLink | SetShares | MoveHand | EndSession)
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
@@ -79,11 +90,60 @@ def read_page_message(text: str | bytes) -> PageMessage:
         message: PageMessage = _DECODER.decode(text)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise WireError("malformed", str(error)) from None
-    if isinstance(message, SetLink | SetShares):
-        numbers = [value for value in message.to.values() if not isinstance(value, str)]
-        if not all(map(math.isfinite, numbers)):
-            raise WireError("not finite", type(message).__name__)
+    numbers: Iterable[float | str] = ()
+    if isinstance(message, MoveHand):
+        numbers = message.to
+    elif isinstance(message, SetLink | SetShares):
+        numbers = message.to.values()
+    if not all(isinstance(number, str) or math.isfinite(number) for number in numbers):
+        raise WireError("not finite", type(message).__name__)
     return message
+
+
+class PageHands:
+    """The hands of one page, one for each arm that it has ever held.
+
+    A hand lives by the page's own messages: if these stay away, the site lets go.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
+        self._bus, self._clock, self._session, self._source = bus, clock, session, source
+        self._boots: dict[str, int] = {}
+        self._numbers: Counter[str] = Counter()
+        self._publish: dict[str, Callable[[bytes], None]] = {}
+        self._held: set[str] = set()
+
+    def move(self, order: MoveHand, *, pushes: bool) -> None:
+        """Sends an arm's site what the page wants of it."""
+        site = order.site
+        if site not in self._publish:
+            if not order.grip:
+                return
+            self._boots[site] = new_boot() % (2**32 - 1) + 1
+            self._publish[site] = self._bus.publisher(topics.key(self._session, site, topics.HAND))
+        self._numbers[site] += 1
+        (self._held.add if order.grip else self._held.discard)(site)
+        goal = order.to if order.grip else []
+        message = HandMessage(
+            site=site,
+            boot=self._boots[site],
+            source=self._source,
+            n=self._numbers[site],
+            grip=order.grip,
+            target=[] if pushes else goal,
+            force=goal if pushes else [],
+            sent_ns=self._clock.monotonic_ns(),
+        )
+        self._publish[site](encode(message))
+
+    def release(self) -> None:
+        """Lets go of every arm."""
+        for site in list(self._held):
+            self.move(MoveHand(site=site, grip=False), pushes=False)
+
+    def holds(self, site: str, source: int) -> bool:
+        """True if it is this page that a record of a site names as holding its arm."""
+        return source != 0 and self._boots.get(site) == source
 
 
 class OrderDesk:

@@ -1,6 +1,6 @@
 """The page's server: its files and its socket, from one `websockets` server in a thread of its own.
 
-Invariant: newest state wins. A page gets its next frame when it has drawn the one before, so that a slow
+Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
 page sees fewer frames and nobody waits for it. A page of another origin, without the token, with too many or
 too large messages is refused and counted; nothing of it reaches a site. One thread serves all pages and takes
 in the session's messages.
@@ -10,7 +10,7 @@ import asyncio
 import hmac
 import secrets
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
@@ -31,7 +31,9 @@ from trilat_net.net.clock import Clock
 from .page_orders import (
     MAX_MESSAGE_BYTES,
     EndSession,
+    MoveHand,
     OrderDesk,
+    PageHands,
     PageMessage,
     Seen,
     SetLink,
@@ -43,6 +45,8 @@ from .session_frames import SessionFrames, show_event
 from .session_view import SessionView
 
 FRAMES_PER_S = 30
+FRAMES_AHEAD = 2
+"""Frames that a page may have got and not drawn yet: one is on its way while it draws the other."""
 MESSAGES_PER_S = 240
 """Messages that a page may send on average; one that sends many more is closed."""
 BURST = 480
@@ -85,14 +89,17 @@ class Page:
     """One connected page.
 
     Attributes:
+        hands: what it holds.
         takes_part: true if its orders count.
         wake: set when there is a frame that it has not got.
     """
 
-    def __init__(self, connection: ServerConnection, *, takes_part: bool) -> None:
-        self.connection, self.takes_part = connection, takes_part
+    def __init__(self, connection: ServerConnection, hands: PageHands, *, takes_part: bool) -> None:
+        self.connection, self.hands, self.takes_part = connection, hands, takes_part
         self.wake = asyncio.Event()
         self.drawn = self.sent = 0
+        self.notified = 0
+        self.unseen: deque[int] = deque()
         self.points = self.energies = self.events = 0
         self._allowed, self._filled_ns, self._excess = float(BURST), 0, 0
 
@@ -139,7 +146,8 @@ class PageServer:
         port: int = 0,
         ends: bool = False,
     ) -> None:
-        self._clock, self._host, self._port, self._ends = clock, host, port, ends
+        self._bus, self._clock, self._host, self._port, self._ends = bus, clock, host, port, ends
+        self._met = 0
         self.view = SessionView(bus, clock, session)
         self._frames = SessionFrames(self.view)
         self._desk = OrderDesk(bus, clock, session)
@@ -154,6 +162,7 @@ class PageServer:
         self.address = ""
         self._ready = threading.Event()
         self._problem: OSError | None = None
+        self._failure: BaseException | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="page", daemon=True)
@@ -170,6 +179,8 @@ class PageServer:
             with suppress(RuntimeError):  # its loop has ended already
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
+        if self._failure is not None:
+            raise self._failure
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
@@ -193,9 +204,11 @@ class PageServer:
             shown = f"[{self._host}]" if ":" in self._host else self._host
             self.address = f"http://{shown}:{self._port}/" + (f"?token={self._token}" if self._token else "")
             self._ready.set()
-            ticking = asyncio.create_task(self._tick())
-            await self._stop.wait()
-            ticking.cancel()
+            tasks = [asyncio.create_task(self._tick()), asyncio.create_task(self._stop.wait())]
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                task.cancel()
+            self._failure = next((task.exception() for task in done), None)
 
     async def _tick(self) -> None:
         """Takes in the session's messages and makes a frame, thirty times a second."""
@@ -260,7 +273,9 @@ class PageServer:
 
     async def _attend(self, connection: ServerConnection) -> None:
         """Serves one page until it goes."""
-        page = Page(connection, takes_part=not any(other.takes_part for other in self._pages))
+        self._met += 1
+        hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
+        page = Page(connection, hands, takes_part=not any(other.takes_part for other in self._pages))
         self._pages.add(page)
         sending = asyncio.create_task(self._send(page))
         try:
@@ -269,6 +284,7 @@ class PageServer:
         except ConnectionClosed as closed:
             self.refused["too large"] += closed.sent is not None and closed.sent.code == _TOO_LARGE
         finally:
+            page.hands.release()
             sending.cancel()
             self._pages.discard(page)
 
@@ -289,15 +305,28 @@ class PageServer:
     def _obey(self, page: Page, message: PageMessage) -> None:
         if isinstance(message, Seen):
             page.drawn = min(message.n, page.sent)
+            while page.unseen and page.unseen[0] <= page.drawn:
+                page.unseen.popleft()
             page.wake.set()
         elif isinstance(message, TakePart):
             page.takes_part = message.want
+            if not message.want:
+                page.hands.release()
         elif not page.takes_part:
             self.refused["does not take part"] += 1
         elif isinstance(message, SetLink | SetShares):
             self._desk.order(message)
+        elif isinstance(message, MoveHand):
+            self._move_hand(page, message)
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
+
+    def _move_hand(self, page: Page, order: MoveHand) -> None:
+        site = self.view.sites.get(order.site)
+        if site is None or site.hand is None:
+            self.refused["nobody can hold it"] += 1
+            return
+        page.hands.move(order, pushes=site.hand.mode == "force")
 
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
@@ -307,12 +336,13 @@ class PageServer:
             while True:
                 await page.wake.wait()
                 page.wake.clear()
-                if page.sent > page.drawn or page.sent == self._n:
+                if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._n:
                     continue
                 begins = self._frame is not None
                 if not begins and page.sent and self._n - page.sent < WAITING_FRAMES:
                     continue
-                page.sent = self._n
+                page.notified, page.sent = page.sent, self._n
+                page.unseen.append(page.sent)
                 if not greeted or not begins:
                     greeted = begins
                     about = {**self._frames.describe(), "n": self._n, "ends": self._ends}
@@ -327,6 +357,8 @@ class PageServer:
         most = 100_000 if first else POINTS_PER_FRAME
         points = frames.points.since(page.points, most)
         energies = frames.energies.since(page.energies, most)
+        sites = (self._frame or {}).get("sites", {})
+        held = [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
         events = [show_event(event) for event in view.events.since(page.events, 100)]
         page.points, page.energies, page.events = (
             frames.points.count,
@@ -339,8 +371,9 @@ class PageServer:
             "points": points,
             "energies": energies,
             "events": events,
-            "notices": [one for one in self._notices if one["n"] > page.drawn],
+            "notices": [one for one in self._notices if one["n"] > page.notified],
             "pages": len(self._pages),
             "takes_part": page.takes_part,
+            "holds": held,
             "refused": sum(self.refused.values()),
         }

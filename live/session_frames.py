@@ -12,10 +12,12 @@ import numpy as np
 from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m, upright_axes
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
+from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.operators import find_live_hand
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -65,8 +67,17 @@ class ArmFrames:
             "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
             "task": self._model.shares_pose,
             "unit": "m" if self._model.shares_pose else "rad",
+            "hand": self._describe_hand(),
             "law": type(self._spec.control).__struct_config__.tag,
         }
+
+    def _describe_hand(self) -> Json | None:
+        """Returns what somebody who takes hold can do; None if nobody can."""
+        hand = find_live_hand(self._spec.hands)
+        if hand is None:
+            return None
+        limit = hand.torque_limit_nm if hand.mode == "joint" else hand.force_limit_n
+        return {"mode": hand.mode, "limit": limit}
 
     def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
         """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
@@ -88,9 +99,22 @@ class ArmFrames:
             "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
             "hand": _rounded(hand[-1], 3),
             "wall": _rounded(wall[-1], 3),
+            **self._describe_grip(own, hand[-1]),
         }
         sizes = (np.linalg.norm(force, axis=1).max() for force in (hand, wall))
         return now, [float(e.max()), float(tau.max()), *map(float, sizes)]
+
+    def _describe_grip(self, own: AlignedRecords, force: Array) -> Json:
+        """Returns who holds the arm, where to, and whether the force is at its limit."""
+        if not own.hand.size:
+            return {}
+        held = HandInForce.read(own.hand[-1].tolist())
+        hand = find_live_hand(self._spec.hands)
+        limited = False
+        if hand is not None and hand.mode != "joint" and held.source:
+            limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (1.0 - 1e-6)
+        shown = held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
+        return {"grip": held.grip, "source": held.source, "target": shown, "hand_limited": limited}
 
     def _hand_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
         """Returns the force of people at the end effector, shape (K, 2) or (K, 3), N."""
@@ -195,6 +219,7 @@ class SessionFrames:
             "tick": record.tick,
             "mode": record.mode,
             "silent": self._view.silent(site),
+            "holder": site.holder if now.get("source") else "",
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
             "missing": account.missing if site.holds_from == 0 else 0,

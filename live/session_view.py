@@ -15,6 +15,7 @@ from recorder.inbound_queue import InboundMessage, InboundQueue
 from recorder.site_reception import SiteReception
 from trilat_net.analysis.certificate.running_energy import RunningEnergy
 from trilat_net.analysis.record_window import RecordWindow, make_windows
+from trilat_net.core.live_hand import TAKEN
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import topics
@@ -30,6 +31,7 @@ from trilat_net.scenario import (
     parse_embedded,
     scheduled_link_tables,
 )
+from trilat_net.scenario.operators import LiveHand, find_live_hand
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
@@ -67,10 +69,20 @@ class SiteView:
         record: the newest; None before the first.
         stats: the newest; None before the first.
         holds_from: its first tick that was seen.
+        hand: the live hand that its scenario has there; None without one.
+        holder: who took hold of its arm last.
     """
 
-    def __init__(self, bus: Bus, session: str, reception: SiteReception, window: RecordWindow) -> None:
-        self.reception, self.window = reception, window
+    def __init__(
+        self,
+        bus: Bus,
+        session: str,
+        reception: SiteReception,
+        window: RecordWindow,
+        hand: LiveHand | None = None,
+    ) -> None:
+        self.reception, self.window, self.hand = reception, window, hand
+        self.holder = ""
         self.dropped: Counter[str] = Counter()
         self.repair = GapRepair(bus, session, reception, self.dropped)
         self.record: State | None = None
@@ -173,7 +185,10 @@ class SessionView:
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)
         self.sites = {
-            name: SiteView(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name])
+            name: SiteView(
+                *(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name]),
+                find_live_hand(scenario.sites[name].hands),
+            )
             for name in scenario.names
         }
 
@@ -210,6 +225,9 @@ class SessionView:
             site.stats = content
         elif channel == topics.EVENT:
             self.events.add(content)
+            words, took_hold, _ = content.text.partition(f" {TAKEN} ")
+            if content.kind == "hand" and took_hold:
+                site.holder = words.removeprefix(f"{name}: ")
             if content.command:
                 self._change(name, content.command)
 

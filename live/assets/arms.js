@@ -2,8 +2,15 @@
 // Bodies are painted by three.js, or on a plain canvas where there is no WebGL; arrows and marks lie on top.
 import { PlainPainter } from "./painter2d.js";
 
-export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const colours = new Map(); // computing a style takes longer than drawing with it
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => colours.clear());
+export function css(name) {
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return colours.get(name);
+}
 export const siteColour = (index) => css(`--site-${index % 6}`);
+const SLOW_MS = 45;
+const SLOW_FRAMES = 40;
 const MODES = { hold: "HOLDS: peer stale", brake: "BRAKED: peer stale", return: "RETURNS", diverged: "DIVERGED" };
 const element = (parent, tag, name = "") => {
   const made = document.createElement(tag);
@@ -45,7 +52,7 @@ class ArmCard {
     this.alarms.setAttribute("role", "status");
     this.alarms.style.cssText = "display:contents";
     this.foot = element(this.card, "div", "foot");
-    this.view = { centre: this.middle(), half: 1.05 * about.reach, dark: false };
+    this.view = { centre: this.middle(), half: 0 };
     this.hold = null; // what this page's hand does: { at, to } in the arm's frame
     this.trail = [];
   }
@@ -57,14 +64,14 @@ class ArmCard {
     return tip.map((x) => 0.3 * reach * (x / size));
   }
 
-  chips(site) {
+  chips(site, holds) {
     const list = [];
     if (site.mode in MODES) list.push([MODES[site.mode], "bad"]);
     if (site.clamped) list.push(["TORQUE LIMIT", "bad"]);
     if (site.hand_limited) list.push(["FORCE LIMIT", "bad"]);
     if (site.silent) list.push(["SILENT", "bad"]);
-    if (this.hold) list.push(["you hold it", "good"]);
-    else if (site.holder) list.push([`held by ${site.holder}`, "warn"]);
+    if (holds) list.push(["you hold it", "good"]);
+    else if (site.holder) list.push([this.hold ? `REFUSED: ${site.holder} holds it` : `held by ${site.holder}`, this.hold ? "bad" : "warn"]);
     const text = JSON.stringify(list);
     if (text !== this.shown) {
       this.shown = text;
@@ -90,13 +97,16 @@ class ArmCard {
   fit(site) {
     const { view } = this;
     const aspect = this.canvas.width / this.canvas.height;
-    let needed = 0.62 * this.about.reach;
+    let needed = 0.56 * this.about.reach;
     for (const point of [...site.points, ...(this.about.task ? [] : site.ghost)]) {
       const [x, y] = this.flat(point);
       const [cx, cy] = this.flat(view.centre);
       needed = Math.max(needed, 1.18 * Math.abs(y - cy), (1.12 * Math.abs(x - cx)) / aspect);
     }
-    view.half += (needed > view.half ? 0.2 : 0.01) * (needed - view.half);
+    const now = performance.now();
+    const share = view.half ? 1 - Math.exp((this.fitted - now) / (needed > view.half ? 120 : 4000)) : 1;
+    this.fitted = now;
+    view.half += share * (needed - view.half);
   }
 
   flat(point) { // seen from the front: planar arms as they are, chains along their floor
@@ -114,7 +124,7 @@ class ArmCard {
     return ratio;
   }
 
-  draw(painter, site, scale) {
+  draw(painter, site, scale, holds) {
     const ratio = this.size();
     if (this.canvas.width < 2) return;
     this.fit(site);
@@ -125,7 +135,7 @@ class ArmCard {
     painter.paint(this, site, g);
     this.project = (point) => painter.project(this, point);
     this.over(g, site, ratio, scale);
-    this.chips(site);
+    this.chips(site, holds);
     this.numbers(site);
   }
 
@@ -154,8 +164,9 @@ class ArmCard {
     };
     push(site.wall, css("--bad"), "wall");
     push(site.hand, css("--good"), "hand");
-    if (this.hold?.to) {
-      const to = this.project(this.hold.to);
+    const target = this.hold?.to || site.target;
+    if (target) {
+      const to = this.project(target);
       g.strokeStyle = css("--good");
       g.lineWidth = 1.5 * ratio;
       g.setLineDash([4 * ratio, 3 * ratio]);
@@ -178,13 +189,22 @@ export class Arms {
     this.byName = Object.fromEntries(this.cards.map((card) => [card.name, card]));
     this.painter = new PlainPainter();
     this.scale = 10;
-    say("drawing without WebGL ...");
-    const plain = new URLSearchParams(location.search).has("plain");
+    say("drawn flat until WebGL is there");
+    this.say = say;
+    this.wishes = new URLSearchParams(location.search); // ?flat, or ?webgl however slow it is
+    if (this.wishes.has("flat")) return say("drawn flat, as asked");
     import("./painter3d.js").then(({ makeScenePainter }) => {
-      const painter = plain ? null : makeScenePainter(this.cards);
+      const painter = makeScenePainter(this.cards, this.wishes.has("webgl"));
       if (painter) this.painter = painter;
-      say(painter ? "drawn with WebGL" : "no WebGL here: drawn flat, on a plain canvas");
-    }).catch((error) => say(`no WebGL here (${error.message}): drawn flat, on a plain canvas`));
+      say(painter ? "drawn with WebGL" : "no WebGL, or none with a graphics card: drawn flat");
+    }).catch((error) => say(`no WebGL here (${error.message}): drawn flat`));
+  }
+
+  pace(took) { // a machine without a graphics card draws bodies too slowly to feel an arm
+    this.slow = took > SLOW_MS ? (this.slow || 0) + 1 : 0;
+    if (this.slow < SLOW_FRAMES || this.painter instanceof PlainPainter || this.wishes.has("webgl")) return;
+    this.painter = new PlainPainter();
+    this.say("WebGL is slow here: drawn flat");
   }
 
   draw(frame) {
@@ -192,7 +212,9 @@ export class Arms {
     const sizes = Object.values(frame.sites).flatMap((site) => [Math.hypot(...site.hand), Math.hypot(...site.wall)]);
     this.most = Math.max(5, ...sizes, 0.995 * (this.most || 0));
     this.scale = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 1e4].find((step) => step >= 0.9 * this.most) || 1e4;
+    const begun = performance.now();
     this.painter.begin?.();
-    for (const card of this.cards) card.draw(this.painter, frame.sites[card.name], this.scale);
+    for (const card of this.cards) card.draw(this.painter, frame.sites[card.name], this.scale, frame.holds.includes(card.name));
+    this.pace(performance.now() - begun);
   }
 }

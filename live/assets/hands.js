@@ -15,7 +15,16 @@ export class Hands {
     setInterval(() => this.beat(), EVERY_MS);
   }
 
-  can(card) { return this.page.takesPart && Boolean(card.about.hand) && Boolean(card.project); }
+  can(card) { return this.page.takesPart && ["tip", "force"].includes(card.about.hand?.mode) && Boolean(card.project); }
+
+  goal(card) { // the target; for an arm that is pushed the force, as far as the pointer is from the tip
+    const { hand, reach } = card.about;
+    if (hand.mode === "tip") return card.hold.to;
+    const tip = this.tip(card);
+    const pull = card.hold.to.map((x, n) => x - tip[n]);
+    const size = Math.hypot(...pull) || 1;
+    return pull.map((x) => (x / size) * hand.limit * Math.min(1, size / (0.35 * reach)));
+  }
 
   pixel(card, event) {
     const box = card.canvas.getBoundingClientRect();
@@ -83,7 +92,7 @@ export class Hands {
     const now = performance.now();
     if (now - card.hold.told < EVERY_MS - 1) return;
     card.hold.told = now;
-    this.send({ do: "hand", site: card.name, grip: true, to: card.hold.to });
+    this.send({ do: "hand", site: card.name, grip: true, to: this.goal(card) });
   }
 
   beat() {

@@ -73,12 +73,13 @@ export class Network {
     for (const link of chosen ? [chosen] : this.links) this.send({ do: "link", link, to: preset ? { preset } : values });
   }
 
-  place(n, width, height) {
+  place(n, width, height) { // as the triangle of dominance: the third on top
     const count = this.sites.length;
-    const angle = -Math.PI / 2 + (2 * Math.PI * (n + (count === 2 ? 0.5 : 0.5 + 1))) / count;
-    const turn = count === 2 ? Math.PI * n : angle;
-    const rx = Math.min(0.5 * width - 42, 1.35 * height);
-    return [width / 2 + (count === 2 ? -rx * Math.cos(turn) : rx * Math.cos(angle) / 0.87), (count === 3 ? 0.4 : 0.5) * height - (count === 2 ? 0 : -(0.5 * height - 30) * Math.sin(angle) * (count === 3 ? 0.98 : 1))];
+    const rx = Math.min(0.5 * width - 34, 1.1 * height);
+    if (count === 2) return [width / 2 + (n ? rx : -rx), height / 2];
+    if (count === 3) return n === 2 ? [width / 2, 24] : [width / 2 + (n ? rx : -rx), height - 40];
+    const angle = Math.PI * (1.25 - (2 * n) / count);
+    return [width / 2 + rx * Math.cos(angle), height / 2 - (0.5 * height - 26) * Math.sin(angle)];
   }
 
   draw(frame) {
@@ -101,7 +102,7 @@ export class Network {
       g.textBaseline = "middle";
       g.fillText(site.length > 4 ? site.slice(0, 4) : site, x, y);
     });
-    if (!(this.turn = ((this.turn || 0) + 1) % 6)) for (const name of this.links) this.row(name, frame);
+    if ((this.turn = ((this.turn ?? -1) + 1) % 6) === 0) for (const name of this.links) this.row(name, frame);
   }
 
   link(g, name, frame, width, height) {
@@ -136,10 +137,9 @@ export class Network {
     g.font = "11px system-ui, sans-serif";
     g.fillStyle = stale ? css("--bad") : css("--soft");
     const [x, y] = point(0.5);
-    const [ox, oy] = [-uy * 15, ux * 12];
-    g.textAlign = Math.abs(ox) < 5 ? "center" : ox > 0 ? "left" : "right";
+    g.textAlign = Math.abs(uy) < 0.3 ? "center" : uy < 0 ? "left" : "right";
     g.textBaseline = "middle";
-    g.fillText(`${link.age_ms.toFixed(0)} ms`, x + 0.6 * ox, y + oy);
+    g.fillText(`${link.age_ms.toFixed(0)} ms`, x - 10 * uy, y + 13 * ux);
   }
 
   row(name, frame) {

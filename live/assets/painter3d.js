@@ -11,7 +11,7 @@ class ArmScene {
     this.card = card;
     const { about } = card;
     const size = about.reach;
-    this.thick = 0.042 * size;
+    this.thick = 0.05 * size;
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(FIELD, 1, 0.05 * size, 60 * size);
     this.up = about.planar ? [new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 0, 1), Y.clone()] : about.up.map(vector);
@@ -124,7 +124,7 @@ class ArmScene {
     const centre = vector(card.view.centre);
     const away = card.view.half / Math.tan((FIELD * Math.PI) / 360);
     const [ahead, side, up] = this.up;
-    const from = card.about.planar ? new THREE.Vector3(-0.1, 0.2, 1) : ahead.clone().multiplyScalar(0.64).addScaledVector(side, -0.77).addScaledVector(up, 0.4);
+    const from = card.about.planar ? new THREE.Vector3(-0.03, 0.1, 1) : ahead.clone().multiplyScalar(0.64).addScaledVector(side, -0.77).addScaledVector(up, 0.4);
     camera.position.copy(centre).addScaledVector(from.normalize(), away);
     camera.up.copy(up);
     camera.aspect = aspect;
@@ -183,12 +183,13 @@ class ScenePainter {
   }
 }
 
-export function makeScenePainter(cards) { // null where there is no WebGL
+export function makeScenePainter(cards, however) { // null where there is no WebGL, or none by a graphics card
   const canvas = document.createElement("canvas");
   const context = canvas.getContext("webgl2", { antialias: true, alpha: true, premultipliedAlpha: true });
   if (context === null) return null;
   const info = context.getExtension("WEBGL_debug_renderer_info");
   const name = info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
-  const software = /swiftshader|llvmpipe|software/i.test(name) && !new URLSearchParams(location.search).has("shadows");
+  const software = /swiftshader|llvmpipe|software/i.test(name);
+  if (software && !however) return null;
   return new ScenePainter(new THREE.WebGLRenderer({ canvas, context }), cards, software);
 }

@@ -10,13 +10,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from live.live_session import PageOptions
-from live.page_orders import MAX_MESSAGE_BYTES
+from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
 from live.page_server import BURST, MOST_EXCESS, PageServer
-from tests.net.waiting import until
+from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
 from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.requests import ChangeReply, ChangeRequest
+from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 
 
@@ -168,3 +168,35 @@ def test_orders_count_of_a_page_that_takes_part_and_a_second_one_asks_first(
         second.send(order)
         assert decode(until(questions.poll).payload, ChangeRequest).link == "m1->s"
     assert server.refused["does not take part"] == 1
+
+
+def test_what_a_page_wants_of_a_hand_is_in_range_or_refused(server: PageServer) -> None:
+    """An arm that is not there, or that nobody can hold, is refused; so is what is no number."""
+    with socket(server) as page:
+        page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
+        until(lambda: server.refused["nobody can hold it"] == 1)
+        for to in ("[NaN,0]", "[1e999,0]", '["1",0]', str([0.0] * 13)):
+            page.send(f'{{"do":"hand","site":"m1","grip":true,"to":{to}}}')
+        until(lambda: server.refused["malformed"] == 4)
+        assert "hello" in hears(page)
+
+
+def test_the_hands_of_a_page_are_its_own_and_let_go_with_it(network: LocalNetwork) -> None:
+    site = network.join()
+    messages = site.inbox("trilat/s1/m1/hand")
+    hands = [PageHands(network.join(), SystemClock(), "s1", f"page {n}") for n in (1, 2)]
+    for hand in hands:
+        hand.move(MoveHand(site="m1", grip=True, to=[1.0, 0.5]), pushes=False)
+    hands[0].move(MoveHand(site="m1", grip=True, to=[1.1, 0.5]), pushes=False)
+    hands[0].release()
+    hands[0].release()
+    sent = [decode(payload, HandMessage) for _, payload in drained(messages)]
+    assert [(one.source, one.n, one.grip, one.target) for one in sent] == [
+        ("page 1", 1, True, [1.0, 0.5]),
+        ("page 2", 1, True, [1.0, 0.5]),
+        ("page 1", 2, True, [1.1, 0.5]),
+        ("page 1", 3, False, []),
+    ]
+    assert hands[0].holds("m1", sent[0].boot)
+    assert not hands[1].holds("m1", sent[0].boot)
+    assert sent[0].boot != sent[1].boot

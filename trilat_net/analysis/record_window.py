@@ -5,6 +5,7 @@ Invariant: bounded; a record may come late, out of order or twice. What is not t
 """
 
 from collections.abc import Iterable
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,11 @@ class RecordWindow:
         self.site, self.rate_hz = site, scenario.sites[site].rate_hz
         self.peers, self._axes = scenario.peers(site), scenario.arms[site].axes
         layout = scenario.layout(site)
-        self._names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()))
-        columns = layout.columns()
-        self._columns = {name: columns[name] for name in self._names}
+        names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()), *(("hand",) if layout.hand else ()))
+        ends = list(accumulate(layout.lengths()[name] for name in names))
+        self._columns = {name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)}
         self._kept = max(8, round(kept_s * self.rate_hz))
-        self._floats = np.zeros((2 * self._kept, layout.floats))
+        self._floats = np.zeros((2 * self._kept, ends[-1]))
         self._used = np.full((2 * self._kept, len(self.peers)), -1, dtype=np.int64)
         self._known = np.zeros(2 * self._kept, dtype=np.bool_)
         self._follows = np.zeros(2 * self._kept, dtype=np.bool_)
