@@ -1,11 +1,13 @@
-"""A scenario of three arms of six joints."""
+"""Scenarios of chains: three arms of six joints, and two alike arms of any file."""
+
+from collections.abc import Sequence
 
 SIX = """
 name = "six"
 title = "Three arms of six joints"
 duration_s = {duration_s}
 [arm]
-urdf = "arm6.urdf"
+urdf = "{urdf}"
 armature_kg_m2 = [0.2, 0.2, 0.2, 0.05, 0.05, 0.05]
 [control]
 law = "adaptive"
@@ -28,8 +30,43 @@ m1 = {{ m2 = 0.5, s = 0.5 }}
 m2 = {{ m1 = 0.5, s = 0.5 }}
 s = {{ m1 = 0.5, m2 = 0.5 }}
 """
+TWO = """
+name = "two"
+duration_s = {duration_s}
+[arm]
+urdf = "{urdf}"
+armature_kg_m2 = {armature}
+[control]
+law = "adaptive"
+Lambda = 1.0
+Kp = 10.0
+Kd = 2.0
+Gamma = 1.0
+[link]
+model = "constant"
+delay_ms = {delay_ms}
+[sites.m]
+q0_rad = {q0}
+[sites.s]
+role = "slave"
+q0_rad = {q0}
+[dominance]
+m = {{ s = 1.0 }}
+s = {{ m = 1.0 }}
+"""
 
 
-def six_joints(duration_s: float, delay_ms: float = 20.0) -> str:
-    """The scenario's text."""
-    return SIX.format(duration_s=duration_s, delay_ms=delay_ms)
+def six_joints(duration_s: float, delay_ms: float = 20.0, urdf: str = "arm6.urdf") -> str:
+    """The text of three arms of six joints."""
+    return SIX.format(duration_s=duration_s, delay_ms=delay_ms, urdf=urdf)
+
+
+def two_arms(
+    urdf: str,
+    q0: Sequence[float],
+    duration_s: float = 1.0,
+    delay_ms: float = 40.0,
+    armature: float | list[float] = 0.2,
+) -> str:
+    """The text of two arms of one file in one pose."""
+    return TWO.format(urdf=urdf, q0=list(q0), duration_s=duration_s, delay_ms=delay_ms, armature=armature)

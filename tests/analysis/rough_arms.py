@@ -4,23 +4,11 @@ from functools import cache
 from importlib import resources
 
 import trilat_net
+from tests.chains import six_joints
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
-ROUGH = """
-name = "rough"
-duration_s = 4.0
-[arm]
-urdf = "rough.urdf"
-armature_kg_m2 = [0.2, 0.2, 0.2, 0.05, 0.05, 0.05]
-[control]
-law = "adaptive"
-Kp = [10, 10, 10, 2, 2, 2]
-Kd = [2, 2, 2, 0.5, 0.5, 0.5]
-[link]
-delay_ms = 50.0
-[sites.m1]
-q0_rad = [0.3, -1.0, 1.2, -0.6, 0.5, 0.2]
+ROUGH = f"""{six_joints(4.0, 50.0, "rough.urdf")}
 [[sites.m1.hands]]
 kind = "tip_spring"
 to_m = [-0.4, -0.2, 0.1]
@@ -29,21 +17,22 @@ move_end_s = 2.0
 stiffness_n_m = 100.0
 damping_n_s_m = 20.0
 end_s = 3.0
-[sites.m2]
-q0_rad = [-0.4, -1.3, 1.5, -0.2, 0.1, 0.0]
-hands = [{ kind = "pulse", start_s = 0.1, end_s = 0.9, peak_nm = [0.0, 0.0, 60.0, 0.0, 1.0, 0.0] }]
-[sites.s]
-role = "slave"
-q0_rad = [0.0, -1.1, 1.0, -0.4, 0.3, 0.1]
-limits = { tau_limit_nm = [150.0, 30.0, 150.0, 28.0, 28.0, 28.0] }
-environment = [
-    { kind = "wall", point_m = [0.0, 0.0, 0.27], normal = [0.1, 0.0, 1.0], stiffness_n_m = 500.0 },
-    { kind = "viscous", damping_nm_s_rad = 0.5, sampled = true },
-]
-[dominance]
-m1 = { m2 = 0.5, s = 0.5 }
-m2 = { m1 = 0.5, s = 0.5 }
-s = { m1 = 0.5, m2 = 0.5 }
+[[sites.m2.hands]]
+kind = "pulse"
+start_s = 0.1
+end_s = 0.9
+peak_nm = [0.0, 0.0, 60.0, 0.0, 1.0, 0.0]
+[sites.s.limits]
+tau_limit_nm = [150.0, 30.0, 150.0, 28.0, 28.0, 28.0]
+[[sites.s.environment]]
+kind = "wall"
+point_m = [0.0, 0.0, 0.27]
+normal = [0.1, 0.0, 1.0]
+stiffness_n_m = 500.0
+[[sites.s.environment]]
+kind = "viscous"
+damping_nm_s_rad = 0.5
+sampled = true
 [urdf]
 "rough.urdf" = '''
 """

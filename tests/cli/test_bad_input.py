@@ -1,10 +1,17 @@
 """Bad input is one line on stderr and exit code 2: what is wrong, where, and what would be right."""
 
+import json
 from pathlib import Path
 
 import pytest
 
+from tests.chains import six_joints
+from tests.task_arms import planar_task
+from trilat_net.scenario.resolve import SHIPPED_FOLDER
+
 from .running import trilat
+
+ARM6 = Path(str(SHIPPED_FOLDER)) / "arm6.urdf"
 
 OVERRIDES = {
     "control.Kq=5": ("control.Kq", "Kp"),
@@ -79,6 +86,58 @@ def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> Non
     arguments, facts = COMMANDS[kind]
     trilat(*arguments, cwd=tmp_path).refuses(*facts)
     assert list(tmp_path.iterdir()) == []  # and nothing is left behind
+
+
+SEVEN = [0.0, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
+ARMS: dict[str, tuple[str, dict[str, object], list[str]]] = {
+    "a singular task pose": ("planar", {"sites.s.q0_rad": [0.1, 0.0]}, ["sites.s.q0_rad", "singular pose"]),
+    "a joint beyond its stop": ("six", {"sites.s.q0_rad": [0, 0, 9, 0, 0, 0]}, ["q0_rad[2]", "joint elbow"]),
+    "arms of different joints": (
+        "six",
+        {"sites.m1.arm.urdf": "arm7.urdf", "sites.m1.arm.armature_kg_m2": 0.2, "sites.m1.q0_rad": SEVEN}
+        | {f"sites.m1.control.{gain}": 1.0 for gain in ("Kp", "Kd")},
+        ["sites.m2.arm", "6 joints", "7"],
+    ),
+    "a body that none can be": ("heavy", {}, ["arm.urdf", "link 'forearm'", "mass"]),
+}
+"""Scenarios that no command may run: what is wrong with them, and what an error must name."""
+TAKERS = [
+    "sim",
+    "demo",
+    "test",
+    "linear",
+    "scenario check",
+    "sweep --over link.delay_ms=0,1",
+    "compare --tune",
+    "site m1",
+]
+
+
+def write_arms(kind: str, folder: Path) -> list[str]:
+    """Writes a scenario of bad arms; returns its name and overrides, as arguments."""
+    text, changes, _ = ARMS[kind]
+    written = {"planar": planar_task()}.get(text, six_joints(1.0))
+    (folder / "arms.toml").write_text(
+        written.replace("arm6.urdf", "heavy.urdf") if text == "heavy" else written
+    )
+    forearm = ARM6.read_text().split('<link name="forearm">')
+    (folder / "heavy.urdf").write_text(
+        '<link name="forearm">'.join([forearm[0], forearm[1].replace('<mass value="', '<mass value="-', 1)])
+    )
+    return [
+        "arms.toml",
+        *(word for key, value in changes.items() for word in ("--set", f"{key}={json.dumps(value)}")),
+    ]
+
+
+@pytest.mark.parametrize("kind", ARMS)
+@pytest.mark.parametrize("command", TAKERS)
+def test_bad_arms_are_named_by_every_command(command: str, kind: str, tmp_path: Path) -> None:
+    given = write_arms(kind, tmp_path)
+    if command.startswith("site"):
+        given = ["--scenario", *given]
+    trilat(*command.split(), *given, cwd=tmp_path).refuses(*ARMS[kind][2])
+    assert {path.name for path in tmp_path.iterdir()} == {"arms.toml", "heavy.urdf"}
 
 
 READERS = ["verify", "report", "rerun --closed-loop", "certify", "metrics", "replay", "figure"]

@@ -8,6 +8,7 @@ import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
+from tests.chains import two_arms
 from tests.core.chain_references import ARMS, chain_references
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import (
@@ -20,35 +21,12 @@ from trilat_net.log.ros2.robot_model import (
 from trilat_net.log.ros2.ros2_messages import ROBOT_CHANNELS
 from trilat_net.scenario import Scenario, parse_scenario
 
-TEXT = """
-name = "two"
-duration_s = 1.0
-[arm]
-urdf = "{arm}.urdf"
-down = {down}
-armature_kg_m2 = 0.2
-[control]
-law = "adaptive"
-Lambda = 1.0
-Kp = 10.0
-Kd = 2.0
-Gamma = 1.0
-[link]
-delay_ms = 40.0
-[sites.m]
-q0_rad = {q0}
-[sites.s]
-role = "slave"
-q0_rad = {q0}
-[dominance]
-m = {{ s = 1.0 }}
-s = {{ m = 1.0 }}
-"""
 POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
 
 
 def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
-    return parse_scenario(TEXT.format(arm=arm, down=down, q0=POSES[arm]), "two.toml")
+    text = two_arms(f"{arm}.urdf", POSES[arm]).replace("[control]", f"down = {down}\n[control]")
+    return parse_scenario(text, "two.toml")
 
 
 def end_of(model: RobotModel, q) -> tuple:

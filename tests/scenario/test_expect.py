@@ -121,3 +121,19 @@ def test_a_window_has_the_quantities_of_as_many_joints_as_the_arm() -> None:
         six(**{"expect.windows": [window | {"q7_rad": [0.0, 1.0]}]})
     with pytest.raises(ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"):
         with_expect(windows=[window])
+
+
+def test_a_window_may_name_joints_as_their_file_does() -> None:
+    """It is the same window as one with their numbers, so that nothing else knows the difference."""
+
+    def windows(**keys: Any) -> tuple[ExpectWindow, ...]:
+        return six(**{"expect.windows": [{"from_s": 0.0, "to_s": 1.0, "site": "m1", **keys}]}).expect.windows
+
+    named = windows(q_elbow_rad=[0.0, 1.0], push_wrist_1_mean_nm=[-1.0, 1.0])
+    assert named == windows(q3_rad=[0.0, 1.0], push4_mean_nm=[-1.0, 1.0])
+    for keys, words in (
+        ({"q_elbo_rad": [0, 1]}, r"expect\.windows\[0\]\.q_elbo_rad: unknown key"),
+        ({"q_elbow_rad": [0, 1], "q3_rad": [0, 1]}, "is q3_rad once more"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            windows(**keys)

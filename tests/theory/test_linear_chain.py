@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
 
+from tests.chains import two_arms
 from tests.core.chain_references import ARMS
 from tests.theory.loops import Array, residual, roots_within
 from trilat_net.core.chain import (
@@ -46,22 +47,7 @@ from trilat_net.theory.tick_map import compute_sampled_spectrum
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]
 """Joints of arm6 that gravity loads: not the first, whose axis is upright."""
-TEXT = """
-name = "six"
-duration_s = 20.0
-[arm]
-urdf = "arm6.urdf"
-armature_kg_m2 = [0.2, 0.2, 0.2, 0.05, 0.05, 0.05]
-[link]
-model = "constant"
-delay_ms = 50
-[sites.m]
-[sites.s]
-role = "slave"
-[dominance]
-m = { s = 1.0 }
-s = { m = 1.0 }
-"""
+TEXT = two_arms("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 LAWS: dict[str, dict[str, Any]] = {
     "adaptive": {"law": "adaptive", "Gamma": 3.0, "Lambda": 2.0, "Kp": [8, 0.5, 3, 1, 1, 1], "Kd": 1.0},
     "p_d": {"law": "p_d", "K": [60.0, 60.0, 60.0, 12.0, 12.0, 12.0], "d": [6.0, 6.0, 6.0, 0.7, 0.7, 0.7]},

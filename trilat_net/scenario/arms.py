@@ -299,8 +299,9 @@ def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
     """
     if arm.urdf not in urdf:
         raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
-    if any(arm.payload_inertia_kg_m2) and not arm.payload_kg:
-        raise ScenarioError("is of a payload without mass: give payload_kg", path="payload_inertia_kg_m2")
+    for key in ("payload_com_m", "payload_inertia_kg_m2"):
+        if any(getattr(arm, key)) and not arm.payload_kg:
+            raise ScenarioError("is of a payload without mass: give payload_kg", path=key)
     payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
     try:
         return _read_cached(urdf[arm.urdf], arm.base, arm.tip, payload if arm.payload_kg else None)

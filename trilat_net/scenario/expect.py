@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from ..errors import ScenarioError
 from .fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys, field_names, suggest_nearest
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
@@ -37,9 +38,9 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         speed_peak_rad_s: largest speed of a joint.
         torque_peak_nm: largest control torque of a joint.
         q1_rad: angle of joint 1, at every tick; q2_rad of joint 2, and so on as far as the arm has joints;
-            m of a prismatic joint.
+            m of a prismatic joint. Where a URDF names the joints, q_NAME_rad is written as well.
         push1_mean_nm: torque of operator and environment ON joint 1, the mean over the ticks; push2_mean_nm
-            of joint 2, and so on.
+            of joint 2, and so on; push_NAME_mean_nm so.
         wall_mean_n: force of the walls, the mean over the ticks, with or without contact.
         wall_deviation_n: its standard deviation over the ticks (of the population).
         wall_peak_n: the largest.
@@ -97,6 +98,35 @@ def window_quantities(joints: int) -> tuple[str, ...]:
     """Returns the quantities of a window of a site whose arm has so many joints."""
     numbers = {key: _JOINT_QUANTITY.match(key) for key in _QUANTITIES}
     return tuple(key for key, number in numbers.items() if number is None or int(number[1]) <= joints)
+
+
+def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
+    """Returns the windows of a file with keys that name joints, as q_elbow_rad, written by their numbers.
+
+    `joint_names` has the names of the joints of each site's arm, in their order. What is no window stays.
+    """
+    if not isinstance(written, list):
+        return written
+    windows = []
+    for n, table in enumerate(written):
+        numbered: dict[str, Any] = {}
+        for key, value in table.items() if isinstance(table, dict) else ():
+            kind, ending, name = _split_joint_key(key)
+            names = joint_names.get(table.get("site", ""), ()) if name else ()
+            known = f"{kind}{names.index(name) + 1}{ending}" if name in names else key
+            if known in numbered or (known != key and known in table):
+                raise ScenarioError(f"is {known} once more", path=f"expect.windows[{n}].{key}")
+            numbered[known] = value
+        windows.append(numbered if isinstance(table, dict) else table)
+    return windows
+
+
+def _split_joint_key(key: str) -> tuple[str, str, str]:
+    """Returns kind, ending and joint name of a key that names a joint; the name is "" of any other."""
+    for kind, ending in (("q", "_rad"), ("push", "_mean_nm")):
+        if key.startswith(f"{kind}_") and key.endswith(ending):
+            return kind, ending, key.removeprefix(f"{kind}_").removesuffix(ending)
+    return "", "", ""
 
 
 def check_window_keys(written: Any) -> None:

@@ -18,11 +18,11 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
-from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
-from .expect import Expect, check_window_keys
+from .expect import Expect, check_window_keys, number_window_joints
 from .fields import (
     Frozen,
     TomlTable,
@@ -99,12 +99,16 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     for group, kind in SITE_GROUPS.items():
         check_keys(tables.get(group, {}), field_names(kind), group)
     check_keys(tables.get("expect", {}), field_names(Expect), "expect")
-    check_window_keys(tables.get("expect", {}).get("windows"))
     _resolve_control(tables.get("control", {}), {}, "control", VectorCounts())
     draws = Draws(tables.get("seed", _DEFAULT_SEED), tables.get("drawn", {}))
     urdf = _read_urdf_files(tables, folder)
     sites = _resolve_sites(tables, draws, urdf)
     named = [site["arm"].get("urdf") for site in sites.values()]
+    expect = dict(tables.get("expect", {}))
+    if "windows" in expect:
+        joints = {name: _name_joints(site["arm"], urdf) for name, site in sites.items()}
+        expect["windows"] = number_window_joints(expect["windows"], joints)
+        check_window_keys(expect["windows"])
     written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
     for name in sites:
         if name not in written:
@@ -121,7 +125,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "dominance": rows,
         "links": links,
         "timeline": resolve_timeline(tables.get("timeline", []), links, list(sites)),
-        "expect": tables.get("expect", {}),
+        "expect": expect,
         "drawn": msgspec.to_builtins(draws.drawn),
         "urdf": {name: text for name, text in urdf.items() if name in named},
     }
@@ -274,6 +278,13 @@ def _resolve_arm(
         raise ScenarioError(_OF_A_CHAIN, path=f"{path}.armature_kg_m2")
     table |= draws.draw_numbers(expand_vectors(armature, Arm, model.counts), path)
     return table, _model_arm(table, task, urdf, chains, path)
+
+
+def _name_joints(table: TomlTable, urdf: dict[str, str]) -> tuple[str, ...]:
+    """Returns the names that the file of an arm gives its joints, in their order; () of a planar arm."""
+    if not table.get("urdf"):
+        return ()
+    return tuple(joint.name for joint in read_arm(msgspec.convert(table, Arm), urdf).joints)
 
 
 _OF_A_CHAIN = "belongs to an arm with a urdf, and this one is planar"

@@ -93,6 +93,7 @@ class LogMetrics(NamedTuple):
         sharing_ratios: the force sharing of those at which two sites are loaded.
         responses: impedances and reflections over frequency.
         axes: names of what sites share in task space, where a joint's number is that of an axis; else ().
+        joint_names: names that the files of the arms give their joints, if they agree; else ().
     """
 
     run: MetricValues
@@ -106,10 +107,13 @@ class LogMetrics(NamedTuple):
     stiffness: list[StiffnessEstimate]
     responses: list[ImpedanceEstimate]
     axes: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
 
     def label(self, number: int) -> str:
-        """Returns what the number of a joint stands for, from 1: "1", or the name of an axis."""
-        return self.axes[number - 1] if self.axes else str(number)
+        """Returns what the number of a joint stands for, from 1: "1", "3 elbow", or the name of an axis."""
+        if self.axes:
+            return self.axes[number - 1]
+        return f"{number} {self.joint_names[number - 1]}" if self.joint_names else str(number)
 
     def unit(self, of_joint: str, number: int) -> str:
         """Returns the unit of a joint's quantity, or of that along an axis of a place."""
@@ -186,7 +190,14 @@ def _measure(log: Log) -> LogMetrics:
         static_windows.estimate_stiffness(windows),
         estimate_impedances(shared),
         TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
+        _find_joint_names(scenario),
     )
+
+
+def _find_joint_names(scenario: Scenario) -> tuple[str, ...]:
+    """Returns the names that the files of the arms give their joints; () if not all name them alike."""
+    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
+    return names.pop() if len(names) == 1 else ()
 
 
 def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
@@ -282,6 +293,8 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         ],
     }
     if not metrics.axes:
+        for entry in (one for entries in found.values() for one in entries if metrics.joint_names):
+            entry["joint_name"] = metrics.joint_names[entry["joint"] - 1]
         return found
     return {name: [_name_axis(metrics, one) for one in entries] for name, entries in found.items()}
 
