@@ -33,9 +33,11 @@ from . import (
     scenario,
     sim,
     site,
+    stop,
     sweep,
     test,
     verify,
+    watch,
 )
 from . import set as set_command
 
@@ -83,6 +85,8 @@ _SINGLE = {
     "site": (site.site_command, "m1 --scenario paper"),
     "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
     "ping": (ping.ping_command, "--session paper"),
+    "watch": (watch.watch_command, "--session paper-demo"),
+    "stop": (stop.stop_command, "--session paper-demo"),
     "router": (router.router_command, f"--listen {router.ANY_ADDRESS}"),
     "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
     "verify": (verify.verify_command, "run.mcap"),
