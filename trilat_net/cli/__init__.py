@@ -20,6 +20,7 @@ from . import (
     compare,
     demo,
     figure,
+    keys,
     linear,
     live,
     log,
@@ -87,7 +88,7 @@ _SINGLE = {
     "ping": (ping.ping_command, "--session paper"),
     "watch": (watch.watch_command, "--session paper-demo"),
     "stop": (stop.stop_command, "--session paper-demo"),
-    "router": (router.router_command, f"--listen {router.ANY_ADDRESS}"),
+    "router": (router.router_command, "--keys keys/router"),
     "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
     "verify": (verify.verify_command, "run.mcap"),
     "certify": (certify.certify_command, "run.mcap"),
@@ -128,6 +129,10 @@ _SET = {
     "link": (set_command.set_link_command, "'m1->s' --delay 350ms --loss 5%"),
     "dominance": (set_command.set_dominance_command, "s m1=0.9 m2=0.1"),
 }
+_KEYS = {
+    "new": (keys.keys_new_command, "keys m1 m2 s recorder operator --host 192.0.2.1"),
+    "show": (keys.keys_show_command, "keys/m1"),
+}
 _CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
 _CHANGES.callback()(set_command.set_command)
 app.add_typer(_group(_SINGLE))
@@ -141,6 +146,10 @@ app.add_typer(
     name="scenario",
 )
 app.add_typer(_CHANGES, name="set")
+app.add_typer(
+    _group(_KEYS, "keys ", no_args_is_help=True, help="The keys by which members know one another."),
+    name="keys",
+)
 
 
 def main() -> None:

@@ -86,6 +86,7 @@ def replay_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a session of its own.
@@ -110,7 +111,9 @@ def replay_command(
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
     name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
     first = [default_endpoint(name, 0)]
-    connection = options.resolve_connection(listen, connect, router, zenoh_config, first, [])
+    connection = options.resolve_connection(
+        listen, connect, router, zenoh_config, first, [], insecure=insecure
+    )
     play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
     console = terminal.err if as_json else terminal.out
     tell = partial(console.print, markup=False, soft_wrap=True)
