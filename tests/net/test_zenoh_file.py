@@ -173,6 +173,7 @@ def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_pa
         ("{connect: {endpoints: {pear: []}}}", r"connect/endpoints/pear: no key .*did you mean peer\?"),
         ("{connect: {endpoints: ['nope']}}", "connect/endpoints: Endpoints must be of the form <protocol>"),
         ("{access_control: {rules: [{id: 'x'}]}}", "access_control/rules: missing field `key_exprs`"),
+        ("{access_control: {default_permission: 'deny'}}", "access_control: has no `enabled: true`"),
         ("{transport: {link: {tx: {lease: 500}}}}", "transport/link/tx/lease: 500 must be 5000 or more"),
     ],
 )

@@ -131,7 +131,7 @@ _SET = {
 }
 _KEYS = {
     "new": (keys.keys_new_command, "keys m1 m2 s recorder operator --host 192.0.2.1"),
-    "show": (keys.keys_show_command, "keys/m1"),
+    "info": (keys.keys_info_command, "keys/m1"),
 }
 _CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
 _CHANGES.callback()(set_command.set_command)

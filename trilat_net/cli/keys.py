@@ -40,7 +40,7 @@ def keys_new_command(
     terminal.print_line(f"they hold for {days} days; as in: trilat site {made[0].name} --keys {made[0]} ...")
 
 
-def keys_show_command(
+def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
 ) -> None:
     """Shows whose keys these are, until when they hold, and the settings of Zenoh that they make."""

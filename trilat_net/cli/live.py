@@ -57,8 +57,8 @@ def live_command(
         name = options.check_session_name(session)
         code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)
         raise typer.Exit(code)
-    if connect or router or zenoh_config:
-        raise UsageError("--connect, --router and --zenoh-config go with --session")
+    if connect or router or zenoh_config or keys:
+        raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     _run_session(page, scenario, folder, duration, seed, overrides, force=force)
 
 

@@ -13,6 +13,7 @@ def stop_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
 ) -> None:
     """Ends a running session in order: all sites at one time, and every recorder with all records.
 
@@ -25,7 +26,7 @@ def stop_command(
     from ..scenario import parse_embedded
 
     name, clock = options.check_session_name(session), SystemClock()
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
     with connect_to_session(
         connection,
         clock,

@@ -13,6 +13,7 @@ def watch_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
     timeout: Annotated[
         float,
         typer.Option(
@@ -36,7 +37,7 @@ def watch_command(
     from ..scenario import parse_embedded
 
     name, clock = options.check_session_name(session), SystemClock()
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
     with Interrupt() as interrupt:
         with connect_to_session(
             connection,
