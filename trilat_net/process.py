@@ -142,6 +142,7 @@ def worker_pool(count: int) -> Iterator[Executor]:
     from loky import ProcessPoolExecutor
 
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
+    warnings.filterwarnings("ignore", "A worker was restarted")  # each keeps the laws that it compiled
     pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=(os.getpid(),))
     try:
         with hold_sigint():

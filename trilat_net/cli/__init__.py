@@ -16,6 +16,7 @@ from ..errors import TrilatError
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error
 from . import (
+    bench,
     certify,
     compare,
     demo,
@@ -117,6 +118,7 @@ _STUDIES = {
         "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
         "runs/sweep-p_d_margin-001 --cell 17",
     ),
+    "bench": (bench.bench_command, "--small", "--study round-trips --law wave,smith"),
     "linear": (linear.linear_command, "p_d_margin --set control.d=0.9 --over control.d=0.1:3"),
 }
 _SCENARIO = {
