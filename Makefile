@@ -5,10 +5,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo setup test pytest sessions live containers lint test-long bench lock clean
+.PHONY: help demo play setup test pytest sessions live containers lint test-long bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
+	@echo "make play    take hold of three arms on a page in the browser, and look at what you made"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
@@ -16,6 +17,9 @@ help:
 
 demo: setup
 	@$(BIN)/trilat demo paper
+
+play: setup
+	@$(BIN)/trilat live play
 
 setup: $(VENV)/runtime.stamp
 

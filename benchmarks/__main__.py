@@ -12,6 +12,7 @@ from . import (
     links,
     live,
     machine,
+    page,
     presets,
     reading,
     replay,
@@ -39,6 +40,7 @@ LONG = {
     "stalls": stalls.run,
     "endurance": endurance.run,
     "live": live.run,
+    "page": page.run,
 }
 """Only when they are named."""
 

@@ -157,10 +157,13 @@ class ArmCard {
       const length = Math.min(1.6, size / scale) * 0.55 * this.about.reach;
       const end = this.project(tip.map((x, n) => x + (length * (force[n] || 0)) / size));
       arrow(g, at, end, colour, 3.2 * ratio);
+      g.textAlign = "left";
       g.font = `600 ${11.5 * ratio}px system-ui, sans-serif`;
       g.fillStyle = colour;
-      g.textAlign = end[0] < at[0] ? "right" : "left";
-      g.fillText(`${label} ${size.toFixed(size < 10 ? 1 : 0)} N`, end[0] + (end[0] < at[0] ? -6 : 6) * ratio, end[1] + 4 * ratio);
+      const words = `${label} ${size.toFixed(size < 10 ? 1 : 0)} N`;
+      const wide = g.measureText(words).width;
+      const x = end[0] < at[0] ? end[0] - wide - 8 * ratio : end[0] + 8 * ratio;
+      g.fillText(words, Math.max(6 * ratio, Math.min(this.canvas.width - wide - 6 * ratio, x)), Math.max(52 * ratio, end[1] + 4 * ratio));
     };
     push(site.wall, css("--bad"), "wall");
     push(site.hand, css("--good"), "hand");

@@ -55,8 +55,9 @@ export class Hands {
       const [tx, ty] = card.project(this.tip(card));
       this.take(card, [...this.tip(card)], { pointer: event.pointerId, offset: [tx - x, ty - y] });
     });
-    card.canvas.addEventListener("pointermove", (event) => {
-      card.near = near(event);
+    card.canvas.addEventListener("pointermove", (event) => { card.near = near(event); });
+    const raw = "onpointerrawupdate" in window ? "pointerrawupdate" : "pointermove"; // does not wait for a frame
+    card.canvas.addEventListener(raw, (event) => {
       const hold = card.hold;
       if (!hold || hold.pointer !== event.pointerId) return;
       const [x, y] = this.pixel(card, event);

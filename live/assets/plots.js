@@ -19,8 +19,7 @@ class Plot {
       const key = keys.appendChild(document.createElement("span"));
       const swatch = key.appendChild(document.createElement("span"));
       swatch.className = `swatch${dash ? " dashed" : ""}`;
-      swatch.style.background = colour.startsWith("--") ? `var(${colour})` : colour;
-      if (dash) swatch.style.backgroundColor = `var(${colour})`;
+      swatch.style.backgroundColor = `var(${colour})`;
       key.append(label);
     }
     this.box = this.card.appendChild(document.createElement("div"));
@@ -43,7 +42,7 @@ class Plot {
       return [bottom < 0 ? bottom - 0.06 * (top - bottom) : 0, top + 0.1 * (top - bottom)];
     };
     this.plot = new uPlot({
-      width: Math.max(this.box.clientWidth, 120), height: 132, padding: [6, 8, 0, 0], legend: { show: false }, cursor: { show: false },
+      width: Math.max(this.box.clientWidth, 120), height: 132, padding: [6, 16, 0, 0], legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false, range: () => [this.now - SPAN_S, this.now] }, y: { range } },
       axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => `${v} s`) }, axis(46)],
       series: [{}, ...this.series.map(({ colour, dash, width = 1.6 }) => ({
@@ -87,6 +86,7 @@ export class Plots {
     this.energy = new Plot(parent, "V", "J", [
       { label: "V", colour: "--ink", width: 2 }, { label: "V less what hands and walls gave: must not rise", colour: "--accent", dash: true },
     ], "V follows from every record, a moment later");
+    this.energy.card.classList.add("wide");
     this.drawn = 0;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       for (const { plot } of [...this.streams, { plot: this.energy }]) plot.build();

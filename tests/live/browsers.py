@@ -1,13 +1,16 @@
 """A real browser on a real page: Debian's chromium, driven by Playwright."""
 
+import contextlib
+import os
 import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 
 from tests.net.waiting import until
 
@@ -25,12 +28,37 @@ QUIET = (
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
 
+def launch(playwright: Playwright, *, gl: bool = True) -> Browser:
+    """A browser without a window, with WebGL by software or without any."""
+    drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if gl else ("--disable-3d-apis",)
+    return playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *drawing])
+
+
+def chromium_pid() -> int:
+    """The first process of the browser that a test of this process has started."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            line = (folder / "cmdline").read_bytes()
+            if b"--type=" not in line and b"--remote-debugging-pipe" in line and _descends(int(folder.name)):
+                found.append(int(folder.name))
+    return min(found)
+
+
+def _descends(pid: int) -> bool:
+    """True if a process is below this one."""
+    while pid > 1:
+        if pid == os.getpid():
+            return True
+        pid = int(Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[1])
+    return False
+
+
 @contextmanager
 def browser_page(url: str, *, gl: bool = True, **options: Any) -> Iterator[Page]:
     """A page of a browser at an address; it fails for every error that the page reports."""
-    drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if gl else ("--disable-3d-apis",)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *drawing])
+        browser = launch(playwright, gl=gl)
         try:
             page = browser.new_page(**options)
             problems: list[str] = []

@@ -1,18 +1,21 @@
 """`trilat live` in a real browser: what the page shows is the session, and its button ends it in order."""
 
+import contextlib
+import os
 import signal
-from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page
+from playwright.sync_api import Page, sync_playwright
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from tests.net.waiting import until
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.log.log_reader import Log, open_log
 
-from .browsers import browser_page, needs_browser, page_address, shows
-from .processes import Process, Stage
+from .browsers import browser_page, chromium_pid, launch, needs_browser, page_address, shows
+from .processes import PAPER, Process, Session, Stage, connections
 
 pytestmark = needs_browser
 
@@ -39,15 +42,48 @@ def end_by_button(page: Page) -> None:
     page.click("#end")
 
 
-def test_the_page_shows_the_session_changes_a_link_and_ends_it(stage: Stage) -> None:
-    running = live(stage, "two_sites", "--duration", "60")
+def tip_px(page: Page, arm: int) -> tuple[float, float]:
+    """Where an end effector is on the screen."""
+    x, y = page.evaluate(
+        """(n) => { const card = trilat.parts.arms.cards[n], box = card.canvas.getBoundingClientRect();
+        const tip = card.project(trilat.frame.sites[card.name].points.at(-1));
+        const ratio = card.canvas.width / box.width;
+        return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; }""",
+        arm,
+    )
+    return x, y
+
+
+def take_hold(page: Page, arm: int, dx: float, dy: float) -> None:
+    """Presses the pointer on an end effector and drags it by so many pixels."""
+    shows(page, f"trilat.parts.arms.cards[{arm}].graspable")
+    x, y = tip_px(page, arm)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for n in range(1, 11):
+        page.mouse.move(x + dx * n / 10, y + dy * n / 10)
+
+
+def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+    """Time, s, grip and number of the message in force at every tick."""
+    part = log[site]
+    return np.column_stack([part.t_s, part.hand[:, 0], part.hand[:, 1]])
+
+
+def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
+    running = live(stage, "play")
     with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
-        sites: dict[str, Any] = page.evaluate("trilat.frame.sites")
-        assert set(sites) == {"m", "s"}
-        assert page.locator(".arm").count() == 2
+        assert page.locator(".arm").count() == 3
         page.click("#link-presets button:has-text('300 ms')")
-        shows(page, "trilat.frame.links['m->s'].age_ms > 290 && trilat.frame.links['s->m'].age_ms > 290")
+        before = page.evaluate("trilat.frame.sites.m1.points.at(-1)")
+        take_hold(page, 0, 60.0, 10.0)
+        shows(page, "trilat.frame.holds.includes('m1') && Math.hypot(...trilat.frame.sites.m1.hand) > 1")
+        shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
+        assert "you hold it" in page.inner_text(".arm >> nth=0")
+        page.mouse.up()
+        shows(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
+        shows(page, "Object.values(trilat.frame.links).every((link) => link.age_ms > 290)")
         shows(page, "trilat.energies.length > 60 && trilat.energies.at(-1)[0] > 2")
         energies = page.evaluate("trilat.energies")
         end_by_button(page)
@@ -56,8 +92,63 @@ def test_the_page_shows_the_session_changes_a_link_and_ends_it(stage: Stage) -> 
     assert "ok   executed again" in running.text()
     log = open_log(stage.folder / "out" / "run.mcap")
     assert_energies_are_those_of(log, energies)
-    changed = {event.text for event in log.events if event.kind == "change"}
-    assert len(changed) == 2
+    assert len({event.command for event in log.events if event.kind == "change"}) == 6
+    first = next(event.text for event in log.events if event.kind == "hand")
+    assert first.startswith("m1: page 1 takes hold")
+    assert grips(log, "m1")[:, 1].max() == 1.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("killed", ["browser", "server"])
+def test_an_arm_in_grip_is_free_soon_after_its_page_is_killed(killed: str, stage: Stage) -> None:
+    """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
+    session = Session(stage, "play", PAPER, "--duration", "25")
+    session.all()
+    ways = connections(session.endpoints)
+    page_server = stage.start("page", "live", "--session", "t", "--no-browser", *ways)
+    with sync_playwright() as playwright:
+        browser = launch(playwright)
+        page = browser.new_page()
+        page.goto(page_address(page_server))
+        shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
+        take_hold(page, 0, 40.0, 10.0)
+        shows(page, "trilat.frame.sites.m1.grip === 1")
+        os.kill(page_server.pid if killed == "server" else chromium_pid(), signal.SIGKILL)
+    session.ends_well()
+    log = open_log(session.log)
+    t_s, grip, number = grips(log, "m1").T
+    last_message_s = t_s[np.flatnonzero(np.diff(number) > 0)[-1] + 1]
+    free_s = t_s[np.flatnonzero(grip > 0.0)[-1] + 1]
+    assert free_s - last_message_s < 0.32
+    assert "hand" in {event.kind for event in log.events}
+    assert all(log.missing(site) == 0 for site in log.sites)
+
+
+@pytest.mark.long
+def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
+    """A flood, ten megabytes, NaN, a target a kilometre away: refused and counted, every record is there."""
+    running = live(stage, "play")
+    address = page_address(running)
+    socket_address = address.replace("http", "ws") + "socket"
+    with browser_page(address) as page:
+        shows(page, "trilat.frame && trilat.frame.t > 1")
+        for _ in range(3):
+            with connect(socket_address, max_size=None) as hostile, contextlib.suppress(ConnectionClosed):
+                hostile.send('{"do":"control","want":true}')
+                hostile.send('{"do":"hand","site":"m1","grip":true,"to":[1000.0,0.0]}')
+                hostile.send('{"do":"hand","site":"m1","grip":true,"to":[NaN,0.0]}')
+                for _ in range(100_000):
+                    hostile.send('{"do":"hand","site":"m1","grip":true,"to":[1000.0,0.0]}')
+            with connect(socket_address, max_size=None) as hostile, contextlib.suppress(ConnectionClosed):
+                hostile.send("x" * (10 << 20))
+        shows(page, "trilat.frame.refused > 3000")
+        assert page.evaluate("trilat.frame.sites.m1.grip") == 0
+    running.signal(signal.SIGINT)
+    assert running.code() == 0, running
+    log = open_log(stage.folder / "out" / "run.mcap")
+    assert all(log.missing(site) == 0 for site in log.sites)
+    assert grips(log, "m1")[:, 1].max() == 0.0
+    assert log.link_stats("m1")[-1].dropped["hand: out of range"] > 0
 
 
 @pytest.mark.long

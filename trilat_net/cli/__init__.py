@@ -83,7 +83,7 @@ def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any
 
 _SINGLE = {
     "demo": (demo.demo_command, "paper --duration 10 --set control.Kd=5"),
-    "live": (live.live_command, "two_sites", "--session paper-demo"),
+    "live": (live.live_command, "play", "--session paper-demo"),
     "site": (site.site_command, "m1 --scenario paper"),
     "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
     "ping": (ping.ping_command, "--session paper"),

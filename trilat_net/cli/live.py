@@ -12,7 +12,7 @@ from . import options
 
 def live_command(
     context: typer.Context,
-    scenario: options.ScenarioArgument = "paper",
+    scenario: options.ScenarioArgument = "play",
     session: Annotated[
         str | None,
         typer.Option("--session", metavar="ID", help="Show this running session instead of starting one."),

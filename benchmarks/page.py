@@ -1,0 +1,157 @@
+"""The page of `trilat live`: from a pointer to the arm, what it costs the loops, and what its server takes.
+
+Chromium draws on the machine that it measures; without a graphics card that is most of the load. So the loops
+are compared with two socket clients that take every frame and draw nothing, and without any, in turns.
+"""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+from playwright.sync_api import Page, sync_playwright
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+import trilat_net
+from trilat_net.net.hand_port import Hand
+
+RUN_S, PAIRS, MOVES = 10.0, 5, 60
+POINTER_P50_MS, POINTER_P95_MS, LATENESS_RATIO, SERVER_PERCENT = 60.0, 120.0, 1.3, 30.0
+_TIP = """(() => { const card = trilat.parts.arms.cards[0], box = card.canvas.getBoundingClientRect();
+const tip = card.project(trilat.frame.sites[card.name].points.at(-1)), ratio = card.canvas.width / box.width;
+return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; })()"""
+_READY = "Boolean(trilat.frame?.t > 2 && trilat.takesPart && trilat.parts.arms.cards[0].project)"
+
+
+def run() -> list[str]:
+    took_ms = measure_pointer()
+    p50, p95 = np.percentile(took_ms, (50, 95))
+    late_us, alone_us, server = measure_load()
+    ratio = late_us / alone_us
+    return [
+        f"pointer to arm, {len(took_ms)} moves: p50 {p50:.1f} ms (at most {POINTER_P50_MS:g}), "
+        f"p95 {p95:.1f} ms (at most {POINTER_P95_MS:g})",
+        f"lateness p99: {late_us:.0f} us with two pages, {alone_us:.0f} us with none, "
+        f"{ratio:.2f} of it (at most {LATENESS_RATIO:g})",
+        f"the page's server: {server:.1f} % of a core (at most {SERVER_PERCENT:g})",
+    ]
+
+
+@contextmanager
+def live_session(folder: Path) -> Iterator[tuple[str, int]]:
+    """A session of `play` with a page: its address and its process; its log is whole at the end."""
+    options = ["--no-browser", "--force", "--out", str(folder)]
+    command = [sys.executable, "-m", "trilat_net", "live", "play", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    lines = iter(process.stdout)
+    address = next(found[1] for line in lines if (found := re.search(r"the page: (\S+)", line)))
+    try:
+        yield address, process.pid
+    finally:
+        process.send_signal(signal.SIGINT)
+        for line in lines:
+            if line.startswith("checking the log"):  # no report is needed
+                process.kill()
+        process.wait()
+
+
+class SocketClient(threading.Thread):
+    """A page that draws nothing: it takes every frame and says so."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(daemon=True)
+        self.socket = connect(f"ws://{urlsplit(address).netloc}/socket", max_size=None)
+        self.t_s = 0.0
+        self.start()
+
+    def run(self) -> None:
+        """Takes frames until the session or the test closes it."""
+        with suppress(ConnectionClosed):
+            for text in self.socket:
+                message = json.loads(text)
+                self.t_s = message.get("t", 0.0)
+                n = message["hello"]["n"] if "hello" in message else message["n"]
+                self.socket.send(json.dumps({"do": "seen", "n": n}))
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of one process without its children, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure_once(pages: int) -> tuple[float, float]:
+    """p99 of how late the loops woke up, us, and the server's share of a core, percent."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "run"
+        with live_session(folder) as (address, pid):
+            clients = [SocketClient(address) for _ in range(2)]
+            while clients[0].t_s < 2.0:
+                time.sleep(0.05)
+            for client in clients[pages:]:
+                client.socket.close()
+            began_s, before_s = time.monotonic(), cpu_s(pid)
+            time.sleep(RUN_S)
+            share = 100.0 * (cpu_s(pid) - before_s) / (time.monotonic() - began_s)
+        log = trilat_net.open_log(str(folder / "run.mcap"))
+        assert not any(log.missing(site) for site in log.sites)
+        late_us = [log[site].late_us[(log[site].t_s > 2.5) & (log[site].t_s < RUN_S)] for site in log.sites]
+        return float(np.percentile(np.concatenate(late_us), 99)), share
+
+
+def measure_load() -> tuple[float, float, float]:
+    """Lateness with two pages and with none, us, and the server's share with two, percent: medians."""
+    pairs = [(measure_once(2), measure_once(0)) for _ in range(PAIRS)]
+    print("p99 with two pages and with none, us:", [(f"{a[0]:.0f}", f"{b[0]:.0f}") for a, b in pairs])
+    ratio = float(np.median([two[0] / none[0] for two, none in pairs]))
+    none_us = float(np.median([none[0] for _, none in pairs]))
+    return ratio * none_us, none_us, float(np.median([two[1] for two, _ in pairs]))
+
+
+def measure_pointer() -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
+    """From a pointer that moves in chromium to a record whose hand goes elsewhere, ms."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        live_session(Path(name) / "run") as (address, _),
+        sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(address)
+        while not page.evaluate(_READY):
+            time.sleep(0.1)
+        x, y = page.evaluate(_TIP)
+        with trilat_net.hand("play-demo", "m1", source="onlooker") as onlooker:
+            page.mouse.move(x, y)
+            page.mouse.down()
+            took_ms = [move_once(page, onlooker, x + 4 * (n % 2), y - 4 * (n % 2)) for n in range(MOVES)]
+            page.mouse.up()
+        browser.close()
+        return np.array([ms for ms in took_ms if ms is not None])
+
+
+def move_once(page: Page, onlooker: Hand, x: float, y: float) -> float | None:
+    """Moves the pointer by a little; None if nothing followed, or nobody held the arm."""
+    time.sleep(0.3)
+    before = onlooker.in_force
+    began_s = time.monotonic()
+    page.mouse.move(x, y)
+    while before is not None and before.source and time.monotonic() - began_s < 2.0:
+        now = onlooker.in_force
+        if now is not None and now.target != before.target:
+            return (time.monotonic() - began_s) * 1e3
+        time.sleep(0.0005)
+    return None
